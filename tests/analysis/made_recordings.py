@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from yid_ocp.analysis.experiment_design import RecordedExperiment
+from yid_ocp.analysis.experiment_design import UnchangedExperiment
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
@@ -27,7 +27,7 @@ def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):
         options=ProblemOptions(sensors=sensors or {}),
         system=SimpleNamespace(mechanism=Mechanism("made", (), dict.fromkeys(frames))),
     )
-    return RecordedExperiment(problem, np.zeros(1), **more), episode
+    return UnchangedExperiment(problem, np.zeros(1), **more), episode
 
 
 def holding_pendulum(folder, links=3):

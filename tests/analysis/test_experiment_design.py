@@ -19,7 +19,7 @@ from yid_ocp.analysis.experiment_design import (
     ExperimentVariantSensitivities,
     ExperimentVariantSensitivityBuilder,
     PointObservationSchedule,
-    RecordedExperiment,
+    UnchangedExperiment,
     extended_step_and_measurable_points,
     measurable_points,
 )
@@ -185,7 +185,7 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     sensor = SimpleNamespace(effort_joints=made["measured"])
     recording = SimpleNamespace(joints=object() if made["joints"] else None)
     episode = SimpleNamespace(measurements=(SimpleNamespace(sensor=sensor),), recording=recording)
-    base = RecordedExperiment(
+    base = UnchangedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
     assert ExperimentVariantSensitivityBuilder(base).applicable_mechanical_changes() == possible.split()
@@ -214,7 +214,7 @@ def swung(urdf_folder):
 def built(problem, *mechanics, heard=None, **settings):
     """The builder of a problem's variants, and the variant with these changes."""
     made = ExperimentVariantSensitivityBuilder(
-        RecordedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
+        UnchangedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
     )
     found = made.build_sensitivities(frozenset(mechanics))
     assert not isinstance(found, str), found
@@ -248,7 +248,7 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     problem = swung()
     x = np.array([np.nan, 0.1])
-    found = ExperimentVariantSensitivityBuilder(RecordedExperiment(problem, x)).build_sensitivities(frozenset())
+    found = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, x)).build_sensitivities(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
@@ -494,7 +494,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
 
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
-    builder = ExperimentVariantSensitivityBuilder(RecordedExperiment(noisy, noisy.initial_unknowns))
+    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(noisy, noisy.initial_unknowns))
     made = builder.build_sensitivities(frozenset({"motion"}))
     assert not isinstance(made, str), made
     own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors

@@ -12,7 +12,7 @@ from made_recordings import holding_pendulum
 from yid_ocp.analysis import identifiability as module
 from yid_ocp.analysis.identifiability import (
     _orthogonal_part,
-    add_nuisance_unknowns,
+    free_starts_and_grasps,
     identifiability,
     system_with_grasp_offset_effects,
     unknowns_from_solution,
@@ -152,7 +152,7 @@ def test_the_part_that_a_direction_explains_does_not_depend_on_its_length(size):
 def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuisances, words):
     start = {"a": 2.0, **dict.fromkeys(nuisances, 0.0)}
     wide = Formula(lambda x: [30 * (x["a"] / 2 - 1) + 5 * x[name] for name in nuisances], start, bounds=FREE)
-    monkeypatch.setattr(module, "add_nuisance_unknowns", lambda *_: wide)
+    monkeypatch.setattr(module, "free_starts_and_grasps", lambda *_: wide)
     [hidden] = identifiability(Formula(lambda x: [30 * (x["a"] / 2 - 1)], {"a": 2.0})).directions
     assert (hidden.words, hidden.verdict) == (f"a cannot be separated from {words}", "not_identifiable")
 
@@ -183,8 +183,8 @@ def test_where_the_grasp_sits_is_a_nuisance(held_tube):
     assert loose.parameters["T1.bend"].std > 1.5 * base.parameters["T1.bend"].std
     one_free = problem.with_free_parameters((*held_tube.free, "grasp_offset@hand.dy"))
     added = ("grasp_offset@hand.dx", "grasp_offset@hand.dz")
-    assert add_nuisance_unknowns(one_free, "assumed", 2e-3).options.prior_stds == dict.fromkeys(added, 2e-3)
-    assert add_nuisance_unknowns(one_free, "assumed", None) is one_free
+    assert free_starts_and_grasps(one_free, "assumed", 2e-3).options.prior_stds == dict.fromkeys(added, 2e-3)
+    assert free_starts_and_grasps(one_free, "assumed", None) is one_free
 
 
 def test_every_grasp_without_an_offset_gets_one(urdf_folder):

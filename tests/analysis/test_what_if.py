@@ -13,7 +13,7 @@ from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis.experiment_design import (
     MECHANICAL_CHANGE_DESCRIPTIONS,
     ExperimentVariantSensitivityBuilder,
-    RecordedExperiment,
+    UnchangedExperiment,
 )
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import ChangedExperimentResult, evaluate_experiment_change_sets, what_if
@@ -154,7 +154,7 @@ def test_a_fit_that_is_worse_than_its_noise_informs_less(held_tube, tube_ranking
     found = what_if(held_tube, x, considered_changes=()).unchanged_experiment.std_relative["T1.bend"]
     known = tube_ranking[0].unchanged_experiment.std_relative["T1.bend"]
     assert found == pytest.approx(math.sqrt(chi2) * known, rel=1e-5)
-    [other] = evaluate_experiment_change_sets(RecordedExperiment(held_tube, x), [()], chi2)
+    [other] = evaluate_experiment_change_sets(UnchangedExperiment(held_tube, x), [()], chi2)
     assert other.std_relative["T1.bend"] == pytest.approx(found, rel=1e-9)
 
 
@@ -203,7 +203,7 @@ def missing(*arguments, **settings):
 
 def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
-    builder = ExperimentVariantSensitivityBuilder(RecordedExperiment(short_run, short_run.initial_unknowns))
+    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(short_run, short_run.initial_unknowns))
     other = builder.build_sensitivities(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_driven_angles[:20]
@@ -252,7 +252,7 @@ def test_one_arm_needs_another_arm_and_welds(exact):
 def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     """Two arms with welds and no camera, MuJoCo's motion and noise, from a start of 3 N m/rad each."""
     made = exact("dual_arm_no_vision")
-    layout = ExperimentVariantSensitivityBuilder(RecordedExperiment(made, at_truth(made))).build_sensitivities(
+    layout = ExperimentVariantSensitivityBuilder(UnchangedExperiment(made, at_truth(made))).build_sensitivities(
         frozenset({"weld"})
     )
     assert not isinstance(layout, str), layout

@@ -10,7 +10,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp import options
-from yid_ocp.config.reader import EMBEDDED_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.schema import section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
@@ -20,9 +20,9 @@ RENAMED = "find its new name in the table of CHANGELOG.md"
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
-    embedded = repository / "yid_ocp" / "data" / "defaults" / EMBEDDED_CONFIG_FILE_NAME
-    assert embedded.read_bytes() == (repository / "configs" / EMBEDDED_CONFIG_FILE_NAME).read_bytes()
-    assert load_config() == dataclasses.replace(load_config(repository / "configs" / EMBEDDED_CONFIG_FILE_NAME))
+    embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT_CONFIG_FILE_NAME
+    assert embedded.read_bytes() == (repository / "configs" / DEFAULT_CONFIG_FILE_NAME).read_bytes()
+    assert load_config() == dataclasses.replace(load_config(repository / "configs" / DEFAULT_CONFIG_FILE_NAME))
 
 
 def test_numbers_as_in_yaml_1_2(written):

@@ -19,9 +19,9 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
     AllCandidatesLinearization,
+    CandidateDetectability,
     CandidateScore,
     ConfusabilityMatrix,
-    DetectableAmplitudes,
     ScreeningResult,
     _EffectSignature,
 )
@@ -96,8 +96,8 @@ def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> Cand
     return CandidateScore(of, values, decrease, statistic, p)
 
 
-def visible(of: EffectBase, seen=True, detectable=0.1) -> DetectableAmplitudes:
-    return DetectableAmplitudes(of, dict.fromkeys(of.amplitude_parameter_names, detectable), seen)
+def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability:
+    return CandidateDetectability(of, dict.fromkeys(of.amplitude_parameter_names, detectable), seen)
 
 
 def alike(labels: Sequence[str], matrix) -> ConfusabilityMatrix:

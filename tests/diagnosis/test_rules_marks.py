@@ -13,7 +13,7 @@ from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, labels_json_and_
 from yid_ocp.diagnosis.blind_scores import (
     detection_and_false_alarm_rates,
     diagnosis_evidence_to_dict,
-    judge_recorded_case,
+    rejudge_diagnosis_evidence,
     score_blind_case,
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
@@ -318,7 +318,7 @@ def diagnosed(decrease=80.0, there=0.5):
 def again(finding, **limits):
     """Verdict and effects of what was kept of a diagnosis, by other thresholds."""
     data = json.loads(json.dumps(diagnosis_evidence_to_dict(finding), allow_nan=False))
-    found = judge_recorded_case(data, limits)
+    found = rejudge_diagnosis_evidence(data, limits)
     return found["verdict"], [f"{e['kind']}@{e['location']}" for e in found["effects"]]
 
 
@@ -347,15 +347,15 @@ def test_what_was_kept_of_a_case_is_judged_by_other_thresholds(made, limits, ver
 def test_a_case_keeps_its_own_thresholds_as_far_as_there_still_are_such():
     asked = Thresholds(min_explained_fraction=0.6)
     made = diagnosis_evidence_to_dict(replace(diagnosed(decrease=120.0), thresholds=asked))
-    assert judge_recorded_case(made, {})["verdict"] == "effect"
+    assert rejudge_diagnosis_evidence(made, {})["verdict"] == "effect"
     made["thresholds"] = {"min_explained_fraction": 0.8, "one_that_is_gone": 3.0}
-    assert judge_recorded_case(made, {})["verdict"] == "unknown"
+    assert rejudge_diagnosis_evidence(made, {})["verdict"] == "unknown"
 
 
 def test_a_case_of_an_earlier_version_is_refused():
     made = diagnosis_evidence_to_dict(diagnosed()) | {"format": "yid-evidence/1"}
     with pytest.raises(DataError, match="'yid-evidence/1'"):
-        judge_recorded_case(made, {})
+        rejudge_diagnosis_evidence(made, {})
 
 
 def test_a_case_without_a_place_of_its_gap_is_not_judged_where_thresholds_see_one():

@@ -21,7 +21,7 @@ from yid_ocp.diagnosis.screening import (
     _shape_grid,
 )
 from yid_ocp.inference import null_test
-from yid_ocp.inference.null_test import encoder_noise_residual_factor, residual_channels
+from yid_ocp.inference.null_test import channels_with_residual_indices, encoder_noise_residual_factor
 from yid_ocp.problem import EstimationProblem
 
 CHI2 = scipy.stats.chi2
@@ -67,7 +67,7 @@ def test_scores_scatter_with_the_encoders_noise_that_moves_an_arm(urdf_folder, h
     recording = taken(step, 3, camera=False, steps=80)
     problem = EstimationProblem(step, [recording], ("elbow.damping",))
     found = encoder_noise_residual_factor(problem, x := problem.initial_unknowns)
-    channels = residual_channels(problem)
+    channels = channels_with_residual_indices(problem)
     rows = np.concatenate([c.residual_indices for c in channels if c.group == "points_arm"])
     assert not np.delete(found, rows, axis=0).any()
     if "driven" in how:

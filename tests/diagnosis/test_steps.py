@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.screening import (
     linearize_candidates,
 )
 from yid_ocp.effects import make_effect
-from yid_ocp.inference.null_test import residual_channels
+from yid_ocp.inference.null_test import channels_with_residual_indices
 from yid_ocp.problem import EstimationProblem
 
 
@@ -56,7 +56,9 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
 
 def test_screening_finds_the_withheld_effect_first_and_promises_what_a_refit_does_to_a_linear_model(screened):
     composed, nominal, point = screened
-    ranked = _score_candidates(point, residual_channels(nominal.problem), _candidate_detectable_amplitudes(point))
+    ranked = _score_candidates(
+        point, channels_with_residual_indices(nominal.problem), _candidate_detectable_amplitudes(point)
+    )
     assert ranked[0].effect.label == "joint_coulomb@elbow"
     assert ranked[0].predicted_values["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
     assert ranked[0].p_value < 1e-6

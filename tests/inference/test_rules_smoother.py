@@ -278,7 +278,7 @@ def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
     for column, source in enumerate(SOURCES):
         expected = math.sqrt(10.0 / reference.scores(0, column)[1])
         assert found.detectable_std[source] == pytest.approx(expected, rel=1e-8)
-    more = smoothed(monkeypatch, models, detectable_chi2_rise=40.0)
+    more = smoothed(monkeypatch, models, detectable_unknown_chi2_rise=40.0)
     assert more.detectable_std == {s: pytest.approx(2 * v) for s, v in found.detectable_std.items()}
 
 
@@ -319,7 +319,10 @@ def test_a_place_that_does_as_well_is_told():
     drop, found = smoother._alternatives([twice], variance, state, Thresholds())
     assert drop[HERE] > 100
     assert found == {HERE: (LIKE,)}
-    strict, better = Thresholds(tied_evidence_ratio=1.0, min_log_bayes_factor=1e-9), replace(state, log_evidence=1e6)
+    strict, better = (
+        Thresholds(min_tied_evidence_ratio=1.0, min_log_bayes_factor=1e-9),
+        replace(state, log_evidence=1e6),
+    )
     assert LIKE not in smoother._alternatives([twice], variance, better, strict)[1][HERE]
 
 

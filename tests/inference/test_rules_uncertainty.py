@@ -18,7 +18,7 @@ from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
     benjamini_hochberg_mask,
-    residual_channels,
+    channels_with_residual_indices,
     residual_chi2_null_test,
     residuals_exceed_noise,
     whiten_with_extra_errors,
@@ -235,7 +235,7 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
     options = ProblemOptions(path_cutoff=np.inf, weak_prior_geometric_std=0.0)
     recordings = [taken(step, seed, camera=False, steps=200) for seed in range(3)]
     problem = EstimationProblem(step, recordings, ("elbow.mass",), options)
-    found, series = problem.evaluate(problem.initial_unknowns), residual_channels(problem)
+    found, series = problem.evaluate(problem.initial_unknowns), channels_with_residual_indices(problem)
     offset = np.random.default_rng(2).choice([-3.0, 3.0], len(series))
     moved = np.zeros(len(found.residual))
     for own, size in zip(series, offset, strict=True):
@@ -463,7 +463,7 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
 def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_folder):
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
     problem = EstimationProblem(step, [taken(step, 1, steps=90)], ("elbow.mass",), ProblemOptions(path_cutoff=15.0))
-    low_pass, own = effort_low_pass_filter(15.0), residual_channels(problem)
+    low_pass, own = effort_low_pass_filter(15.0), channels_with_residual_indices(problem)
     found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
     noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
     lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)

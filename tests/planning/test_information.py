@@ -81,16 +81,16 @@ def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem, dr
 def test_slopes_are_derivatives_of_the_sensitivities(kind, request):
     experiment = request.getfixturevalue(kind)
     w, way = some_motion(experiment), some_motion(experiment, 1, 1.0)
-    rows, e = experiment.search_problem_sensitivities(w), 1e-4
+    rows, e = experiment.sensitivities_to_unknowns(w), 1e-4
     slope = np.tensordot(way.ravel(), experiment.sensitivity_derivatives_by_coefficients(w, rows), 1)
-    after, before = (experiment.search_problem_sensitivities(w + sign * e * way) for sign in (1, -1))
+    after, before = (experiment.sensitivities_to_unknowns(w + sign * e * way) for sign in (1, -1))
     central = (after - before) / (2 * e)
     np.testing.assert_allclose(slope, central, atol=2e-3 * np.abs(central).max())
 
 
 def test_prescribed_arms_tell_what_identifiability_says(moved_experiment):
     w = some_motion(moved_experiment, size=0.3)
-    searched = moved_experiment.search_problem_sensitivities(w)
+    searched = moved_experiment.sensitivities_to_unknowns(w)
     judged = identifiability(moved_experiment.planned_estimation_problem(w))
     # the search sees fewer samples of points, each telling more
     np.testing.assert_allclose(np.diag(searched.T @ searched), np.diag(judged.fisher_information), rtol=0.05)
@@ -99,7 +99,7 @@ def test_prescribed_arms_tell_what_identifiability_says(moved_experiment):
 def test_driven_arms_tell_about_what_the_innovations_say(driven_experiment):
     for seed in range(2):
         w = some_motion(driven_experiment, seed, 0.3)
-        searched = driven_experiment.search_problem_sensitivities(w)
+        searched = driven_experiment.sensitivities_to_unknowns(w)
         judged = driven_experiment.planned_recording_sensitivities(w)
         for criterion in (DOptimalityCriterion((i,), (0, 1)) for i in (0, 1)):  # logarithms of standard deviations
             told, true = (criterion.value_and_gradient_by_sensitivities(rows, False)[0] for rows in (searched, judged))
@@ -160,7 +160,7 @@ def searched(limits, rounds=50):
     values, upper = limits
     bounds = np.full((2, 1), -1.0), np.full((2, 1), 1.5)
     simulator = SimpleNamespace(coefficient_bounds=lambda: bounds, simulate_path=lambda w, slopes=False: w)
-    read = {"search_problem_sensitivities": line, "sensitivity_derivatives_by_coefficients": slopes}
+    read = {"sensitivities_to_unknowns": line, "sensitivity_derivatives_by_coefficients": slopes}
     experiment = SimpleNamespace(simulator=simulator, **read)
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
     kept = SimpleNamespace(limit_rows=bounded, limited_quantity_values=lambda rolled, w: values(w.ravel()))

@@ -20,7 +20,7 @@ from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneou
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Effect, NodeState
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.sensors import ChannelSpecification, EffortSensor, PointSensor, Sensor, sensor_reading_function
+from yid_ocp.sensors import EffortSensor, PointSensor, RecordedChannelKind, Sensor, sensor_reading_function
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 LABEL = "drift@left"
@@ -159,7 +159,7 @@ def test_a_joint_or_frame_that_is_not_there_is_refused(sensor: Sensor, system: S
 class Hand(Sensor):
     """How fast the elbow turns, how that changes and what holds the hand: what a node has beside its coordinates."""
 
-    channel = ChannelSpecification("hand", "touch", "1")
+    channel = RecordedChannelKind("hand", "touch", "1")
     group_name: str = "hand.touch"
     frame_names = point_names = ()
 

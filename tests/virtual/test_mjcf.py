@@ -12,7 +12,7 @@ from virtual_examples import SYSTEMS, TRUTH, mujoco
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.export.models import format_support_by_effect
+from yid_ocp.export.models import export_support_by_effect
 from yid_ocp.model import (
     Effect,
     EffectStepTerms,
@@ -154,16 +154,16 @@ def test_mechanics_of_an_effect_equals_the_symbolic_one(system: System, kind: st
 @pytest.mark.parametrize("kind", [*MECHANICAL, *OTHERS])
 def test_what_is_said_of_it(system: System, kind: str) -> None:
     location, values, *status = (*MECHANICAL[kind], "native") if kind in MECHANICAL else OTHERS[kind]
-    [said] = format_support_by_effect(with_effect(system, kind, location, values), {}, "mjcf").values()
+    [said] = export_support_by_effect(with_effect(system, kind, location, values), {}, "mjcf").values()
     assert [said.status] == status
     neutral = with_effect(system, kind, location, {})
-    assert format_support_by_effect(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
+    assert export_support_by_effect(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
 
 
 def test_what_has_no_term_is_refused(system: System) -> None:
     for kind, (location, values, status) in OTHERS.items():
         changed = with_effect(system, kind, location, values)
-        [said] = format_support_by_effect(changed, {}, "mjcf").values()
+        [said] = export_support_by_effect(changed, {}, "mjcf").values()
         motion = not said.how.startswith("what a sensor reads")
         if kind == "junction_compliance" or (status == "not representable" and motion):
             with pytest.raises(ModelError):

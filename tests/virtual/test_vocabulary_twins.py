@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.friction import effect_with_sign_smoothing_speed
 from yid_ocp.errors import ModelError
-from yid_ocp.export.models import format_support_by_effect, format_support_by_parameter
+from yid_ocp.export.models import export_support_by_effect, export_support_by_parameter
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform
@@ -274,10 +274,10 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
     effects += [("servo_saturation", "lift", {"limit": 0.9}), ("backlash", "elbow", {"width": 0.01})]
     system = servo_arm.with_effects([make_effect(kind, place, servo_arm, values) for kind, place, values in effects])
     values = dict(zip(system.parameters.names, system.parameters.vector(VALUES), strict=True))
-    said = format_support_by_effect(system, values, "mjcf")
+    said = export_support_by_effect(system, values, "mjcf")
     assert [said[f"{kind}@{place}"].status for kind, place, _ in effects] == ["native"] * 3 + ["not representable"]
     for form, status in (("mjcf", "native"), ("urdf", "not representable"), ("sdf", "not representable")):
-        own = format_support_by_parameter(system, format_support_by_effect(system, values, form), form)
+        own = export_support_by_parameter(system, export_support_by_effect(system, values, form), form)
         names = ("gain", "damping", "delay", "torque_limit")
         assert {own[f"wrist_flex.servo_{name}"].status for name in names} == {status}
     kept = servo_arm.with_effects([make_effect(kind, place, servo_arm, values) for kind, place, values in effects[:3]])

@@ -83,7 +83,7 @@ def tracked(system, run, recording, shape):
     """
 
     def make(outliers=0.0, seed=0, late=(), **timing):
-        when = vision.CameraTimingModel(mean_rate=3.0, latency=0.06, **timing)
+        when = vision.VirtualCameraTiming(mean_rate=3.0, latency=0.06, **timing)
         scene = vision.SceneModel(system, "package:baxter")
         camera = vision.VirtualCameraSetup(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = vision.render_virtual_frames(scene, run.t, run.q, camera)

@@ -74,17 +74,17 @@ def test_outliers_are_as_many_as_asked_for():
 
 def test_frame_timing():
     rng = np.random.default_rng(0)
-    when = vision.CameraTimingModel(10.0, dropped_fraction=1 / 3, latency=0.05, latency_std=0.002)
+    when = vision.VirtualCameraTiming(10.0, dropped_frame_fraction=1 / 3, latency=0.05, latency_std=0.002)
     taken, stamps = when._sample_times_and_stamps(0.0, 300.0, rng)
     assert len(taken) == pytest.approx(2000, rel=0.05)
     assert np.std(stamps - taken - 0.05) == pytest.approx(0.002, rel=0.1)
     with pytest.raises(ConfigError, match="rate"):
-        vision.CameraTimingModel(mean_rate=0.0)._sample_times_and_stamps(0.0, 1.0, rng)
+        vision.VirtualCameraTiming(mean_rate=0.0)._sample_times_and_stamps(0.0, 1.0, rng)
 
 
 def test_virtual_frames_are_the_same_every_time(system, run):
     pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-    camera = vision.VirtualCameraSetup(pose, timing=vision.CameraTimingModel(mean_rate=2.0))
+    camera = vision.VirtualCameraSetup(pose, timing=vision.VirtualCameraTiming(mean_rate=2.0))
     one, two = (
         vision.render_virtual_frames(vision.SceneModel(system), run.t, run.q, replace(camera, seed=seed))
         for seed in (3, 4)

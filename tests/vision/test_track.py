@@ -46,7 +46,7 @@ def test_points_at_two_metres(clean):
 
 
 def test_a_third_of_the_frames_lost_a_fifth_of_the_points_wrong_and_stamps_late(tracked):
-    hard = tracked(outliers=0.2, dropped_fraction=1 / 3, seed=11, latency_std=0.003, late=(2, 5))
+    hard = tracked(outliers=0.2, dropped_frame_fraction=1 / 3, seed=11, latency_std=0.003, late=(2, 5))
     assert np.isfinite(hard.errors).mean() > 0.9
     assert (np.nanmedian(hard.errors, axis=0) < 5 * MILLIMETRE).all()
     assert np.nanmax(hard.errors) < 15 * MILLIMETRE

@@ -28,7 +28,7 @@ from yid_ocp.data.channel_checks import (
     median_sample_period,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup
-from yid_ocp.inference.null_test import residual_channels
+from yid_ocp.inference.null_test import channels_with_residual_indices
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -227,7 +227,7 @@ def clock_drift_and_overstated_noise_issues(
 def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
     assert evaluation.jacobian is not None
     times = np.zeros(len(evaluation.residual))
-    for series in residual_channels(problem):
+    for series in channels_with_residual_indices(problem):
         times[series.residual_indices] = series.t
     size = np.ones(len(problem.initial_unknowns))
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
@@ -274,7 +274,7 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     """Groups whose residuals, both per sample and summed over time blocks, are far below the stated noise."""
     by_group: dict[str, list[tuple[float, float, int]]] = {}
     units = {}
-    for series in residual_channels(problem):
+    for series in channels_with_residual_indices(problem):
         r = evaluation.residual[series.residual_indices]
         if len(r) >= MIN_DIFFERENCES_FOR_NOISE_STD:
             sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])

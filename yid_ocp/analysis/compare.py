@@ -72,7 +72,7 @@ def compare_methods(
     truth: Mapping[str, float] | None = None,
     callback: Callable[[str, Iterate], None] | None = None,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-    time_budget: float = math.inf,
+    total_time_budget: float = math.inf,
 ) -> MethodsComparisonResult:
     """Run several estimation methods (`solvers`) from the same initial values and compare their estimates.
 
@@ -80,10 +80,10 @@ def compare_methods(
     minimise the problem's cost without process noise, which not every method supports. If the problem has process
     noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run that includes it.
     `truth` holds known parameter values. `callback` receives the method's name and every `Iterate`. `limits` are the
-    criteria by which a residual exceeds noise. Each method may use an equal part of the remaining `time_budget` [s].
+    criteria by which a residual exceeds noise. A method may use an equal part of the remaining `total_time_budget` [s].
     """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
-    deadline = time.perf_counter() + time_budget
+    deadline = time.perf_counter() + total_time_budget
 
     def listener(name: str, share: float = math.inf) -> Callable[[Iterate], None] | None:
         if callback is None and not math.isfinite(share):
@@ -94,7 +94,7 @@ def compare_methods(
             if callback is not None:
                 callback(name, entry)
             if time.perf_counter() - begun > share:
-                raise StopSearch(f"stopped after {share:.3g} s, its share of compare.time_budget")
+                raise StopSearch(f"stopped after {share:.3g} s, its share of compare.total_time_budget")
 
         return told
 

@@ -19,7 +19,7 @@ from yid_ocp.files import attributes_by_name
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
-    EstimateChecks,
+    EstimateChecksBeyondFit,
     free_estimates_marked_not_trusted,
     typical_parameter_magnitudes,
 )
@@ -70,7 +70,7 @@ def solve(
     found = solvers.solve(problem, solver, initial_unknowns, callback, limits)
     safe = choose_cable_memory_fit(problem, solver, found, limits)
     solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
-    checks = replace(solution.checks or EstimateChecks(), cable_memory_message=safe.message)
+    checks = replace(solution.checks or EstimateChecksBeyondFit(), cable_memory_message=safe.message)
     return replace(solution, checks=checks)
 
 
@@ -122,10 +122,10 @@ def _with_equilibrium_guesses(
 
 def _with_discretisation_errors(
     problem: EstimationProblem, solution: Solution, progress: Progress
-) -> tuple[Solution, EstimateChecks]:
+) -> tuple[Solution, EstimateChecksBeyondFit]:
     """The solution with standard deviations that include the discretisation, and its shifts with notes."""
     if solution.evaluation is None:
-        return solution, EstimateChecks()
+        return solution, EstimateChecksBeyondFit()
     kinds = problem.options.checked_discretisations
     shifts, notes = discretisation.estimate_shifts_by_discretisation(
         problem, solution.x, solution.evaluation, kinds, progress
@@ -136,7 +136,7 @@ def _with_discretisation_errors(
     uncounted = tuple(words for kind, words in _UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
         uncounted = tuple(words for words in uncounted if words != _UNCOUNTED_ERROR_TEXTS["links"])
-    checks = EstimateChecks(discretisation_shifts=shifts, notes=tuple(notes), uncounted_errors=uncounted)
+    checks = EstimateChecksBeyondFit(discretisation_shifts=shifts, notes=tuple(notes), uncounted_errors=uncounted)
     return replace(solution, parameters=inflated), checks
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from yid_ocp.analysis.identifiability import InitialStateKnowledge, add_nuisance_unknowns, transfer_unknowns_by_name
+from yid_ocp.analysis.identifiability import InitialStateKnowledge, free_starts_and_grasps, transfer_unknowns_by_name
 from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_sensor_fisher_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -59,8 +59,8 @@ class PointObservationSchedule:
 
 
 @dataclass(frozen=True)
-class RecordedExperiment:
-    """A recorded experiment whose variants are analysed: problem, unknowns and prior knowledge."""
+class UnchangedExperiment:
+    """A recorded experiment before any change: its problem, unknowns and prior knowledge."""
 
     problem: EstimationProblem
     x: Array  # unknowns at which the information is evaluated, shape (nx,)
@@ -231,7 +231,7 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 class ExperimentVariantSensitivityBuilder:
     """Builds and caches experiment variants for sets of mechanical changes."""
 
-    def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
+    def __init__(self, setting: UnchangedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
         self._progress = progress
         self._layouts: dict[frozenset[str], ExperimentVariantSensitivities | str] = {}
@@ -266,7 +266,7 @@ class ExperimentVariantSensitivityBuilder:
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
         step, seen = extended_step_and_measurable_points(step)
-        wide = add_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
+        wide = free_starts_and_grasps(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
         dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]

@@ -169,7 +169,7 @@ def identifiability(
         said = unknown_name_error_arguments(name, names)
         raise ConfigError(f"'{name}' is not a free parameter", where="intervals", **said)
     given = unknowns_from_solution(problem, solution)
-    wide = add_nuisance_unknowns(problem, start, grasp_std)
+    wide = free_starts_and_grasps(problem, start, grasp_std)
     x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
     # the matrices are small: threads of the linear algebra library cost more than they gain
     with threadpoolctl.threadpool_limits(1):
@@ -245,7 +245,7 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
     return x
 
 
-def add_nuisance_unknowns(
+def free_starts_and_grasps(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
     """Return the problem with unknown initial states (if `start` is "unknown") and grasp offsets (if `grasp_std`)."""

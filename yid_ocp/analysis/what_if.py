@@ -17,7 +17,7 @@ from yid_ocp.analysis.experiment_design import (
     ExperimentVariantSensitivities,
     ExperimentVariantSensitivityBuilder,
     PointObservationSchedule,
-    RecordedExperiment,
+    UnchangedExperiment,
     measurable_points,
     uniform_sample_times,
 )
@@ -131,7 +131,7 @@ def what_if(
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)
-    setting = RecordedExperiment(problem, x, start, grasp_std, two_arm_system)
+    setting = UnchangedExperiment(problem, x, start, grasp_std, two_arm_system)
     outcomes = _Outcomes(setting, inflation, progress, evaluate_changes)
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
@@ -143,7 +143,7 @@ def what_if(
 
 
 def evaluate_experiment_change_sets(
-    setting: RecordedExperiment, sets: Sequence[Sequence[str]], inflation: float
+    setting: UnchangedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
     """Predict the result of each of `sets` of named changes. `inflation` multiplies the stated variances."""
     outcomes = _Outcomes(setting, inflation)
@@ -182,7 +182,7 @@ def _words(changes: Sequence[ExperimentChange]) -> str:
 class _Outcomes:
     def __init__(
         self,
-        setting: RecordedExperiment,
+        setting: UnchangedExperiment,
         inflation: float,
         progress: Progress = NULL_PROGRESS,
         judge: ExperimentChangeSetEvaluator | None = None,

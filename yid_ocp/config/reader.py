@@ -28,8 +28,8 @@ from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.files import read_input_text
 
 _KeyPath = tuple[str | int, ...]
-EMBEDDED_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
-EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
+DEFAULT_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
+DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
 _ALIAS_COST = 40  # in entries: merging an alias compares its mapping with all others
@@ -37,7 +37,7 @@ _ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
 
 
 def load_config(
-    path: str | Path | None = None, overrides: Sequence[str] = (), default: str = EMBEDDED_CONFIG_FILE_NAME
+    path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT_CONFIG_FILE_NAME
 ) -> RunSettings:
     """Read and check the settings of a configuration file. Without `path`, the embedded file `default` is read.
 

@@ -343,7 +343,7 @@ class _CompareSettings:
     methods: Annotated[
         Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
     ] = field(default_factory=_compared)
-    time_budget: Annotated[
+    total_time_budget: Annotated[
         float | None, Gt(0), OptionInfo("total time for all methods, without the run of `solve`", "s")
     ] = 300.0
     reference_paper_experiment_name: Annotated[
@@ -360,13 +360,13 @@ class _VirtualFramesSettings:
     max_gripper_travel: Annotated[
         float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
     ] = 0.11
-    gripper_start_offsets_from_object: Annotated[
+    gripper_start_from_object_end: Annotated[
         Mapping[str, _Vector3], OptionInfo("start relative to the end of the undeformed object, by grasp", "m")
     ] = field(default_factory=dict)
     camera_position: Annotated[_Vector3, OptionInfo("position of the camera", "m")] = (2.6, 0.0, 0.45)
     camera_target: Annotated[_Vector3, OptionInfo("point at which the camera looks", "m")] = (0.85, 0.0, -0.1)
     frame_rate: Annotated[float, Gt(0), Le(60), OptionInfo("mean rate of frames", "Hz")] = 3.0
-    dropped_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
+    dropped_frame_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
     latency: Annotated[float, OptionInfo("stamp minus time of the image", "s")] = 0.0
     latency_std: Annotated[float, Ge(0), OptionInfo("standard deviation of the latency", "s")] = 0.0
     outlier_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of pixels with a wrong depth")] = 0.0

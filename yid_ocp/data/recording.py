@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_for_group_name
+from yid_ocp.sensors.base import EffortSamplingKind, additional_sensor_channel_kinds
 
 ClockKind = Literal["recorded", "nominal"]
 
@@ -473,7 +473,7 @@ def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
 
 def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    declared = {channel.quantity: channel for channel in channel_kinds_for_group_name(group.name)}
+    declared = {channel.quantity: channel for channel in additional_sensor_channel_kinds(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
     hint = "add a dataset of this name, or leave the group out"

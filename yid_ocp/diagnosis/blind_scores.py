@@ -19,9 +19,9 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dic
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStatistics, UnrecordedRefitError
 from yid_ocp.diagnosis.screening import (
     AllCandidatesScoreModel,
+    CandidateDetectability,
     CandidateScore,
     ConfusabilityMatrix,
-    DetectableAmplitudes,
     ScreeningResult,
 )
 from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE
@@ -449,7 +449,7 @@ _MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of
 
 
 def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
-    """The numbers on which a diagnosis' rules are based; `judge_recorded_case` uses them to judge it again."""
+    """The numbers on which a diagnosis' rules are based; `rejudge_diagnosis_evidence` uses them to judge it again."""
     record, plain = result.record, to_lossless_plain_data
     pairs = {
         name: [[[e.label for e in both], decrease] for both, _, decrease in own] for name, own in record.pairs.items()
@@ -516,7 +516,7 @@ class _RecordedCase:
         for i, j, fraction in data["alike"]:
             overlaps[i, j] = fraction
         scores = tuple(CandidateScore(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
-        seen = tuple(DetectableAmplitudes(self._effects[label], {}, own) for label, own in data["detectable"].items())
+        seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in data["detectable"].items())
         return ScreeningResult(seen, scores, ConfusabilityMatrix(tuple(data["labels"]), overlaps), _NO_JOINT_MODEL)
 
     def locate(self) -> GapLocalization:
@@ -537,7 +537,7 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
     return EFFECTS[kind](kind, location, Parameters(entries), definitions=definitions)
 
 
-def judge_recorded_case(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Judge a recorded case again, from the output of `diagnosis_evidence_to_dict`, and return the part that is scored.
 
     The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is

@@ -249,7 +249,7 @@ def _happened(
         return NO_EVENTS, None
     smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
-    (pushed, others), share = found.split_force_from_other_events(), 1 - limits.min_event_chi2_fraction
+    (pushed, others), share = found.split_force_from_other_events(), 1 - limits.min_force_event_gap_fraction
     if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
         found = others
     return found, smoothed
@@ -287,7 +287,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         # without events, the smoother already ran on all fitted data
         smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
         by_chance = smoothed.dof_before - smoothed.dof_after
-        places = smoother.gap_locations_by_smoother_evidence(smoothed, limits.location_z)
+        places = smoother.gap_locations_by_smoother_evidence(smoothed, limits.gap_window_z)
         gap = GapLocalization(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
         return gap
 
@@ -382,7 +382,7 @@ def _after(
     """Held-out null test with the accepted effects, locations of the gap, and locations of the residual gap."""
     tests, rest = (_estimation_null_test(last, limits), _held_out_null_test(last, limits)), tuple[GapLocation, ...]()
     if null_test.residuals_exceed_noise(tests, limits.null_test_limits):
-        rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.location_z)
+        rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.gap_window_z)
     windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
     where = smoother.gap_locations_from_effect_closures(where, judged.closure_by_location, rest, windows)
     return tests[1], where, rest
@@ -417,7 +417,7 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 
 def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
     """The null test of a residual after a fit of the given number of parameters."""
-    samples, level = null_test.residual_channels(problem), limits.significance_level
+    samples, level = null_test.channels_with_residual_indices(problem), limits.significance_level
     return null_test.residual_chi2_null_test(samples, residual, fitted, level, limits.residual_window)
 
 

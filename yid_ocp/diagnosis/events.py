@@ -277,7 +277,7 @@ def _short(smoothed: SmoothedUnknownsResult, recording: int, limits: Thresholds)
     """Unknown forces that are significant, but only for a small part of the time."""
     trace, names = smoothed.smoothed_unknowns[recording], []
     for i, source in enumerate(trace.unknown_groups):
-        sure = smoothed_unknown_significance_mask(trace, [i], limits.location_z)
+        sure = smoothed_unknown_significance_mask(trace, [i], limits.gap_window_z)
         is_force = source.kind == "force" and not source.is_confounded_with_bias and smoothed.group_variance[source]
         if is_force and 0 < np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
             names.append(trace.unknown_names[i])
@@ -308,7 +308,7 @@ def _without_forces_of_motion(
     A force comes with the motion if more recordings than by chance have the same force, or if one recording has more
     than by chance of the same forces as its own recording. Numbers by chance are Poisson distributed.
     """
-    pairs = np.array([[_recurrence(one, other, durations, limits.location_z) for other in forces] for one in forces])
+    pairs = np.array([[_recurrence(one, other, durations, limits.gap_window_z) for other in forces] for one in forces])
     pairs = pairs.reshape(len(forces), len(forces), 2)
     names = list(dict.fromkeys(force.recording for force in forces))
     recording = np.array([names.index(force.recording) for force in forces], int)

@@ -324,8 +324,8 @@ def _prior_precision(law: TorqueLaw, roughness_weight: float) -> Array:
     """Inverse prior covariance of the values at a law's knots, from their second differences and their size."""
     blocks = []
     for quantity in law.quantities:
-        count = len(law.parameter_names_of(quantity))
-        width = law.prior_ranges[law.parameter_names_of(quantity)[0]][1]
+        count = len(law.knot_parameter_names(quantity))
+        width = law.prior_ranges[law.knot_parameter_names(quantity)[0]][1]
         bends = np.diff(np.eye(count), n=2, axis=0) * (_RIDGE_STD_RATIO / width)
         block = roughness_weight * bends.T @ bends + np.eye(count) / width**2
         if quantity == "command":
@@ -352,7 +352,7 @@ def _refitted(
 def _tables(law: TorqueLaw, fit: RefittedModel) -> tuple[TorqueLawTable, ...]:
     made = []
     for quantity, knots in (law.knots or {}).items():
-        names = law.parameter_names_of(quantity)
+        names = law.knot_parameter_names(quantity)
         torque, std = (np.array([own[name] for name in names]) for own in (fit.values, fit.std))
         made.append(TorqueLawTable(quantity, knots, torque, std))
     return tuple(made)

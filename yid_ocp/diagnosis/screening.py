@@ -30,9 +30,9 @@ from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import (
     ResidualChannel,
+    channels_with_residual_indices,
     chi2_p_value,
     encoder_noise_residual_factor,
-    residual_channels,
 )
 
 
@@ -56,7 +56,7 @@ class AllCandidatesLinearization:
 
 
 @dataclass(frozen=True)
-class DetectableAmplitudes:
+class CandidateDetectability:
     """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
 
     effect: EffectBase
@@ -96,7 +96,7 @@ def linearize_candidates(
     labels = {effect.label for effect in base}
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
     placed = problem.with_effects_and_relinearized_filters(base, values)
-    series, rows = residual_channels(problem.problem), problem.problem.residual_rows
+    series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
     scatter = encoder_noise_residual_factor(placed, placed.unknown_vector(values))[rows.data]
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
     for shapes in itertools.zip_longest(*(_shape_grid(effect, grid) for effect in tried)):
@@ -132,9 +132,9 @@ def _basis(matrix: Array) -> Array:
 
 def _candidate_detectable_amplitudes(
     point: AllCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
-) -> tuple[DetectableAmplitudes, ...]:
+) -> tuple[CandidateDetectability, ...]:
     """Smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
-    found: dict[str, list[DetectableAmplitudes]] = {}
+    found: dict[str, list[CandidateDetectability]] = {}
     for signature in point.signatures:
         effect, names = signature.effect, signature.effect.amplitude_parameter_names
         information = signature.projected_sensitivity.T @ signature.projected_sensitivity
@@ -142,7 +142,7 @@ def _candidate_detectable_amplitudes(
         variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
         sizes = np.where(np.diag(information) > 1e-16, z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
         room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
-        entry = DetectableAmplitudes(
+        entry = CandidateDetectability(
             effect, dict(zip(names, map(float, sizes), strict=True)), bool(np.any(sizes < room))
         )
         found.setdefault(effect.label, []).append(entry)
@@ -181,7 +181,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 def _score_candidates(
     point: AllCandidatesLinearization,
     series: Sequence[ResidualChannel],
-    visible: Sequence[DetectableAmplitudes],
+    visible: Sequence[CandidateDetectability],
 ) -> tuple[CandidateScore, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
@@ -320,7 +320,7 @@ def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityM
 class ScreeningResult:
     """Detectability, score tests and confusability of all candidates at one point, with their joint model."""
 
-    detectability: tuple[DetectableAmplitudes, ...]
+    detectability: tuple[CandidateDetectability, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
     joint_score_model: AllCandidatesScoreModel
@@ -335,6 +335,6 @@ def screen_candidates(
     """Screen all candidates not in `base` at `values` for detectability, scores and confusability."""
     point = linearize_candidates(problem, base, values, limits.shape_parameter_grid_size)
     visible = _candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
-    ranked = _score_candidates(point, residual_channels(problem.problem), visible)
+    ranked = _score_candidates(point, channels_with_residual_indices(problem.problem), visible)
     everything = _make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)

@@ -66,7 +66,9 @@ class Thresholds(SmootherThresholds):
         float, Ge(0), Le(1), OptionInfo("fraction of the smoother's decrease that effects must reach")
     ] = 0.75
     # where the gap lies
-    location_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero that locate a gap")] = 3.0
+    gap_window_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero that mark a window of the gap")] = (
+        3.0
+    )
     informed_fraction: Annotated[
         float, Ge(0), Lt(1), OptionInfo("1 - posterior/prior variance of an informed value")
     ] = 0.5
@@ -76,7 +78,7 @@ class Thresholds(SmootherThresholds):
         float, Ge(0), Lt(1), OptionInfo("relative torque error allowed for a good model")
     ] = 0.03
     max_event_duration: Annotated[float, Gt(0), OptionInfo("largest duration of an event", "s")] = 1.0
-    min_event_chi2_fraction: Annotated[
+    min_force_event_gap_fraction: Annotated[
         float, Ge(0), Lt(1), OptionInfo("smallest fraction of the gap that force events must remove")
     ] = 0.1
     max_joint_speed: Annotated[

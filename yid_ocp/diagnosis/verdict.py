@@ -119,8 +119,8 @@ class Judgement:
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     @property
-    def assumption_count(self) -> int:
-        """Number of independent assumptions in the effects: one per local effect and one per other kind."""
+    def independent_effect_count(self) -> int:
+        """Number of independent effects selected: one per local effect and one per other kind."""
         effects = (entry.effect for entry in self.selected_effects)
         return len({effect.label if effect.is_local else effect.kind for effect in effects})
 
@@ -150,18 +150,18 @@ class Judgement:
         }
 
     @property
-    def best_explained_fraction(self) -> float:
-        """Fraction of the gap that effects explain, fitted or, if there is one assumption, surely held out."""
-        held_out = self.gap_closure.ci_low if self.assumption_count == 1 else 0.0
+    def fitted_or_held_out_explained_fraction(self) -> float:
+        """Fraction of the gap that effects explain: fitted or, for one independent effect, surely held out."""
+        held_out = self.gap_closure.ci_low if self.independent_effect_count == 1 else 0.0
         return max(self.explained_fraction, held_out)
 
     def required_explained_fraction(self, limits: Thresholds) -> float:
         """Fraction of the smoother's explanation that the effects are required to explain.
 
-        For k assumptions it is 1 - (1 - `min_explained_fraction`)^k: each assumption must explain that part of the
+        For k independent effects it is 1 - (1 - `min_explained_fraction`)^k: each must explain that part of the
         remainder.
         """
-        return 1.0 - (1.0 - limits.min_explained_fraction) ** self.assumption_count
+        return 1.0 - (1.0 - limits.min_explained_fraction) ** self.independent_effect_count
 
 
 def _verdict_and_reason(
@@ -172,7 +172,7 @@ def _verdict_and_reason(
         return "insufficient_data", ""
     if not said.selected_effects:
         return ("unknown", "none") if has_gap else ("no_gap", "")
-    if said.best_explained_fraction < said.required_explained_fraction(limits):
+    if said.fitted_or_held_out_explained_fraction < said.required_explained_fraction(limits):
         return "unknown", "little"
     if said.failed_transfer_checks:
         return "unknown", "stand_in"
@@ -223,7 +223,7 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
     """
     if not said.selected_effects:
         return 0.0
-    explained = 0.0 if said.failed_transfer_checks else said.best_explained_fraction
+    explained = 0.0 if said.failed_transfer_checks else said.fitted_or_held_out_explained_fraction
     unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
     margin = math.log((1.0 - said.required_explained_fraction(limits)) / unexplained)
     return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))

@@ -87,7 +87,7 @@ class TorqueLaw(EffectBase):
         entries = Parameters(self.parameters[f"{self.label}.{d.name}"] for d in definitions)
         return replace(self, parameters=entries, definitions=tuple(definitions), knots=kept)
 
-    def parameter_names_of(self, quantity: str) -> tuple[str, ...]:
+    def knot_parameter_names(self, quantity: str) -> tuple[str, ...]:
         """Names of the parameters at the knots of one quantity."""
         return tuple(f"{self.label}.{quantity}{k}" for k in range(len((self.knots or {})[quantity])))
 
@@ -109,7 +109,7 @@ class TorqueLaw(EffectBase):
     def _torque(self, quantity: str, x: ca.SX) -> ca.SX:
         """f(x) by cubic B-splines, of which four are nonzero at any x."""
         knots = (self.knots or {})[quantity]
-        values = ca.vertcat(*(self.parameters[name].symbol for name in self.parameter_names_of(quantity)))
+        values = ca.vertcat(*(self.parameters[name].symbol for name in self.knot_parameter_names(quantity)))
         weights = ca.SX(ca.DM(_spline_weights(len(knots)))) @ values
         place = ca.fmin(ca.fmax((x - knots[0]) / (knots[1] - knots[0]), 0), len(knots) - 1)
         total = ca.SX(0)

@@ -16,7 +16,7 @@ from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.virtual.mjcf import (
-    MODEL_ASPECTS,
+    FORMAT_ELEMENTS,
     MUJOCO_APPROXIMATED_ASPECTS,
     ExpressionEvaluator,
     JointDynamicsTerms,
@@ -143,7 +143,7 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
-    known = MODEL_ASPECTS[aspect]
+    known = FORMAT_ELEMENTS[aspect]
     if aspect == "reading":
         return _READING
     if form not in known:
@@ -151,12 +151,14 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
     return FeatureExportSupport("emulated" if aspect in MUJOCO_APPROXIMATED_ASPECTS else "native", known[form])
 
 
-_READING = FeatureExportSupport("not representable", f"{MODEL_ASPECTS['reading']['is']}: correct the readings instead")
+_READING = FeatureExportSupport(
+    "not representable", f"{FORMAT_ELEMENTS['reading']['is']}: correct the readings instead"
+)
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
 _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 
-def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
+def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
     """Support of the export format `form` (`mjcf`, `urdf` or `sdf`) for each effect of a system."""
     value, found = ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
@@ -172,7 +174,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
     return found
 
 
-def format_support_by_parameter(
+def export_support_by_parameter(
     system: System, effects: Mapping[str, FeatureExportSupport], form: str
 ) -> dict[str, FeatureExportSupport]:
     """Support of the export format `form` for each parameter. Parameters of an effect have its support in `effects`."""

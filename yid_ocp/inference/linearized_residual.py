@@ -56,7 +56,7 @@ def nominal_trajectory_from_prediction(
 
 
 @dataclass(frozen=True)
-class ResidualDerivativesAtNodes:
+class ResidualDerivativesByStateAndEffort:
     """Derivatives of r residuals with respect to states and efforts at the nodes around each sample.
 
     Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
@@ -69,7 +69,7 @@ class ResidualDerivativesAtNodes:
     @staticmethod
     def from_nominal_trajectory(
         trajectory: NominalTrajectory, *, with_neighbours: bool = False
-    ) -> ResidualDerivativesAtNodes:
+    ) -> ResidualDerivativesByStateAndEffort:
         """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
 
         `with_neighbours` is required for a sensor of velocities, accelerations or constraint forces, which depends on
@@ -118,20 +118,20 @@ class ResidualDerivativesAtNodes:
             found.append(np.minimum(node, len(trajectory.rollout.torque)) - before)
             parts.append((by_state, by_effort))
         arrays = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
-        return ResidualDerivativesAtNodes(np.concatenate(found), *arrays)
+        return ResidualDerivativesByStateAndEffort(np.concatenate(found), *arrays)
 
     @property
     def visible_state_mask(self) -> BoolArray:
         """Mask of the states on which at least one residual depends, shape (nx,)."""
         return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
-    def select_states(self, kept: IntArray) -> ResidualDerivativesAtNodes:
+    def select_states(self, kept: IntArray) -> ResidualDerivativesByStateAndEffort:
         """Return a copy with the derivatives with respect to the states at the indices `kept`."""
         return replace(self, by_state=self.by_state[:, :, kept])
 
-    def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesAtNodes:
+    def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesByStateAndEffort:
         """Return a copy with the derivatives of the residuals at the indices `rows`."""
-        return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
+        return ResidualDerivativesByStateAndEffort(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
         """Residual derivatives (r, d) along d directions, from the derivatives of states and efforts at K nodes.

@@ -157,7 +157,7 @@ def encoder_noise_residual_factor(
 
     residual_of, nothing = predicted or evaluated, np.zeros((problem.residual_rows.weak_priors.stop, 0))
     points = {group.name for episode in problem.episodes for group in episode.recording.points}
-    rows = [c.residual_indices for c in residual_channels(problem) if c.group in points]
+    rows = [c.residual_indices for c in channels_with_residual_indices(problem) if c.group in points]
     moves_object = problem.system.prescribed and problem.system.unprescribed_coordinate_indices
     if not rows or not moves_object or (before := residual_of(problem)) is None:
         return nothing
@@ -243,7 +243,7 @@ def times_since_recording_start(episode: Episode, samples: SensorMeasurements) -
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def residual_channels(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
+def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
     """Sample times and residual indices of every scalar sensor output of every recording."""
     series: list[ResidualChannel] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):

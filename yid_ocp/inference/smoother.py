@@ -353,7 +353,7 @@ def select_and_smooth_unknowns(
         traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
         # the variance of a group's scores is the mean rise of r'r by unknowns of the reference size
         scores = {source: max(score, 1e-300) for source, (_, score) in _scores(models, nothing).items()}
-        detectable = {source: math.sqrt(limits.detectable_chi2_rise / score) for source, score in scores.items()}
+        detectable = {s: math.sqrt(limits.detectable_unknown_chi2_rise / score) for s, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
         least = limits.min_log_bayes_factor
         return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
@@ -424,7 +424,8 @@ def _alternatives(
         scores = _scores(models, without)
         # the score at zero variance is a poor predictor here: all groups are tried
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
-        least = state.log_evidence - max(limits.min_log_bayes_factor, (1 - limits.tied_evidence_ratio) * drop[source])
+        loss = (1 - limits.min_tied_evidence_ratio) * drop[source]
+        least = state.log_evidence - max(limits.min_log_bayes_factor, loss)
         reached = zip(asked, _largest_evidences(models, less, asked), strict=True)
         found[source] = tuple(other for other, (reach, _) in reached if reach >= least)
     return drop, found
@@ -455,12 +456,12 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 
 
 def gap_locations_by_smoother_evidence(
-    smoothed: SmoothedUnknownsResult, location_z: float = 3.0
+    smoothed: SmoothedUnknownsResult, gap_window_z: float = 3.0
 ) -> tuple[GapLocation, ...]:
     """Rank all locations by their share of the log evidence. At equal shares, observable locations come first.
 
-    The time windows of a location are those in which one of its unknowns is over `location_z` standard deviations from
-    zero.
+    The time windows of a location are those in which one of its unknowns is over `gap_window_z` standard deviations
+    from zero.
     """
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
@@ -471,7 +472,7 @@ def gap_locations_by_smoother_evidence(
     for location, own in groups.items():
         share = weight[location] / total if total > 0 else 0.0
         seen = any(smoothed.detectable_std[s] < 1.0 or drop[s] > 0 for s in own)
-        when = _windows(smoothed, [s for s in own if smoothed.group_variance[s]], location_z)
+        when = _windows(smoothed, [s for s in own if smoothed.group_variance[s]], gap_window_z)
         # locations that could replace every selected group of this location
         also = [{e.location for e in smoothed.alternative_groups[s]} for s in own if s in smoothed.alternative_groups]
         others = tuple(sorted(set.intersection(*also) - {location})) if also else ()

@@ -27,7 +27,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
-    ResidualDerivativesAtNodes,
+    ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import (
@@ -60,11 +60,13 @@ class SmootherThresholds:
         float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")
     ] = 5.0
     max_smoother_unknown_groups: Annotated[int, Ge(1), OptionInfo("largest number of selected groups of unknowns")] = 4
-    detectable_chi2_rise: Annotated[float, Gt(0), OptionInfo("rise of r'r at which unknowns are detectable")] = 10.0
+    detectable_unknown_chi2_rise: Annotated[
+        float, Gt(0), OptionInfo("rise of r'r at which a smoother's unknowns are detectable")
+    ] = 10.0
     force_prior_std_over_load: Annotated[float, Gt(0), OptionInfo("unknown force over the load at its place")] = 0.1
     grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
     bias_prior_std_over_noise: Annotated[float, Gt(0), OptionInfo("unknown bias over its sensor's noise")] = 3.0
-    tied_evidence_ratio: Annotated[
+    min_tied_evidence_ratio: Annotated[
         float, Gt(0), Le(1), OptionInfo("share of a location's evidence at which an alternative is named")
     ] = 0.9
 
@@ -351,7 +353,7 @@ def _recording(
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
     about = course.problem.step, course.nominal.theta, course.nominal.rollout
     moving = np.flatnonzero(dynamic_observable_state_mask(*about, loads))
-    slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course.nominal, with_neighbours=True)
+    slopes = ResidualDerivativesByStateAndEffort.from_nominal_trajectory(course.nominal, with_neighbours=True)
     slopes = slopes.select_states(moving)
     beyond = len(slopes.by_state) - 2  # steps that samples at an interval's end depend on
     by_bias = _bias_slopes(course, unknowns)
@@ -409,7 +411,7 @@ def _loose_start(course: _LinearizedEpisode) -> Array:
 
 
 def _interval_response(
-    steps: tuple[Array, Array, Array], slopes: ResidualDerivativesAtNodes, first: int, length: int
+    steps: tuple[Array, Array, Array], slopes: ResidualDerivativesByStateAndEffort, first: int, length: int
 ) -> tuple[Array, Array, Array]:
     """Derivatives of an interval's final state and rows; steps beyond `length` serve rows of the next interval."""
     a, e, by_effort = steps

@@ -15,7 +15,7 @@ from yid_ocp.data.channel_checks import Issue
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import (
     DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-    residual_channels,
+    channels_with_residual_indices,
     residual_chi2_null_test,
     residuals_exceed_noise,
 )
@@ -107,7 +107,7 @@ def assess_goodness_of_fit(
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
                 parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
         residual = np.concatenate(parts)
-    series = residual_channels(problem)
+    series = channels_with_residual_indices(problem)
     found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.no_data_issue_exceeds_warning)
@@ -201,7 +201,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     blocks: dict[tuple[str, int], list[IntArray]] = {}
     recordings: dict[str, list[IntArray]] = {}
     channels: list[list[IntArray]] = []
-    for series in residual_channels(problem):
+    for series in channels_with_residual_indices(problem):
         channels.append([series.residual_indices])
         recordings.setdefault(series.recording, []).append(series.residual_indices)
         at = (series.t / length).astype(int)
@@ -503,7 +503,7 @@ def priors_that_determine_unknown(data: Array, priors: Array, column: int) -> Bo
 
 
 @dataclass(frozen=True)
-class EstimateChecks:
+class EstimateChecksBeyondFit:
     """Checks of an estimate beyond its fit: finer discretisations, held-out recordings and step stability.
 
     Attributes

@@ -40,7 +40,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.kalman import KalmanSteps, kalman_steps_and_covariance
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
-    ResidualDerivativesAtNodes,
+    ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import dynamic_observable_state_mask, step_derivatives_along_rollout
@@ -157,7 +157,7 @@ class WhiteningFilter:
 def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) -> WhiteningFilter:
     """The whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
-    slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course)
+    slopes = ResidualDerivativesByStateAndEffort.from_nominal_trajectory(course)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     ends = {"seen": slopes.visible_state_mask, "disturbed": np.any(np.abs(start) > _MIN_START_SLOPE, axis=1)}
     live = dynamic_observable_state_mask(step, course.theta, course.rollout, **ends)
@@ -181,7 +181,7 @@ def _filter_steps(
     course: NominalTrajectory,
     errors: InputErrorModel,
     kept: IntArray,
-    slopes: ResidualDerivativesAtNodes,
+    slopes: ResidualDerivativesByStateAndEffort,
     rows_of_node: Sequence[IntArray],
     covariance: Array,
 ) -> tuple[_FilterPart, Array]:

@@ -216,12 +216,12 @@ def _random(experiment: SplineMotionExperiment, seed: int) -> Array:
 def _smooth(experiment: SplineMotionExperiment, w: Array) -> tuple[Array, Array | None]:
     """Scale a motion down until its sensitivities change smoothly with it. Returns the motion and its sensitivities."""
     for _ in range(10):
-        rows = experiment.search_problem_sensitivities(w)
-        there = None if rows is None else experiment.search_problem_sensitivities((1.0 + 1e-4) * w)
+        rows = experiment.sensitivities_to_unknowns(w)
+        there = None if rows is None else experiment.sensitivities_to_unknowns((1.0 + 1e-4) * w)
         if rows is not None and there is not None and _is_near(there, rows):
             return w, rows
         w = 0.5 * w
-    return w, experiment.search_problem_sensitivities(w)
+    return w, experiment.sensitivities_to_unknowns(w)
 
 
 def _is_near(there: Array, rows: Array) -> bool:

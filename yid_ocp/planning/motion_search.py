@@ -398,7 +398,7 @@ class InformativeMotionSearch:
 
     def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
         """Criterion and sensitivities of a motion; the criterion is minus infinity if the rollout fails."""
-        rows = self.experiment.search_problem_sensitivities(w)
+        rows = self.experiment.sensitivities_to_unknowns(w)
         return -np.inf if rows is None else self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:

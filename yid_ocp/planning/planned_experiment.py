@@ -222,7 +222,7 @@ class SplineMotionExperiment:
 
     @cached_property
     def sensitivity_column_names(self) -> tuple[str, ...]:
-        """Column names of `search_problem_sensitivities`: parameters, other unknowns, torque offsets."""
+        """Column names of `sensitivities_to_unknowns`: parameters, other unknowns, torque offsets."""
         return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
 
     @cached_property
@@ -249,7 +249,7 @@ class SplineMotionExperiment:
                 found[rows, i] = samples.decorrelate(own * samples.weight[samples.positive_weight_mask])
         return np.vstack([found, np.eye(len(std))])
 
-    def search_problem_sensitivities(self, w: Array) -> Array | None:
+    def sensitivities_to_unknowns(self, w: Array) -> Array | None:
         """Whitened sensitivities (nr, columns) to relative changes of the unknowns, or None if the rollout fails."""
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
@@ -302,12 +302,12 @@ class SplineMotionExperiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
-        """Difference derivatives (w.size, nr, columns) of `search_problem_sensitivities` by w, or None."""
+        """Difference derivatives (w.size, nr, columns) of `sensitivities_to_unknowns` by w, or None."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()
             moved[i] += _SPLINE_DIFFERENCE_STEP
-            there = self.search_problem_sensitivities(moved.reshape(w.shape))
+            there = self.sensitivities_to_unknowns(moved.reshape(w.shape))
             return None if there is None else (there - rows) / _SPLINE_DIFFERENCE_STEP
 
         found = map_with_merged_calls(one, range(w.size))

@@ -174,7 +174,7 @@ class EpisodePredictor:
         recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
         shift, measured = self.model_functions.recorded_momentum_correction, episode.measured_driven_angles
-        return inputs.with_effect_momentum_shift(shift, recorded, measured, theta, names, by_internal)
+        return inputs.with_effect_momentum_in_reference(shift, recorded, measured, theta, names, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> CorrectedInputs:
         """Correct recorded torques, angles and paths for effects, with derivatives by the parameters `names`."""

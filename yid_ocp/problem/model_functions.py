@@ -65,7 +65,7 @@ class CorrectedInputs:
                     reference[:, column] += moved[: len(reference), at]
         return replace(feedback, reference=reference)
 
-    def with_effect_momentum_shift(
+    def with_effect_momentum_in_reference(
         self,
         shift: RecordedMomentumCorrection,
         recorded: JointMotionWithSensitivities,

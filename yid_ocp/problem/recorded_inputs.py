@@ -18,7 +18,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_column_indices
-from yid_ocp.sensors.base import channel_kinds_for_group_name
+from yid_ocp.sensors.base import additional_sensor_channel_kinds
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
@@ -220,7 +220,7 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
             if any(channel.matches_group_name(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
         for group in recording.channel_groups:
-            of_vectors = [channel.group for channel in channel_kinds_for_group_name(group.name) if channel.components]
+            of_vectors = [c.group for c in additional_sensor_channel_kinds(group.name) if c.components]
             mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
         if any(recorded_camera_pose(group) is not None for group in recording.points):
             found.add("camera")

@@ -5,7 +5,7 @@ from pkgutil import iter_modules
 
 from yid_ocp.sensors.base import CHANNEL_KINDS as CHANNEL_KINDS
 from yid_ocp.sensors.base import SENSOR_READERS as SENSOR_READERS
-from yid_ocp.sensors.base import ChannelSpecification as ChannelSpecification
+from yid_ocp.sensors.base import RecordedChannelKind as RecordedChannelKind
 from yid_ocp.sensors.base import Sensor as Sensor
 from yid_ocp.sensors.base import SensorData as SensorData
 from yid_ocp.sensors.base import SensorDataInputs as SensorDataInputs

@@ -80,7 +80,7 @@ class SensorOptions:
 
 
 @dataclass(frozen=True)
-class ChannelSpecification:
+class RecordedChannelKind:
     """One kind of recorded quantity: its group, dataset, unit, components and sensor constants.
 
     Noise levels are stored in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std` or, for points, in the
@@ -104,11 +104,11 @@ class ChannelSpecification:
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
-CHANNEL_KINDS: Registry[ChannelSpecification] = Registry("recorded channel")
+CHANNEL_KINDS: Registry[RecordedChannelKind] = Registry("recorded channel")
 """Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def channel_kinds_for_group_name(group: str) -> tuple[ChannelSpecification, ...]:
+def additional_sensor_channel_kinds(group: str) -> tuple[RecordedChannelKind, ...]:
     """Channel kinds registered for a recording's group of this name; empty for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
@@ -217,7 +217,7 @@ class Sensor(ABC):
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
     """
 
-    channel: ClassVar[ChannelSpecification]  # kind of recorded channels
+    channel: ClassVar[RecordedChannelKind]  # kind of recorded channels
     group_name: str  # settings key: a point group, such as `points_camera`, or `joints.effort`
     # prediction without a model: zero, or the first measured value
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"

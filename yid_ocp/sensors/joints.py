@@ -17,7 +17,7 @@ from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    ChannelSpecification,
+    RecordedChannelKind,
     RecordedJointGroup,
     RecordedPointGroup,
     Sensor,
@@ -31,8 +31,8 @@ from yid_ocp.sensors.base import (
 
 JOINT_EFFORT_GROUP_NAME = "joints.effort"
 JOINT_POSITION_GROUP_NAME = "joints.position"
-_EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelSpecification("joints", "effort", "N m"))
-_POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelSpecification("joints", "position", "rad"))
+_EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(RecordedChannelKind("joints", "effort", "N m"))
+_POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(RecordedChannelKind("joints", "position", "rad"))
 _MAX_STEPS_PER_GAP = 0.1  # median gap between a quantized channel's values, in smallest gaps and per value
 NOISE_ESTIMATE_DIFFERENCE_ORDER = 6  # of differences: they remove motion slower than the sampling
 
@@ -128,10 +128,10 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
     is_sample = joints.effort_sampling_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
-    return [smoothed_effort_data(around, EffortSensor(names), joints.t, effort, std, bias, is_sample=is_sample)]
+    return [filtered_effort_measurements(around, EffortSensor(names), joints.t, effort, std, bias, is_sample=is_sample)]
 
 
-def smoothed_effort_data(
+def filtered_effort_measurements(
     inputs: SensorDataInputs,
     sensor: JointSensor,
     t: Array,

@@ -13,18 +13,18 @@ from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    ChannelSpecification,
     RecordedChannelGroup,
+    RecordedChannelKind,
     SensorData,
     SensorDataInputs,
     expand_to_joint_values,
     missing_noise_level_error,
 )
-from yid_ocp.sensors.joints import JointSensor, smoothed_effort_data
+from yid_ocp.sensors.joints import JointSensor, filtered_effort_measurements
 
 _TORQUE_CONSTANT = "torque_constant"
 _CURRENT = CHANNEL_KINDS.register("motors.current")(
-    ChannelSpecification("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
+    RecordedChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
 )
 
 
@@ -82,4 +82,4 @@ def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorDa
         raise DataError("a torque constant is zero", where=where, allowed=allowed)
     sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
     values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
-    return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)
+    return filtered_effort_measurements(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)

@@ -15,8 +15,8 @@ from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    ChannelSpecification,
     RecordedChannelGroup,
+    RecordedChannelKind,
     Sensor,
     SensorData,
     SensorDataInputs,
@@ -152,10 +152,10 @@ def _with_encoder_noise(
 
 _XYZ = ("x", "y", "z")
 _ANGULAR_VELOCITY = CHANNEL_KINDS.register("imu.angular_velocity")(
-    ChannelSpecification("imu", "angular_velocity", "rad/s", _XYZ)
+    RecordedChannelKind("imu", "angular_velocity", "rad/s", _XYZ)
 )
 _SPECIFIC_FORCE = CHANNEL_KINDS.register("imu.specific_force")(
-    ChannelSpecification("imu", "specific_force", "m/s^2", _XYZ)
+    RecordedChannelKind("imu", "specific_force", "m/s^2", _XYZ)
 )
 
 

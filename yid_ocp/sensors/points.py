@@ -15,7 +15,7 @@ from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    ChannelSpecification,
+    RecordedChannelKind,
     RecordedPointGroup,
     Sensor,
     SensorData,
@@ -25,7 +25,7 @@ from yid_ocp.sensors.base import (
 )
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
-_POINTS = CHANNEL_KINDS.register("points")(ChannelSpecification("points", "position", "m", ("x", "y", "z")))
+_POINTS = CHANNEL_KINDS.register("points")(RecordedChannelKind("points", "position", "m", ("x", "y", "z")))
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,12 @@ import casadi as ca
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Inertia, Placement
 from yid_ocp.model.system import MidpointState, NodeState, System, floating_joint_mechanism
-from yid_ocp.sensors.base import CHANNEL_KINDS, ChannelSpecification
+from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelKind
 from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
 _XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
-_FORCE = CHANNEL_KINDS.register("wrist.force")(ChannelSpecification("wrist", "force", "N", _XYZ, _SIGN))
-_TORQUE = CHANNEL_KINDS.register("wrist.torque")(ChannelSpecification("wrist", "torque", "N m", _XYZ, _SIGN))
+_FORCE = CHANNEL_KINDS.register("wrist.force")(RecordedChannelKind("wrist", "force", "N", _XYZ, _SIGN))
+_TORQUE = CHANNEL_KINDS.register("wrist.torque")(RecordedChannelKind("wrist", "torque", "N m", _XYZ, _SIGN))
 _N_LOCKED_JOINTS = 6
 
 

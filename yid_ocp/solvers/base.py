@@ -27,7 +27,7 @@ from yid_ocp.inference.linearized_residual import (
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
-    EstimateChecks,
+    EstimateChecksBeyondFit,
     GoodnessOfFit,
     ParameterEstimate,
     assess_goodness_of_fit,
@@ -101,7 +101,7 @@ class Solution(ReprMixin):
         Duration of the search [s].
     evaluation, problem : Evaluation or None, EstimationProblem or None
         Evaluation at `x`; the problem, whitened there.
-    checks : EstimateChecks, optional
+    checks : EstimateChecksBeyondFit, optional
         Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only.
     """
 
@@ -119,7 +119,7 @@ class Solution(ReprMixin):
     evaluation: Evaluation | None
     solver_name: str
     problem: EstimationProblem | None = None
-    checks: EstimateChecks | None = None
+    checks: EstimateChecksBeyondFit | None = None
 
     def _summary(self) -> ReprLineAndTableRows:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}

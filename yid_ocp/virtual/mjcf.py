@@ -27,7 +27,7 @@ from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement,
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, MidpointState, System
 
-MODEL_ASPECTS: Mapping[str, Mapping[str, str]] = YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml"))
+FORMAT_ELEMENTS: Mapping[str, Mapping[str, str]] = YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml"))
 """Aspects of a model that an engine may or may not represent: a description (`is`) and the elements of each format."""
 
 _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of friction torque tau_c [N m]
@@ -39,7 +39,7 @@ MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
 # aspects for which MuJoCo has an equivalent term
 _NATIVE_ASPECTS = (
-    frozenset(MODEL_ASPECTS)
+    frozenset(FORMAT_ELEMENTS)
     - MUJOCO_APPROXIMATED_ASPECTS
     - _IGNORED_ASPECTS
     - {"servo_firmware", "clock", "memory", "force"}
@@ -87,7 +87,7 @@ class ExpressionEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Keys of `MODEL_ASPECTS` whose part of the system's description depends on `symbols`."""
+    """Keys of `FORMAT_ELEMENTS` whose part of the system's description depends on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -118,7 +118,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ExpressionEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
-    """Terms by joint that an effect adds, and the `MODEL_ASPECTS` keys that it changes."""
+    """Terms by joint that an effect adds, and the `FORMAT_ELEMENTS` keys that it changes."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
@@ -446,9 +446,9 @@ def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: b
     for effect in system.effects:
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
         if aspects:
-            changed = MODEL_ASPECTS[min(aspects)]["is"]
+            changed = FORMAT_ELEMENTS[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            allowed = ", ".join(own["is"] for name, own in MODEL_ASPECTS.items() if name in able)
+            allowed = ", ".join(own["is"] for name, own in FORMAT_ELEMENTS.items() if name in able)
             where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:

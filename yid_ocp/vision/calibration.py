@@ -31,9 +31,9 @@ from yid_ocp.vision.camera_registration import (
     CalibrationFrame,
     CalibrationState,
     RobustCostDerivatives,
-    SurfaceVisibilityFractions,
+    SurfaceObservationFractions,
     candidate_calibration_states,
-    pooled_surface_visibility_fractions,
+    pooled_surface_observation_fractions,
     robust_gradient_and_hessian,
 )
 from yid_ocp.vision.point_cloud import weighted_median
@@ -196,7 +196,7 @@ class CameraCalibration:
     # (10, 10), of `camera_state`, in the order of `CalibrationState.difference_from`; zero if nothing was estimated
     state_covariance: Array
     estimate_minus_used: Array  # (10,), estimate minus used state, if the pose is fixed
-    arm_visibility: SurfaceVisibilityFractions | None  # visibility of the arm at the calibrated state
+    arm_visibility: SurfaceObservationFractions | None  # visibility of the arm at the calibrated state
     n_frames: int  # number of frames used
     message: str  # text for the user
 
@@ -304,7 +304,7 @@ class _Calibrator:
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = pooled_surface_visibility_fractions(self.arm, chosen, state, _RAY_REACH)
+        presence = pooled_surface_observation_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= _MIN_ARM_COVERAGE * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
@@ -351,7 +351,7 @@ class _Calibrator:
         for trial in tried:
             for reach in _STAGE_REACHES:
                 trial = self._rounds(trial, few, reach, False, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
-            presence = pooled_surface_visibility_fractions(self.arm, few, trial, 0.5 * _RAY_REACH)
+            presence = pooled_surface_observation_fractions(self.arm, few, trial, 0.5 * _RAY_REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
             if most > _GOOD_START_FRACTION:

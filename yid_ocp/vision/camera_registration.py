@@ -360,7 +360,7 @@ def _add_costs(
 
 
 @dataclass(frozen=True)
-class SurfaceVisibilityFractions:
+class SurfaceObservationFractions:
     """Fractions of the arm's surface in view that a cloud contains, occludes or sees through."""
 
     there: float  # a cloud has it
@@ -369,9 +369,9 @@ class SurfaceVisibilityFractions:
     samples: int
 
 
-def pooled_surface_visibility_fractions(
+def pooled_surface_observation_fractions(
     arm: ArmSurface, frames: Sequence[CalibrationFrame], state: CalibrationState, within: float
-) -> SurfaceVisibilityFractions:
+) -> SurfaceObservationFractions:
     """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)
     for glimpse in frames:
@@ -386,4 +386,4 @@ def pooled_surface_visibility_fractions(
         covered = known & ~near & (depth < own[:, 2] - within)
         counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
     there, covered, through = (float(share) for share in counts[:3] / max(counts[3], 1.0))
-    return SurfaceVisibilityFractions(there, covered, through, int(counts[3]))
+    return SurfaceObservationFractions(there, covered, through, int(counts[3]))

@@ -243,10 +243,8 @@ _SAME_ROOT_FRACTION = 0.1  # of the length between the ends; closer roots are th
 _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends; height difference that makes one end higher
 
 
-def frames_with_consistent_root_end(
-    frames: Sequence[FrameReport], options: TrackOptions
-) -> tuple[list[FrameReport], str]:
-    """Make the object's root the same end in all fits. Also returns a text that says how the end was chosen.
+def align_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
+    """Return the frames with the object's root at the same end in all fits, and a text on how it was chosen.
 
     A choice is needed if a shape fits equally well with its root at another end. Ends are first followed from frame to
     frame. The root is then the end that does not move (if it is fixed) or the higher end.

@@ -498,11 +498,11 @@ class DepthSensorModel:
 
 
 @dataclass(frozen=True)
-class CameraTimingModel:
-    """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
+class VirtualCameraTiming:
+    """Timing of a virtual camera: frame rate, dropped frames and errors of time stamps."""
 
     mean_rate: float = 3.0  # [Hz]
-    dropped_fraction: float = 0.0  # fraction of frames that never arrive
+    dropped_frame_fraction: float = 0.0  # fraction of frames that never arrive
     latency: float = 0.0  # stamp minus capture time, camera clock offset included [s]
     latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
 
@@ -513,7 +513,7 @@ class CameraTimingModel:
         count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
         taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
         taken = taken[taken < stop]
-        taken = taken[rng.random(len(taken)) >= self.dropped_fraction]
+        taken = taken[rng.random(len(taken)) >= self.dropped_frame_fraction]
         return taken, taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
 
 
@@ -532,7 +532,7 @@ class VirtualCameraSetup:
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # default: an Asus Xtion Pro Live
-    timing: CameraTimingModel = field(default_factory=CameraTimingModel)
+    timing: VirtualCameraTiming = field(default_factory=VirtualCameraTiming)
     seed: int = 0  # seed of all random draws
 
 

@@ -320,7 +320,7 @@ class FrameTracker:
         filtered = None if work.filtered is None else work.filtered.points
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
-    def unprocessed_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
+    def initial_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Make a frame's report before processing, with a reason if the frame is dropped."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
@@ -328,7 +328,7 @@ class FrameTracker:
 
     def drop_outlying_frames_and_choose_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Drop outlying frames and choose the root end, with a note on how it was chosen."""
-        rooted, note = frame_selection.frames_with_consistent_root_end(frames, self.options)
+        rooted, note = frame_selection.align_root_ends(frames, self.options)
         return frame_selection.mark_outlying_frames(rooted, self.options), note
 
     def track_result_from_frame_reports(
@@ -377,7 +377,7 @@ class FrameTracker:
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
         """The object's part of a frame, or None with the reason in its report."""
-        work = _Work(self.unprocessed_frame_report(index, calibration, self._reasons.get(index, "")))
+        work = _Work(self.initial_frame_report(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.config.reader import EMBEDDED_CONFIG_FILE_NAME, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
@@ -57,11 +57,11 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         together = functools.partial(score_joined_slices, arguments.join, arguments.out or "joined-slices")
         return run_command_and_print(arguments, together)
     runs = [
-        load_config(path, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+        load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
         for path in arguments.configs or [None]
     ]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
-        runs.append(load_config(None, arguments.overrides, EMBEDDED_CONFIG_FILE_NAME))
+        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG_FILE_NAME))
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     purpose = blind.BLIND_ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"

@@ -31,7 +31,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import DividedLinksModel, RefinedDiscretisation
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
-from yid_ocp.sensors.base import channel_kinds_for_group_name
+from yid_ocp.sensors.base import additional_sensor_channel_kinds
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
@@ -220,7 +220,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
             where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_GROUP_NAME}"
             raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
-        constants = next((c.constants for c in channel_kinds_for_group_name(group) if c.quantity == quantity), {})
+        constants = next((c.constants for c in additional_sensor_channel_kinds(group) if c.quantity == quantity), {})
         for constant in said.constants:
             if constant not in constants:
                 details = unknown_name_error_arguments(constant, constants)

@@ -9,7 +9,7 @@ from typing import Any
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodsComparisonResult, compare_methods
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import Progress
-from yid_ocp.inference.uncertainty import EstimateChecks
+from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
@@ -43,10 +43,10 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             folder.log_event("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.report_iterate(entry)
 
-        limits, budget = run.diagnosis.null_test_residual_limits, run.compare.time_budget
+        limits, budget = run.diagnosis.null_test_residual_limits, run.compare.total_time_budget
         comparison = compare_methods(problem, solvers, truth, iterate, limits, math.inf if budget is None else budget)
         judged = comparison.verdict_solution
-        own, checks = judged.problem or problem, judged.checks or EstimateChecks()
+        own, checks = judged.problem or problem, judged.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions
         about = {
             "doubts": issues_to_plain_data(checks.data_issues),

@@ -21,7 +21,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.sensors.base import ChannelSpecification, channel_kinds_for_group_name
+from yid_ocp.sensors.base import RecordedChannelKind, additional_sensor_channel_kinds
 from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
@@ -436,9 +436,9 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     return found
 
 
-def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, ChannelSpecification]]:
+def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, RecordedChannelKind]]:
     for group in recording.channel_groups:
-        for kind in channel_kinds_for_group_name(group.name):
+        for kind in additional_sensor_channel_kinds(group.name):
             if kind.components and kind.quantity in group.values_by_quantity:
                 yield f"{group.name}.{kind.quantity}", group, kind
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from yid_ocp.analysis.estimate_history import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnose import diagnose
@@ -61,7 +61,7 @@ _MAX_SHOWN_UNKNOWNS = 5  # in a figure; the page's maps and trajectories.h5 cont
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `diagnose` and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline_run_folders=said))

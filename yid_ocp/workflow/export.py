@@ -171,7 +171,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     if form == "mjcf":
         grasp = FeatureExportSupport("native", "equality constraints between sites, or a tendon where it gives way")
     parameters = {}
-    for name, entry in models.format_support_by_parameter(full, supports, form).items():
+    for name, entry in models.export_support_by_parameter(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
@@ -226,7 +226,7 @@ def _expressible(
     calibrated: _CalibratedModel, full: System, form: str
 ) -> tuple[System, dict[str, FeatureExportSupport]]:
     """The system without effects that a format cannot represent, and the representation of each effect."""
-    said = models.format_support_by_effect(full, calibrated.values_for(full), form)
+    said = models.export_support_by_effect(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
         told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
         kept = [label for label, entry in told.items() if not entry.how.startswith("neutral")]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from yid_ocp.analysis import identifiability as fisher
 from yid_ocp.analysis import what_if
 from yid_ocp.analysis.estimation import problem_without_cable_memory
-from yid_ocp.analysis.experiment_design import RecordedExperiment
+from yid_ocp.analysis.experiment_design import UnchangedExperiment
 from yid_ocp.analysis.identifiability import (
     GRASP_OFFSET_PRIOR_STD,
     IdentifiabilityResult,
@@ -257,7 +257,7 @@ def _change_set_outcomes(
     other = system_with_second_arm_holding_object(run, build_system(run))
     two_arms = None if other is None else system_with_grasp_offset_effects(other)
     x = fisher.unknowns_from_solution(problem, common["x"])
-    setting = RecordedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
+    setting = UnchangedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
     return list(to_lossless_plain_data(what_if.evaluate_experiment_change_sets(setting, sets, inflation)))
 
 

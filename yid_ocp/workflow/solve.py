@@ -19,7 +19,7 @@ from yid_ocp.analysis.estimation import (
 )
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.inference.uncertainty import EstimateChecks, EstimateShiftByLinksAndTimeStep, covariance_to_dict
+from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByLinksAndTimeStep, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPrediction
 from yid_ocp.solvers import Iterate, Solution, Status
@@ -48,7 +48,7 @@ def run_solve(
         problem = build_problem(run)
         log_iterate = _iterate_logger(problem, folder, progress, is_live)
         solution = solve(problem, run.solver, callback=log_iterate, progress=progress)
-        problem, checks = solution.problem or problem, solution.checks or EstimateChecks()
+        problem, checks = solution.problem or problem, solution.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
         folder.log_event("end", **end)

@@ -202,12 +202,12 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
-    for name in settings.gripper_start_offsets_from_object:
+    for name in settings.gripper_start_from_object_end:
         if name not in grasps:
-            where = ("track", "virtual_frames", "gripper_start_offsets_from_object", name)
+            where = ("track", "virtual_frames", "gripper_start_from_object_end", name)
             raise unknown_name_error(run, "grasp", name, grasps, *where)
     with add_setting_location_to_errors(run, "track", "virtual_frames"):
-        posture = grasping_joint_angles(system, offsets=settings.gripper_start_offsets_from_object)
+        posture = grasping_joint_angles(system, offsets=settings.gripper_start_from_object_end)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
         seed = settings.seed
@@ -217,7 +217,7 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = record_simulation(system, None, experiment, truth)
         rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
-        timing = surface_meshes.CameraTimingModel(rate, settings.dropped_fraction, *latency)
+        timing = surface_meshes.VirtualCameraTiming(rate, settings.dropped_frame_fraction, *latency)
         depth = surface_meshes.DepthSensorModel(outlier_probability=settings.outlier_fraction)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
         camera = surface_meshes.VirtualCameraSetup(pose, depth, timing, seed=seed)
@@ -274,7 +274,7 @@ class _FrameTasks:
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
         require_task_values([result for result in results if "abruptly" not in result.error])
         return [
-            tracker.unprocessed_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
+            tracker.initial_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
             if "abruptly" in result.error
             else dataclass_from_plain_data(FrameReport, result.value)
             for i, result in zip(tracker.frame_order, results, strict=True)

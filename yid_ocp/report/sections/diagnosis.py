@@ -11,7 +11,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
-from yid_ocp.inference.null_test import residual_channels
+from yid_ocp.inference.null_test import channels_with_residual_indices
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, z_scores_of_smoothed_unknowns
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
@@ -223,7 +223,7 @@ def _recording_figures(
 def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
     # predicted decrease of r'r in per cent of its excess over noise, or absolute if there is little excess
     fit = finding.nominal_model
-    rows = np.concatenate([series.residual_indices for series in residual_channels(fit.problem)])
+    rows = np.concatenate([series.residual_indices for series in channels_with_residual_indices(fit.problem)])
     excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
     percent = finding.verdict != "no_gap" and excess > 0
     factor = 100 / excess if percent else 1.0
