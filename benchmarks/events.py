@@ -141,7 +141,7 @@ class _BumpAndPushes:
     def edit_model(self, model: Any) -> None:
         pass
 
-    def prepare_motion(self, data: Any) -> None:
+    def begin_motion(self, data: Any) -> None:
         self.begun = float(data.time)
 
     def add_forces(self, model: Any, data: Any) -> None:

@@ -121,7 +121,7 @@ class Injected:
     def edit_model(self, model: Any) -> None:
         self.at = np.array([model.joint(name).id for name in self.joints])
 
-    def prepare_motion(self, data: Any) -> None:
+    def begin_motion(self, data: Any) -> None:
         self.has_begun = True
 
     def add_forces(self, model: Any, data: Any) -> None:

@@ -111,7 +111,7 @@ ROUGH = Torques(
 
 def within_limits(system: System, run: SimulationResult) -> bool:
     """Whether no arm joint exceeds its torque or velocity, and no joint of the object is as fast as in a snap."""
-    driven = list(system.driven_coordinate_indices)
+    driven = list(system.actuated_coordinate_indices)
     torque = np.array([system.mechanism.joints[j].effort_limit for j in driven])
     speed = np.array([system.mechanism.joints[j].velocity_limit for j in driven])
     of_object = np.setdiff1d(np.arange(system.n_coordinates), driven)

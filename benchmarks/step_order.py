@@ -63,7 +63,7 @@ def played(system: System, seed: int, duration: float) -> SimulationResult:
 def recorded(system: System, run: SimulationResult, every: int, noise: float, name: str) -> Recording:
     """Every n-th sample of joints, torque (its mean) and grasped points, and the junction ten times a second."""
     rng = np.random.default_rng(11)
-    driven = list(system.driven_coordinate_indices)
+    driven = list(system.actuated_coordinate_indices)
     rows = slice(None, None, every)
     whole = (len(run.t) - 1) // every
     torque = run.effort[: whole * every].reshape(whole, every, -1).mean(axis=1)

@@ -155,7 +155,7 @@ class Played:
 
     def joints(self, seed: int) -> JointGroup:
         """What the encoders recorded."""
-        driven = list(self.system.driven_coordinate_indices)
+        driven = list(self.system.actuated_coordinate_indices)
         noise = 2e-4 * np.random.default_rng([seed, 5]).standard_normal((len(self.t), len(driven)))
         position = self.q[:, driven] + noise
         stated = {"position_std": 2e-4, "effort_std": 0.0, "effort_kind": "command"}

@@ -18,7 +18,7 @@ from light_tasks import deadly, squared
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.display import Progress
-from yid_ocp.errors import WorkerError
+from yid_ocp.errors import ParallelWorkError
 from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, run_tasks
 from yid_ocp.parallel.resumable_tasks import _dask_executor as connected
 from yid_ocp.version import software_fingerprint
@@ -102,25 +102,28 @@ OLD = {"yid-ocp": "99.0", "code": "b" * 64}, r"version: yid-ocp \S+ instead of 9
 def test_a_worker_of_another_version_is_refused(scheduler, monkeypatch, other, words):
     here = software_fingerprint() | other
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: here)
-    with pytest.raises(WorkerError, match=words):
+    with pytest.raises(ParallelWorkError, match=words):
         scheduler.config.check_scheduler_available()
 
 
 def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
     elsewhere = SimpleNamespace(__module__="nowhere.to_be_found")
     missing = "ModuleNotFoundError: No module named 'nowhere'"
-    with pytest.raises(WorkerError, match=missing), connected(scheduler.address, elsewhere, tmp_path):
+    with pytest.raises(ParallelWorkError, match=missing), connected(scheduler.address, elsewhere, tmp_path):
         pass
     unseen = nullcontext(SimpleNamespace(name=str(tmp_path / "unseen")))
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.tempfile.NamedTemporaryFile", lambda **_: unseen)
-    with pytest.raises(WorkerError, match=f"does not see {tmp_path}"), connected(scheduler.address, squared, tmp_path):
+    with (
+        pytest.raises(ParallelWorkError, match=f"does not see {tmp_path}"),
+        connected(scheduler.address, squared, tmp_path),
+    ):
         pass
 
 
 def test_workers_of_several_threads_are_refused():
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
-        pytest.raises(WorkerError, match="2 tasks at once in one process"),
+        pytest.raises(ParallelWorkError, match="2 tasks at once in one process"),
     ):
         WorkerConfig(scheduler_address=cluster.scheduler_address).check_scheduler_available()
 
@@ -128,7 +131,7 @@ def test_workers_of_several_threads_are_refused():
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere", "a:b:c"])
 def test_a_scheduler_that_is_not_there_is_said(address, monkeypatch):
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks._CONNECT_TIMEOUT", 0.5)
-    with pytest.raises(WorkerError, match="no scheduler answers") as caught:
+    with pytest.raises(ParallelWorkError, match="no scheduler answers") as caught:
         WorkerConfig(scheduler_address=address).check_scheduler_available()
     assert address in str(caught.value)
     assert "dask scheduler" in str(caught.value)
@@ -136,7 +139,7 @@ def test_a_scheduler_that_is_not_there_is_said(address, monkeypatch):
 
 def test_dask_is_optional(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(WorkerError, match=r"pip install 'yid-ocp\[cluster\]'"):
+    with pytest.raises(ParallelWorkError, match=r"pip install 'yid-ocp\[cluster\]'"):
         WorkerConfig(scheduler_address="localhost:8786").check_scheduler_available()
 
 
@@ -158,7 +161,7 @@ def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, monke
         return real(**where)
 
     monkeypatch.setattr(distributed, "Client", busy)
-    answer = pytest.raises(WorkerError, match="event loop of Dask did not start") if refused else nullcontext()
+    answer = pytest.raises(ParallelWorkError, match="event loop of Dask did not start") if refused else nullcontext()
     with answer, connected(scheduler.address) as (executor, _):
         assert executor.submit(abs, -3).result(timeout=60) == 3
     assert len(asked) == 3

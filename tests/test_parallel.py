@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError
+from yid_ocp.errors import ConfigError, DataError, OutputError, ParallelWorkError
 from yid_ocp.parallel import (
     InlineExecutor,
     Task,
@@ -221,7 +221,7 @@ def test_what_all_tasks_found_or_why_one_did_not():
     assert require_task_values([good, good]) == [1, 1]
     with pytest.raises(RuntimeError, match="1 of 2 tasks failed, b with ZeroDivisionError: no b; the same command"):
         require_task_values([good, TaskResult("b", error="ZeroDivisionError: no b")])
-    with pytest.raises(WorkerError, match="c with DataError: no such file; where: here; try: there"):
+    with pytest.raises(ParallelWorkError, match="c with DataError: no such file; where: here; try: there"):
         require_task_values([good, TaskResult("c", error="DataError: no such file\n  where: here\n  try: there")])
 
 

@@ -85,8 +85,8 @@ class OutputError(YidError):
     _usual_hint = "choose another path"
 
 
-class WorkerError(YidError):
-    """Raised when workers cannot be reached or are unsuitable for their tasks."""
+class ParallelWorkError(YidError):
+    """Raised when workers cannot be reached, are unsuitable for their tasks, or fail in them for a known cause."""
 
 
 class InsufficientMemoryError(YidError):

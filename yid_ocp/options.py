@@ -61,7 +61,7 @@ class Option:
 
 
 @functools.cache
-def dataclass_options(kind: type) -> Mapping[str, Option]:
+def options_by_key(kind: type) -> Mapping[str, Option]:
     """Options of a dataclass by key. A key is the field name without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
     found = {}
@@ -138,7 +138,7 @@ def _words(hint: Any) -> str:
 def check_option_bounds(options: Any, where: str) -> None:
     """Raise `ConfigError` if a number in an options dataclass is outside its annotated bounds."""
     kind: Any = type(options)
-    for name, option in dataclass_options(kind).items():
+    for name, option in options_by_key(kind).items():
         value = getattr(options, option.field_name)
         if not _within(option.type_hint, value):
             raise ConfigError(f"{name} = {value}", where=where, allowed=describe_type(option.type_hint))

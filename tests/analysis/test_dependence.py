@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.analysis.discretisation import smallest_possible_grasp_gaps, step_map_natural_frequencies
+from yid_ocp.analysis.discretisation import min_grasp_gaps_at_posture, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
     linearise_step_equations,
-    parameter_influences,
+    parameter_equations_and_responses,
     step_complexity_summary,
 )
 from yid_ocp.analysis.step_symbols import NamedStepEquations
@@ -44,7 +44,7 @@ def judged(problem):
     path = episode.initial_known_coordinates[len(system.driven) :]
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
     symbols = NamedStepEquations.from_equations(step.equations)
-    found = parameter_influences(step, symbols, episode, rest.state, problem.theta, rows)
+    found = parameter_equations_and_responses(step, symbols, episode, rest.state, problem.theta, rows)
     return {entry.parameter: entry for entry in found}, rest, rows
 
 
@@ -175,7 +175,7 @@ def test_without_sensors_only_rows_are_said(hanging):
     theta = step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, theta, np.zeros(0))
-    found = {e.parameter: e for e in parameter_influences(step, symbols, None, rest.state, theta, rows)}
+    found = {e.parameter: e for e in parameter_equations_and_responses(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].observable_rows is None
     assert (found["T1.twist"].max_change_from_rest, found["T1.twist"].seconds) == (None, 0.0)
     assert len(found["T1.bend"].rows) == 12
@@ -284,7 +284,7 @@ def reaching(urdf_folder):
 )
 def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
     system = reaching(x)
-    found = smallest_possible_grasp_gaps(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
+    found = min_grasp_gaps_at_posture(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
     assert set(found) == {"hand"}
     assert found["hand"] == pytest.approx(gap, abs=2e-3)
 
@@ -292,8 +292,8 @@ def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
 def test_each_grasp_has_its_gap_and_no_grasp_none(reaching):
     """Tip at 0.3 m and elbow at 0.7 m above the ground, of a rod of 0.6 m whose middle link ends at 0.4 m."""
     system = reaching(grasps=2)
-    found = smallest_possible_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    found = min_grasp_gaps_at_posture(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05
     system = reaching(grasps=0)
-    assert smallest_possible_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
+    assert min_grasp_gaps_at_posture(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}

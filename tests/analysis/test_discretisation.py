@@ -22,7 +22,7 @@ from yid_ocp.analysis.discretisation import (
     _gauss_newton_step_in_finer_model,
     _half_step_error,
     estimate_shifts_by_discretisation,
-    inflate_stds_by_discretisation,
+    estimates_with_discretisation_error,
     largest_alternating_error_growth,
     longest_accurate_time_step,
     predicted_refit_residual_at_finer_step,
@@ -139,7 +139,7 @@ ONE, BOTH = math.hypot(0.1, 0.6), math.hypot(0.1, 0.6, 0.8)
 )
 def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):
     shifts = {"a": EstimateShiftByLinksAndTimeStep(links, time_step)}
-    found = inflate_stds_by_discretisation({"a": estimate(10.0, 0.1)}, shifts, {})
+    found = estimates_with_discretisation_error({"a": estimate(10.0, 0.1)}, shifts, {})
     assert found["a"].std == pytest.approx(std)
 
 
@@ -153,7 +153,7 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
     shifts = {"c": EstimateShiftByLinksAndTimeStep(9.0), "a": EstimateShiftByLinksAndTimeStep(move)}
-    found = inflate_stds_by_discretisation(said, shifts, {})
+    found = estimates_with_discretisation_error(said, shifts, {})
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
     assert found["b"] == said["b"]
@@ -175,7 +175,7 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
 def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
     said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
     shifts = {"a": EstimateShiftByLinksAndTimeStep(0.3)}
-    found = inflate_stds_by_discretisation({"a": said}, shifts, {})["a"].interval
+    found = estimates_with_discretisation_error({"a": said}, shifts, {})["a"].interval
     if expected is None:
         assert found is None
     else:
@@ -184,7 +184,7 @@ def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected)
 
 def test_what_nothing_informs_stays_unknown():
     said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
-    assert inflate_stds_by_discretisation(said, {"a": EstimateShiftByLinksAndTimeStep(5.0, 5.0)}, {}) == said
+    assert estimates_with_discretisation_error(said, {"a": EstimateShiftByLinksAndTimeStep(5.0, 5.0)}, {}) == said
 
 
 def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):

@@ -16,12 +16,12 @@ from yid_ocp.analysis import torque_error_propagation as propagation
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    ExperimentVariantSensitivities,
-    ExperimentVariantSensitivityBuilder,
+    MechanicalVariantSensitivityBuilder,
     PointObservationSchedule,
     UnchangedExperiment,
-    extended_step_and_measurable_points,
+    VariantPositionSensitivities,
     measurable_points,
+    step_with_frames_at_measurable_points,
 )
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
@@ -100,7 +100,7 @@ def sloped():
     rng = np.random.default_rng(3)
     slopes = {(i, "camera", frame): rng.standard_normal((5, 3, 2)) for i in range(3) for frame in ("a", "b")}
     problem = SimpleNamespace(episodes=[SimpleNamespace(grid=TimeGrid(10.0, 0.5, 4))] * 3)
-    return ExperimentVariantSensitivities(problem, np.zeros(2), ("p", "q"), slopes, np.diag([7.0, 0.0]))
+    return VariantPositionSensitivities(problem, np.zeros(2), ("p", "q"), slopes, np.diag([7.0, 0.0]))
 
 
 def view(times, std, frame="a"):
@@ -188,7 +188,7 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     base = UnchangedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
-    assert ExperimentVariantSensitivityBuilder(base).applicable_mechanical_changes() == possible.split()
+    assert MechanicalVariantSensitivityBuilder(base).applicable_mechanical_changes() == possible.split()
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +213,7 @@ def swung(urdf_folder):
 
 def built(problem, *mechanics, heard=None, **settings):
     """The builder of a problem's variants, and the variant with these changes."""
-    made = ExperimentVariantSensitivityBuilder(
+    made = MechanicalVariantSensitivityBuilder(
         UnchangedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
     )
     found = made.build_sensitivities(frozenset(mechanics))
@@ -248,7 +248,7 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     problem = swung()
     x = np.array([np.nan, 0.1])
-    found = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, x)).build_sensitivities(frozenset())
+    found = MechanicalVariantSensitivityBuilder(UnchangedExperiment(problem, x)).build_sensitivities(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
@@ -272,7 +272,7 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
     np.testing.assert_allclose(camera.t, episode.grid.node_times)
     assert np.all(camera.std == 1.0)
     step = swung().step
-    more, seen = extended_step_and_measurable_points(step)
+    more, seen = step_with_frames_at_measurable_points(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel
@@ -494,7 +494,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
 
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
-    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(noisy, noisy.initial_unknowns))
+    builder = MechanicalVariantSensitivityBuilder(UnchangedExperiment(noisy, noisy.initial_unknowns))
     made = builder.build_sensitivities(frozenset({"motion"}))
     assert not isinstance(made, str), made
     own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors
@@ -524,7 +524,7 @@ def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_fo
     )
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), options)
     x, [episode] = problem.initial_unknowns, problem.episodes
-    slopes, _ = propagation.point_sensitivities_and_joint_sensor_fisher_information(
+    slopes, _ = propagation.sensitivities_and_information_with_input_errors(
         problem, problem.evaluate(x), x, 0, {tip.name: 1e-6}
     )
     [found] = (own[:, :, len(x) :].reshape(-1, own.shape[2] - len(x)) for own in slopes.values())

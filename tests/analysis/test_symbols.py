@@ -30,15 +30,15 @@ def symbols(urdf_folder):
 
 def point(symbols):
     rng = np.random.default_rng(3)
-    values = rng.uniform(0.2, 0.6, len(symbols.column_names))
+    values = rng.uniform(0.2, 0.6, len(symbols.all_variable_names))
     span = symbols.block_slice("theta")
     values[span] = symbols.equations.system.parameters.vector() + 0.1
-    values[symbols.column_names.index("h")] = 0.02
+    values[symbols.all_variable_names.index("h")] = 0.02
     return values
 
 
 def value(symbols, expression, at):
-    return np.array(ca.densify(ca.Function("f", [symbols.column_symbols], [expression])(at))).ravel()
+    return np.array(ca.densify(ca.Function("f", [symbols.all_variable_symbols], [expression])(at))).ravel()
 
 
 def test_blocks_have_the_names_of_the_project(symbols):
@@ -52,7 +52,7 @@ def test_blocks_have_the_names_of_the_project(symbols):
     # parameters are called as everywhere, without a block
     assert symbols.column_blocks[4].full_names == symbols.equations.system.parameters.names
     assert len(set(symbols.row_names)) == len(symbols.row_names)
-    assert len(set(symbols.column_names)) == len(symbols.column_names)
+    assert len(set(symbols.all_variable_names)) == len(symbols.all_variable_names)
 
 
 def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
@@ -63,10 +63,10 @@ def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
     for block in (*symbols.row_blocks, *symbols.column_blocks):
         span = symbols.block_slice(block.name)
         assert span.stop - span.start == len(block.labels) == block.expressions.numel()
-    assert symbols.column_names.index("q1[T1_0_x]") == symbols.block_slice("q1").start + 2
+    assert symbols.all_variable_names.index("q1[T1_0_x]") == symbols.block_slice("q1").start + 2
     assert symbols.row_names.index("p1[elbow]") == symbols.block_slice("p1").start + 1
     for name in ("lam[hand.tilt_y]", "T1.bend", "h", "u[shoulder]"):
-        assert symbols.column_names[symbols.column_names.index(name)] == name
+        assert symbols.all_variable_names[symbols.all_variable_names.index(name)] == name
 
 
 @pytest.mark.parametrize("kind", ["point", "axis", "weld"])
@@ -83,7 +83,7 @@ def test_an_entry_is_the_row_as_text(symbols, row):
     at, entry = point(symbols), symbols.equation_or_derivative(row)
     expected = value(symbols, symbols._row_expressions, at)[symbols.row_names.index(row)]
     assert worked_out(symbols, entry, at) == pytest.approx(expected, rel=1e-9)
-    assert entry.numeric_value(symbols.column_symbols, at) == pytest.approx(expected, rel=1e-12)
+    assert entry.numeric_value(symbols.all_variable_symbols, at) == pytest.approx(expected, rel=1e-12)
     assert entry.title == row
     assert entry.text_lines[0].startswith(f"{row}: {entry.formula.n_operations} operations, depends on ")
     assert entry.text_lines[-1] == f"  {row} = {entry.formula.expression_texts[0]}"
@@ -92,16 +92,16 @@ def test_an_entry_is_the_row_as_text(symbols, row):
 def worked_out(symbols, entry, at):
     """Value of an entry's text, column names put in as numbers."""
     known = dict(FUNCTIONS)
-    places = sorted(range(len(symbols.column_names)), key=lambda i: -len(symbols.column_names[i]))
+    places = sorted(range(len(symbols.all_variable_names)), key=lambda i: -len(symbols.all_variable_names[i]))
 
     def numbers(text):
         for i in places:
-            name = symbols.column_names[i]
+            name = symbols.all_variable_names[i]
             # `h` is a letter of many words; all other names are longer than any function's
             text = text.replace(name, f"v[{i}]") if name != "h" else text
         return read(text)
 
-    known |= {"v": at, "h": at[symbols.column_names.index("h")]}
+    known |= {"v": at, "h": at[symbols.all_variable_names.index("h")]}
     for name, text in entry.formula.shared_subexpressions:
         known[name] = eval(numbers(text), {"__builtins__": {}}, known)
     return eval(numbers(entry.formula.expression_texts[0]), {"__builtins__": {}}, known)
@@ -113,7 +113,7 @@ SLOPES += [("del[elbow]", "lam[hand.y]"), ("constraint[hand.x]", "q1[T1_0_y]"), 
 
 @pytest.mark.parametrize(("row", "column"), SLOPES)
 def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
-    at, i, j = point(symbols), symbols.row_names.index(row), symbols.column_names.index(column)
+    at, i, j = point(symbols), symbols.row_names.index(row), symbols.all_variable_names.index(column)
     width = 1e-6 * max(1.0, abs(at[j]))
     ends = []
     for sign in (1, -1):
@@ -170,7 +170,7 @@ def test_all_rows_are_listed_the_short_ones_whole(symbols):
     inner = symbols.row_blocks[1].full_names[0]
     assert f"  {inner} = " in text
     assert "  del[T1_0_z] = " not in text
-    for name in symbols.column_names:
+    for name in symbols.all_variable_names:
         assert name in text
 
 

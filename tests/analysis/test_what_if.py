@@ -12,7 +12,7 @@ from heard import Heard
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis.experiment_design import (
     MECHANICAL_CHANGE_DESCRIPTIONS,
-    ExperimentVariantSensitivityBuilder,
+    MechanicalVariantSensitivityBuilder,
     UnchangedExperiment,
 )
 from yid_ocp.analysis.identifiability import identifiability
@@ -203,7 +203,7 @@ def missing(*arguments, **settings):
 
 def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
-    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(short_run, short_run.initial_unknowns))
+    builder = MechanicalVariantSensitivityBuilder(UnchangedExperiment(short_run, short_run.initial_unknowns))
     other = builder.build_sensitivities(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_driven_angles[:20]
@@ -252,7 +252,7 @@ def test_one_arm_needs_another_arm_and_welds(exact):
 def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     """Two arms with welds and no camera, MuJoCo's motion and noise, from a start of 3 N m/rad each."""
     made = exact("dual_arm_no_vision")
-    layout = ExperimentVariantSensitivityBuilder(UnchangedExperiment(made, at_truth(made))).build_sensitivities(
+    layout = MechanicalVariantSensitivityBuilder(UnchangedExperiment(made, at_truth(made))).build_sensitivities(
         frozenset({"weld"})
     )
     assert not isinstance(layout, str), layout

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.errors import SolverError, WorkerError
+from yid_ocp.errors import ParallelWorkError, SolverError
 from yid_ocp.parallel import InlineExecutor
 from yid_ocp.workflow import identifiability as identifiability_command
 from yid_ocp.workflow.build import build_system, system_with_second_arm_holding_object
@@ -187,7 +187,7 @@ def test_a_part_that_fails_is_said(run, tmp_path, monkeypatch):
     failing.__module__, failing.__qualname__ = "yid_ocp.workflow.identifiability", "profiled"
     monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", failing)
     words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
-    with pytest.raises(WorkerError, match=words):
+    with pytest.raises(ParallelWorkError, match=words):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
 
 

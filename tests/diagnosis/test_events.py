@@ -66,7 +66,7 @@ class DisturbanceTerms:
     def edit_model(self, model) -> None:
         pass
 
-    def prepare_motion(self, data) -> None:
+    def begin_motion(self, data) -> None:
         self.begun, self.caught = float(data.time), {}
 
     def add_forces(self, model, data) -> None:

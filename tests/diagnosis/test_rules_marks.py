@@ -9,7 +9,7 @@ import pytest
 from factories import added, amplitude, cases, effect, finding, fit, loss, place, score, screening
 
 from yid_ocp.diagnosis import blind, blind_scores
-from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, labels_json_and_sha256, open_sealed_labels
+from yid_ocp.diagnosis.blind import CaseGroundTruth, UnlabelledCase, labels_json_and_sha256, open_sealed_labels
 from yid_ocp.diagnosis.blind_scores import (
     detection_and_false_alarm_rates,
     diagnosis_evidence_to_dict,
@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.blind_scores import (
     score_blind_case,
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.refit import EffectSearchRecord
+from yid_ocp.diagnosis.refit import EffectSearchResults
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import GapLocalization
 from yid_ocp.errors import DataError
@@ -289,7 +289,7 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     monkeypatch.setattr(blind, "fit_nominal_model", lambda *_: nominal)
     monkeypatch.setattr(blind, "refit_with_effects", refit)
     ensemble = SimpleNamespace(_nominal_problem=lambda recording: SimpleNamespace(system="system"))
-    case, told = BlindCase("c", "estimate", "held out", ()), CaseGroundTruth("c", "single", injected, 1.0, {})
+    case, told = UnlabelledCase("c", "estimate", "held out", ()), CaseGroundTruth("c", "single", injected, 1.0, {})
     found = blind.true_effects_gap_closure(ensemble, case, told)
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
@@ -310,7 +310,7 @@ def diagnosed(decrease=80.0, there=0.5):
     refits[f"{FRICTION.label} on the held-out recordings"] = model([FRICTION], 1.0, 50.0, there)
     beside = screening([score(WEAK, p=0.5), score(STRANGE, p=0.6)])
     known = {"screening": screening(ranked), "nominal_model": fit((), loss(3.0, 3.2), 100.0, {"k": 2.0})}
-    record = EffectSearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
+    record = EffectSearchResults(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
     named = {"single_effect_models": (refits[FRICTION.label],), "selected_effects": (added(FRICTION),)}
     return finding(**named, record=record, located_gap=GapLocalization((place("elbow"),), decrease), **known)
 

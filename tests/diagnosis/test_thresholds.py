@@ -6,7 +6,7 @@ import pytest
 
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.options import dataclass_options
+from yid_ocp.options import options_by_key
 
 KIND = "joint_coulomb@elbow"
 
@@ -19,7 +19,7 @@ def found(bench, **limits):
 
 
 def test_every_threshold_is_a_setting():
-    assert set(dataclass_options(Thresholds)) == {entry.name for entry in fields(Thresholds)}
+    assert set(options_by_key(Thresholds)) == {entry.name for entry in fields(Thresholds)}
 
 
 def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):

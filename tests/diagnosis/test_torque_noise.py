@@ -83,7 +83,7 @@ def composed(step: Step, held_out: bool, *candidates: str) -> AllCandidatesProbl
 @cases("held_out", {"held_out": True, "in_blocks": False})
 def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     made = composed(step, held_out)
-    weighted = made.whitened_at({"elbow.stiffness": 2.5})
+    weighted = made.with_whitening_linearized_at({"elbow.stiffness": 2.5})
     assert weighted.candidate_effects == made.candidate_effects
     assert weighted.is_split_in_blocks == made.is_split_in_blocks
     own = weighted.problem
@@ -101,7 +101,9 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
 @cases("held_out", {"held_out": True, "in_blocks": False})
 def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out):
     """Weights are frozen once, about torques that an offset among the effects must not move."""
-    made = composed(step, held_out, "effort_offset", "joint_viscous").whitened_at({"elbow.stiffness": 2.5})
+    made = composed(step, held_out, "effort_offset", "joint_viscous").with_whitening_linearized_at(
+        {"elbow.stiffness": 2.5}
+    )
     wide = made.with_nominal_and_effects_free(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.unknown_vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
@@ -127,7 +129,7 @@ def test_candidates_of_other_places_are_left_out_of_a_refit(step):
     """A step of one place's candidates gives the residuals of all, also where others add internal coordinates."""
     made = composed(step, True, "joint_viscous", "joint_presliding", "effort_offset")
     all_places, at = (
-        made.whitened_at({"elbow.stiffness": 2.5}),
+        made.with_whitening_linearized_at({"elbow.stiffness": 2.5}),
         {"elbow.stiffness": 2.6, "joint_viscous@shoulder.b": 0.02},
     )
     friction = next(e for e in made.candidate_effects if e.label == "joint_viscous@shoulder")

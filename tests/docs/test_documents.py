@@ -164,7 +164,7 @@ def test_entries_and_names_are_those_of_the_equations(page, symbols):
     assert "\n".join(f"    {line}" for line in lines) in text
     listed = re.findall(r"`((?:del|constraint|p1|q0|p0|u|q1|lam)\[[\w.]+\])`", text)
     assert len(listed) > 6
-    assert set(listed) <= {*symbols.row_names, *symbols.column_names}
+    assert set(listed) <= {*symbols.row_names, *symbols.all_variable_names}
     assert f"{_MAX_JACOBIAN_OPERATIONS:_}".replace("_", " ") in text
 
 

@@ -130,7 +130,7 @@ class Bench:
         function = sensor_reading_function(system, sensor, ())
         effort = np.zeros((len(rollout.state) - 1, n))
         effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
-        effort[:, list(system.driven_coordinate_indices)] = rollout.torque
+        effort[:, list(system.actuated_coordinate_indices)] = rollout.torque
         rows = zip(rollout.state[:-1], effort, strict=True)
         return np.array([np.array(function(q=x[:n], z=x[2 * n :], load=e, theta=run.theta)["y"]) for x, e in rows])
 

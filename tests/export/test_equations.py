@@ -134,7 +134,7 @@ def test_names_say_what_stands_where(symbols, folder):
     assert list(names["functions"]) == list(FUNCTIONS)
     assert names["functions"]["rows"]["results"] == ["del", "internal", "constraint", "p1"]
     assert [name for part in names["rows"].values() for name in part] == list(symbols.row_names)
-    assert [name for part in names["columns"].values() for name in part] == list(symbols.column_names)
+    assert [name for part in names["columns"].values() for name in part] == list(symbols.all_variable_names)
     assert names["parameters"]["T1.bend"] == {"value": 4.0, "unit": "N m/rad"}
     assert names["time_step"] == 0.01
 

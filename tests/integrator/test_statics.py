@@ -76,7 +76,7 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
     """Of every feature of a step; those without a spring have nowhere to rest."""
     system, names = case.step.system, case.step.system.parameters.names
     fixed = list(system.prescribed_coordinate_indices)
-    given = np.concatenate([case.start[list(system.driven_coordinate_indices)], case.path[0]])
+    given = np.concatenate([case.start[list(system.actuated_coordinate_indices)], case.path[0]])
     torque = 0.3 * case.torque[0] if len(system.driven) else None
     guess = case.start[: system.n_coordinates].copy()
     guess[fixed] = case.path[0]

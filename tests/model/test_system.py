@@ -38,7 +38,7 @@ def test_configuration_order_of_the_paper(dual_arm):
     assert dual_arm.n_constraints == 6
     assert dual_arm.parameters["right_s0.damping"].value == 0.05
     assert dual_arm.point_frames == ("w_T1", "w_T2", "w_T3")
-    assert dual_arm.driven_coordinate_indices == tuple(range(14))
+    assert dual_arm.actuated_coordinate_indices == tuple(range(14))
     assert dual_arm.unprescribed_coordinate_indices == tuple(range(50))
     assert [segment.name for segment in dual_arm.segment_layouts] == ["T1", "T2", "T3"]
     assert dual_arm.segment_layout("T2").parent_segment == "T1"

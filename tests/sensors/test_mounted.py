@@ -128,7 +128,7 @@ def recorded(urdf: Path) -> Recording:
     )
     q, read = [], {site + kind: list[Array]() for site in ("lower", "w_T1") for kind in KINDS}
     for tick in range(6001):
-        controller.apply_input(tick * step)
+        controller.apply_input_to_scene(tick * step)
         if tick % 50 == 0:
             mujoco.mj_forward(model, scene.data)
             q.append(scene.data.qpos[scene.joint_ids][:2])

@@ -58,7 +58,7 @@ def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, t
 
 def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(problem):
     nodes, episode = nodes_of(problem), problem.episodes[0]
-    driven = list(problem.system.driven_coordinate_indices)
+    driven = list(problem.system.actuated_coordinate_indices)
     rolled = problem.evaluate(START).episode_predictions[0].rollout
     found = guess_unknowns_and_node_states(problem, nodes, START, lambda i, state, x: 1.0)
     np.testing.assert_allclose(found.node_states[0], rolled.state, atol=1e-9)

@@ -196,7 +196,7 @@ def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, mo
         begun = False
 
         def edit_model(self, model: Any) -> None: ...
-        def prepare_motion(self, data: Any) -> None:
+        def begin_motion(self, data: Any) -> None:
             self.begun = True
 
         def add_forces(self, model: Any, data: Any) -> None:
@@ -311,7 +311,7 @@ def test_recordings_are_reproducible(kind: str, arms: int, clean: Path, benchmar
         assert np.all(np.abs(error.mean(axis=0)) < 4 * np.array(arms * torques.offset))
     else:
         np.testing.assert_allclose(error, 0.0, rtol=0, atol=1e-6)
-    angles = run.q[:, list(system.driven_coordinate_indices)]
+    angles = run.q[:, list(system.actuated_coordinate_indices)]
     np.testing.assert_allclose(joints.position[:11], angles, rtol=0, atol=1.5e-3)
 
 
@@ -356,7 +356,7 @@ def test_shaking_takes_the_torque_that_was_asked_for_and_leaves_the_travel_alone
     posture = grasping_joint_angles(system)
     start = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
     inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass])(start))))
-    torque = inertia[list(system.driven_coordinate_indices), None] * rough.amplitude[:, 3:] * omega**2
+    torque = inertia[list(system.actuated_coordinate_indices), None] * rough.amplitude[:, 3:] * omega**2
     np.testing.assert_allclose(np.sqrt((torque[:4] ** 2).sum(1) / 2), 0.5, rtol=1e-9)
     speed = rough.amplitude[:, 3:] * omega
     assert speed.max() == pytest.approx(0.2)

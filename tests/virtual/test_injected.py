@@ -44,7 +44,7 @@ def passive(effects, q, v):
     data = mujoco.MjData(model)
     terms = injected._InjectedTerms(SYSTEM, TRUTH, effects)
     terms.edit_model(model)
-    terms.prepare_motion(data)
+    terms.begin_motion(data)
     data.qpos[order], data.qvel[order] = q, v
     mujoco.set_mjcb_passive(terms.add_forces)
     try:
@@ -183,7 +183,7 @@ class Bench:
         self.terms = injected._InjectedTerms(SYSTEM, TRUTH, [InjectedEffect(kind, location, {"size": size})])
         self.terms.edit_model(self.model)
         if running:
-            self.terms.prepare_motion(self.data)
+            self.terms.begin_motion(self.data)
         self.force(np.zeros(self.model.nv))  # what is anchored somewhere is anchored by this state
         self.began = {joint: self.place(joint) for joint in ("left_w0", joints_of("T3", 2)[-1])}
 

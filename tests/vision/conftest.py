@@ -64,7 +64,7 @@ def run(system):
 @pytest.fixture(scope="session")
 def recording(system, run):
     rng = np.random.default_rng(5)
-    position = run.q[:, list(system.driven_coordinate_indices)]
+    position = run.q[:, list(system.actuated_coordinate_indices)]
     noisy = position + 2e-4 * rng.standard_normal(position.shape)
     return Recording(JointGroup(system.driven, run.t, noisy, position_std=2e-4), source="test", name="virtual")
 

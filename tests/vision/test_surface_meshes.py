@@ -166,7 +166,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
 def test_baxters_meshes_are_found_and_move(system):
     tree = system.numeric_mechanism()
     meshes = load_robot_meshes_by_joint("package:baxter", tree)
-    assert set(meshes) == {-1, *system.driven_coordinate_indices}
+    assert set(meshes) == {-1, *system.actuated_coordinate_indices}
     assert 0.1 < meshes[system.mechanism.joint_index("left_w2")].vertices[:, 2].max() < 0.5
     assert set(load_robot_meshes_by_joint("package:baxter", tree, "collision")) <= set(meshes)
 

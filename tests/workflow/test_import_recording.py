@@ -186,9 +186,9 @@ def test_no_command_is_suggested_that_would_fail(odd: Path, capsys: pytest.Captu
 
 def test_every_flag_is_a_key_of_the_section() -> None:
     from yid_ocp.config.settings import ImportSettings
-    from yid_ocp.options import dataclass_options
+    from yid_ocp.options import options_by_key
 
     known: Callable[..., object] = build_argument_parser().parse_args
     given = vars(known(["import", "x"]))
     others = {"command", "run", "files", "out", "preview", "config", "quiet", "verbose", "json"}
-    assert set(given) - others == set(dataclass_options(ImportSettings))
+    assert set(given) - others == set(options_by_key(ImportSettings))

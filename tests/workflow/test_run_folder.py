@@ -15,7 +15,7 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.effects import EFFECTS
-from yid_ocp.errors import ConfigError, OutputError, WorkerError
+from yid_ocp.errors import ConfigError, OutputError, ParallelWorkError
 from yid_ocp.files import file_sha256, write_text
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.build import build_system
@@ -171,7 +171,7 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
     def fail_in_task(file):
         with pytest.raises(OutputError) as failed:
             write_text(file, "a")
-        raise WorkerError(f"3 tasks failed: {failed.value}", hint="mend it")
+        raise ParallelWorkError(f"3 tasks failed: {failed.value}", hint="mend it")
 
     monkeypatch.setattr("yid_ocp.files.os.replace", full)
     with (
@@ -181,7 +181,7 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
         folder.write_text_file("a.txt", "a")
     assert caught.value.where == str(tmp_path / "runs" / "run" / "a.txt")
     assert not (tmp_path / "runs").exists()
-    with pytest.raises(WorkerError) as caught, atomic_run_folder(settings, tmp_path / "run") as folder:
+    with pytest.raises(ParallelWorkError) as caught, atomic_run_folder(settings, tmp_path / "run") as folder:
         fail_in_task(folder.resume_folder / "done.json")
     assert f"where: {tmp_path / 'run' / 'done.json'}" in caught.value.what
     assert ".partial" not in str(caught.value)

@@ -25,7 +25,7 @@ from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
-from yid_ocp.problem.options import RefinedDiscretisation
+from yid_ocp.problem.options import RefinementKind
 from yid_ocp.solvers import GaussNewton
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
@@ -216,7 +216,7 @@ def estimate_shifts_by_discretisation(
     problem: EstimationProblem,
     x: Array,
     at_x: Evaluation,
-    kinds: Sequence[RefinedDiscretisation],
+    kinds: Sequence[RefinementKind],
     progress: Progress = NULL_PROGRESS,
     *,
     model_difference_only: bool = False,
@@ -250,7 +250,7 @@ def estimate_shifts_by_discretisation(
     return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _refined_problem(problem: EstimationProblem, what: RefinedDiscretisation) -> _FinerDiscretisationProblem:
+def _refined_problem(problem: EstimationProblem, what: RefinementKind) -> _FinerDiscretisationProblem:
     options = problem.options
     if what == "time_step" or options.divided_links_model is None:
         return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
@@ -269,7 +269,7 @@ def _refined_problem(problem: EstimationProblem, what: RefinedDiscretisation) ->
     return _FinerDiscretisationProblem(made, factors, joints)
 
 
-def inflate_stds_by_discretisation(
+def estimates_with_discretisation_error(
     estimates: Mapping[str, ParameterEstimate],
     found: Mapping[str, EstimateShiftByLinksAndTimeStep],
     sizes: Mapping[str, float],
@@ -303,7 +303,7 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 
 @dataclass(frozen=True)
-class NaturalFrequencies:
+class StepMapNaturalFrequencies:
     """Natural frequencies of a system about an equilibrium, with the robot fixed, as the integrator reproduces them.
 
     Unstable modes grow from step to step although damping is included: the equilibrium is unstable, or the time step is
@@ -323,7 +323,7 @@ def step_map_natural_frequencies(
     force_split: ForceSplit = "symmetric",
     constraint_force_at: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
-) -> NaturalFrequencies:
+) -> StepMapNaturalFrequencies:
     """Compute the natural frequencies of a system about an equilibrium, as one integration step reproduces them.
 
     The frequencies follow from the eigenvalues of the linearised step without damping. The driven and prescribed
@@ -334,18 +334,18 @@ def step_map_natural_frequencies(
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: with these held still nothing can swing"
-        return NaturalFrequencies(np.zeros(0), message=held)
+        return StepMapNaturalFrequencies(np.zeros(0), message=held)
     step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
     known = np.array([configuration[name] for name in still.prescribed])
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
     if not rest.is_converged:
-        return NaturalFrequencies(np.zeros(0), message=rest.message)
+        return StepMapNaturalFrequencies(np.zeros(0), message=rest.message)
     damps = [name.rpartition(".")[2] in _DAMPING_PARAMETERS for name in system.parameters.names]
     undamped = np.where(damps, 0.0, theta)
     angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
     turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
     growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
-    return NaturalFrequencies(turning / (2 * math.pi * time_step), growing)
+    return StepMapNaturalFrequencies(turning / (2 * math.pi * time_step), growing)
 
 
 def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:
@@ -359,7 +359,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def smallest_possible_grasp_gaps(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_grasp_gaps_at_posture(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
     `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths.
@@ -491,7 +491,7 @@ def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> Al
             continue
         inputs = predictor.corrected_inputs_with_effect_momentum(episode, theta, (), begin.state)
         feedback = inputs.feedback_with_corrected_reference(
-            episode.tracking_feedback, system.driven_coordinate_indices, episode.measured_driven_angles
+            episode.tracking_feedback, system.actuated_coordinate_indices, episode.measured_driven_angles
         )
         rollout = simulate(
             problem.step, theta, begin.state, episode.grid.steps, inputs.torque, inputs.prescribed_path, feedback

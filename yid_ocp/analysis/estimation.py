@@ -13,7 +13,7 @@ from yid_ocp.analysis.clock_checks import clock_drift_and_overstated_noise_issue
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import MAX_REPORTED_LIMIT_VIOLATION_RATIO, Issue
+from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_by_name
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
@@ -131,7 +131,7 @@ def _with_discretisation_errors(
         problem, solution.x, solution.evaluation, kinds, progress
     )
     sizes = typical_parameter_magnitudes(problem, solution.x)
-    inflated = discretisation.inflate_stds_by_discretisation(solution.parameters, shifts, sizes)
+    inflated = discretisation.estimates_with_discretisation_error(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}
     uncounted = tuple(words for kind, words in _UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
@@ -403,7 +403,7 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
                 best, guess, error = better
                 unit = units[channels[0]]
                 what = f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by"
-                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_REPORTED_LIMIT_VIOLATION_RATIO
+                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)

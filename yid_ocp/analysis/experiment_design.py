@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, free_starts_and_grasps, transfer_unknowns_by_name
-from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_sensor_fisher_information
+from yid_ocp.analysis.torque_error_propagation import sensitivities_and_information_with_input_errors
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -165,7 +165,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def extended_step_and_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
+def step_with_frames_at_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
     """Return the step with all measurable frames in its mechanism, and these frames. The equations stay the same."""
     mechanism, seen = step.system.mechanism, measurable_points(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
@@ -174,12 +174,12 @@ def extended_step_and_measurable_points(step: Step) -> tuple[Step, list[_Measura
 
 
 @dataclass
-class ExperimentVariantSensitivities:
+class VariantPositionSensitivities:
     """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
     with respect to the nx unknowns and to the episode's q torque-error unknowns (see
-    `point_sensitivities_and_joint_sensor_fisher_information`).
+    `sensitivities_and_information_with_input_errors`).
     """
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
@@ -228,15 +228,15 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 }
 
 
-class ExperimentVariantSensitivityBuilder:
+class MechanicalVariantSensitivityBuilder:
     """Builds and caches experiment variants for sets of mechanical changes."""
 
     def __init__(self, setting: UnchangedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
         self._progress = progress
-        self._layouts: dict[frozenset[str], ExperimentVariantSensitivities | str] = {}
+        self._layouts: dict[frozenset[str], VariantPositionSensitivities | str] = {}
 
-    def build_sensitivities(self, mechanics: frozenset[str]) -> ExperimentVariantSensitivities | str:
+    def build_sensitivities(self, mechanics: frozenset[str]) -> VariantPositionSensitivities | str:
         """Compute the sensitivities for the mechanical changes `mechanics`, or return a message if that fails."""
         if mechanics not in self._layouts:
             if mechanics:
@@ -258,14 +258,14 @@ class ExperimentVariantSensitivityBuilder:
         applies = {"weld": loose, "second_arm": second, "motion": moves, "travel": moves}
         return [name for name, does in (applies | {"torque": bool(robot) and not measured}).items() if does]
 
-    def _build(self, mechanics: frozenset[str]) -> ExperimentVariantSensitivities:
+    def _build(self, mechanics: frozenset[str]) -> VariantPositionSensitivities:
         setting, base = self.setting, self.setting.problem
         system, recordings, notes = self._experiment(mechanics)
         if "torque" in mechanics:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
-        step, seen = extended_step_and_measurable_points(step)
+        step, seen = step_with_frames_at_measurable_points(step)
         wide = free_starts_and_grasps(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
@@ -282,7 +282,7 @@ class ExperimentVariantSensitivityBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = point_sensitivities_and_joint_sensor_fisher_information(
+            points, by_joints[i] = sensitivities_and_information_with_input_errors(
                 problem, evaluation, x, i, finest, encoders
             )
             slopes |= {(i, *key): value for key, value in points.items()}
@@ -290,7 +290,7 @@ class ExperimentVariantSensitivityBuilder:
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
         # priors of the parameters are excluded: the result is the information of the sensors
         stated[:, [problem.unknown_names.index(name) for name in names]] = 0.0
-        return ExperimentVariantSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
+        return VariantPositionSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
 
     def _joint_sensors(self, mechanics: frozenset[str]) -> dict[str, SensorOptions]:
         given = self.setting.problem.options.sensors
@@ -404,7 +404,7 @@ class ExperimentVariantSensitivityBuilder:
         excitation = MultisineOptions(gripper_travel=travel, max_joint_speed=speed, duration=duration)
         motion = random_multisine_motion(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
         run = simulate_in_mujoco(system, values, motion, SimulationOptions(duration), initial_joint_angles=posture)
-        driven = list(system.driven_coordinate_indices)
+        driven = list(system.actuated_coordinate_indices)
         q, noise = run.q[:, driven], _noise_as_recorded(base.system, system, episode)
         joints = JointGroup(system.driven, run.t, q, effort=run.effort, effort_kind="command")
         joints = replace(joints, position_std=noise[0], effort_std=noise[1], effort_bias_std=noise[2])
@@ -458,7 +458,7 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
 
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
     whole = np.zeros((len(episode.measured_driven_angles), system.n_coordinates))
-    whole[:, list(system.driven_coordinate_indices)] = episode.measured_driven_angles
+    whole[:, list(system.actuated_coordinate_indices)] = episode.measured_driven_angles
     paths = _frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
     return float(np.linalg.norm(paths - paths[0], axis=2).max(initial=0.0)) or 0.11
 

@@ -150,7 +150,7 @@ def measured_and_predicted_friction_torques(
         inputs = problem.predictor.corrected_inputs(episode, theta, ())
         shift = inputs.driven_angles - episode.measured_driven_angles
         q = np.zeros_like(path)
-        q[:, list(system.driven_coordinate_indices)] = path + shift
+        q[:, list(system.actuated_coordinate_indices)] = path + shift
         without = theta.copy()
         without[[system.parameters.index(name) for name in friction_parameters]] = 0.0
         lacking, given = (_missing_torque(problem, at, q, inputs.torque) for at in (without, theta))

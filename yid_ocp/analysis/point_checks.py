@@ -360,7 +360,7 @@ def _upside_down(
     """Issue for a cable that rises between its clamps by more than its shape does: gravity has the wrong sign."""
     pull = float(np.linalg.norm(gravity))
     free = [name for name in cable.unclamped_vertex_names if name in at]
-    ends = [name for name in (cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[-1]) if name in at]
+    ends = [name for name in (cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[-1]) if name in at]
     if pull == 0 or len(ends) < 2 or not free:
         return None
     up = -gravity / pull

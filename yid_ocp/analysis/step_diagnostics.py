@@ -64,7 +64,7 @@ class ParameterInfluence:
     change_along_recordings: float | None = None  # root sum of squares over all readings, likewise
 
 
-def parameter_influences(
+def parameter_equations_and_responses(
     step: Step,
     symbols: NamedStepEquations,
     episode: Episode | None,

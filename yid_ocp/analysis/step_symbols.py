@@ -230,7 +230,7 @@ class NamedStepEquations(ReprMixin):
         return tuple(name for block in self.row_blocks for name in block.full_names)
 
     @property
-    def column_names(self) -> tuple[str, ...]:
+    def all_variable_names(self) -> tuple[str, ...]:
         """Full names of all variables in order."""
         return tuple(name for block in self.column_blocks for name in block.full_names)
 
@@ -239,14 +239,14 @@ class NamedStepEquations(ReprMixin):
         return ca.vertcat(*(block.expressions for block in self.row_blocks))
 
     @cached_property
-    def column_symbols(self) -> ca.SX:
+    def all_variable_symbols(self) -> ca.SX:
         """Symbols of all variables as one column vector."""
         return ca.vertcat(*(block.expressions for block in self.column_blocks))
 
     @cached_property
     def full_jacobian_sparsity_pattern(self) -> ca.Sparsity:
         """Sparsity of the Jacobian of all equations with respect to all variables."""
-        found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
+        found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.all_variable_symbols)
         return found
 
     def block_slice(self, block: str) -> slice:
@@ -271,15 +271,15 @@ class NamedStepEquations(ReprMixin):
         row, column = _place(said[0], self.row_names, "row", self.row_blocks), ""
         expression = self._row_expressions[row]
         if len(said) == 2:
-            at = _place(said[1], self.column_names, "column", self.column_blocks)
-            expression, column = ca.jacobian(expression, self.column_symbols[at]), self.column_names[at]
-        made = format_expressions([expression], self.column_symbols, self.column_names)
+            at = _place(said[1], self.all_variable_names, "column", self.column_blocks)
+            expression, column = ca.jacobian(expression, self.all_variable_symbols[at]), self.all_variable_names[at]
+        made = format_expressions([expression], self.all_variable_symbols, self.all_variable_names)
         used = self._summarize_columns(made.variable_indices)
         return EquationOrDerivativeFormula(self.row_names[row], column, made, used, expression)
 
     def _summarize_columns(self, places: Iterable[int]) -> tuple[str, ...]:
         """Names of columns by index. A block with many of them is abbreviated, such as `24 of q0`."""
-        chosen, names, words = set(places), self.column_names, []
+        chosen, names, words = set(places), self.all_variable_names, []
         for block in self.column_blocks:
             span = self.block_slice(block.name)
             inside = [names[i] for i in range(span.start, span.stop) if i in chosen]
@@ -289,10 +289,10 @@ class NamedStepEquations(ReprMixin):
     def text_lines(self) -> list[str]:
         """Text lines of all equations, then the names of all variables. Only short equations are shown in full."""
         said = []
-        place = {self.column_symbols[i].element_hash(): i for i in range(self.column_symbols.numel())}
+        place = {self.all_variable_symbols[i].element_hash(): i for i in range(self.all_variable_symbols.numel())}
         for at, name in enumerate(self.row_names):
             row = self._row_expressions[at]
-            count = count_operations([row], self.column_symbols)
+            count = count_operations([row], self.all_variable_symbols)
             if count <= _MAX_PRINTED_OPERATIONS:
                 said += self.equation_or_derivative(name).text_lines
             else:

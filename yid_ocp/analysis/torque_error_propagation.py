@@ -29,7 +29,7 @@ _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a read
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
-def point_sensitivities_and_joint_sensor_fisher_information(
+def sensitivities_and_information_with_input_errors(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -73,7 +73,7 @@ def point_sensitivities_and_joint_sensor_fisher_information(
         if encoders is not None:
             nodes, nx = course.rollout.state.shape
             angles = np.zeros((nodes, len(driving.input_errors.angle_std), nx))
-            angles[:, np.arange(angles.shape[1]), list(problem.system.driven_coordinate_indices)] = 1.0
+            angles[:, np.arange(angles.shape[1]), list(problem.system.actuated_coordinate_indices)] = 1.0
             by_state.append(angles)
             units += list(driving.input_errors.angle_std)
         scale = np.array(units)[:, None]

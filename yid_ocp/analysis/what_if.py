@@ -14,10 +14,10 @@ from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
     MECHANICAL_CHANGE_DESCRIPTIONS,
-    ExperimentVariantSensitivities,
-    ExperimentVariantSensitivityBuilder,
+    MechanicalVariantSensitivityBuilder,
     PointObservationSchedule,
     UnchangedExperiment,
+    VariantPositionSensitivities,
     measurable_points,
     uniform_sample_times,
 )
@@ -95,7 +95,7 @@ class ExperimentChangeRanking(ReprMixin):
 
 
 # From sets of changes and a factor on the stated variances to the predicted results, one for each set.
-ExperimentChangeSetEvaluator = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
+ChangeSetEvaluationFunction = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
 
 
 def what_if(
@@ -107,7 +107,7 @@ def what_if(
     two_arm_system: System | None = None,
     considered_changes: Collection[str] | None = None,
     progress: Progress = NULL_PROGRESS,
-    evaluate_changes: ExperimentChangeSetEvaluator | None = None,
+    evaluate_changes: ChangeSetEvaluationFunction | None = None,
 ) -> ExperimentChangeRanking:
     """Rank changes of an experiment by the number of parameters that they make identifiable, without new measurements.
 
@@ -185,10 +185,10 @@ class _Outcomes:
         setting: UnchangedExperiment,
         inflation: float,
         progress: Progress = NULL_PROGRESS,
-        judge: ExperimentChangeSetEvaluator | None = None,
+        judge: ChangeSetEvaluationFunction | None = None,
     ) -> None:
         self.setting, self.inflation, self.progress = setting, inflation, progress
-        self.builder = ExperimentVariantSensitivityBuilder(setting, progress)
+        self.builder = MechanicalVariantSensitivityBuilder(setting, progress)
         self.judge = judge or self._judged
         self.known: dict[frozenset[str], ChangedExperimentResult] = {}
 
@@ -245,7 +245,7 @@ class _Outcomes:
         return ChangedExperimentResult(names, words, std, verdicts, count, gain, "; ".join(layout.feasibility_notes))
 
     def _views(
-        self, episode: Episode, changes: Sequence[ExperimentChange], layout: ExperimentVariantSensitivities
+        self, episode: Episode, changes: Sequence[ExperimentChange], layout: VariantPositionSensitivities
     ) -> list[PointObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_point_group_times_and_std(episode)
@@ -271,9 +271,7 @@ class _Outcomes:
         return views + [PointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
 
 
-def _relative_stds_and_gain(
-    layout: ExperimentVariantSensitivities, information: Array
-) -> tuple[dict[str, float], float]:
+def _relative_stds_and_gain(layout: VariantPositionSensitivities, information: Array) -> tuple[dict[str, float], float]:
     """Relative standard deviation of every free parameter, and the gain, from the information of all unknowns."""
     problem, x = layout.problem, layout.x
     chosen = np.array([problem.unknown_names.index(name) for name in layout.free_parameters])

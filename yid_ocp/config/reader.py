@@ -225,7 +225,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
         allowed = f"a key that ends in '{name}'"
         raise ConfigError(f"there are no keys below '{name}'", where=origin, allowed=allowed, hint="shorten the key")
     elif inner is not None and inner.selector_key == "name":
-        below = inner.variants_for_mapping_key(name, origin).classes[""]
+        below = inner.variants_for_entry(name, origin).classes[""]
     else:
         known = {} if inner is None else inner.variant_options()
         cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
@@ -265,7 +265,7 @@ class _Reader:
             if raw is not None and not isinstance(raw, dict):
                 raise self._wrong(raw, hint, path)
             return {
-                name: self._section(inner.variants_for_mapping_key(name, self.where((*path, name))), own, (*path, name))
+                name: self._section(inner.variants_for_entry(name, self.where((*path, name))), own, (*path, name))
                 for name, own in (raw or {}).items()
             }
         return self._leaf(hint, raw, path)
@@ -287,7 +287,7 @@ class _Reader:
                 within += f" with {sections.selector_key}: {word}" if within and len(sections.classes) > 1 else ""
                 raise schema.unknown_key_error(name, known, self.where((*path, name)), within)
         values: dict[str, Any] = {}
-        for name, option in options.dataclass_options(kind).items():
+        for name, option in options.options_by_key(kind).items():
             if name in raw:
                 values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
             elif option.default_value is MISSING:

@@ -33,12 +33,12 @@ class SectionVariants:
     def variant_options(self, word: Any = "") -> Mapping[str, options.Option]:
         """Options, by key, of the settings class that `word` selects (default: the first class)."""
         known = isinstance(word, str) and word in self.classes
-        own = options.dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
+        own = options.options_by_key(self.classes[word] if known else next(iter(self.classes.values())))
         if self.selector_key in ("", *own):
             return own
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
-    def variants_for_mapping_key(self, name: str, where: str) -> SectionVariants:
+    def variants_for_entry(self, name: str, where: str) -> SectionVariants:
         """Settings classes for a mapping's entry `name`: the class of that name, or all classes."""
         if self.selector_key != "name":
             return self
@@ -119,12 +119,12 @@ def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
     sections = section_variants_from_annotation(hint)
     if sections is None:
         return
-    having = [word for word, kind in sections.classes.items() if name in options.dataclass_options(kind)]
+    having = [word for word, kind in sections.classes.items() if name in options.options_by_key(kind)]
     if having:
         choice = "" if len(having) == len(sections.classes) else f" with {sections.selector_key}: {', '.join(having)}"
         yield (f"`{at}`" if at else "the file itself") + choice
     for kind in sections.classes.values():
-        for key, option in options.dataclass_options(kind).items():
+        for key, option in options.options_by_key(kind).items():
             yield from _sections_with_key(option.type_hint, name, f"{at}.{key}" if at else key)
 
 
@@ -151,7 +151,7 @@ def _type_schema(hint: Any) -> dict[str, Any]:
         return {"type": "array", "items": _described_schema(entries)}
     inner = section_variants_from_annotation(values)
     if inner is not None and inner.selector_key == "name":
-        named = {name: _section_schema(inner.variants_for_mapping_key(name, ""), "") for name in inner.classes}
+        named = {name: _section_schema(inner.variants_for_entry(name, ""), "") for name in inner.classes}
         return {"type": "object", "properties": named, "additionalProperties": False}
     if inner is not None:
         return {"type": "object", "additionalProperties": _described_schema(values)}
@@ -164,7 +164,7 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
     required = []
     if sections.selector_key == "name":
         properties["name"] = {"const": word, "description": f"the {sections.variant_noun}"}
-    for name, option in options.dataclass_options(kind).items():
+    for name, option in options.options_by_key(kind).items():
         properties[name] = _described_schema(option.type_hint)
         default = option.default_value
         if default is MISSING:

@@ -264,7 +264,7 @@ def _measured_positions(recording: Recording, point: str) -> Array:
 
 IssueSeverity = Literal["warning", "not_trusted", "refused"]
 
-MAX_REPORTED_LIMIT_VIOLATION_RATIO = 1e3
+LIMIT_VIOLATION_RATIO_CAP = 1e3
 """Largest value of `Issue.limit_violation_ratio`; larger ratios are clipped."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
@@ -304,7 +304,7 @@ class Issue:
     what: str  # sentence on the cause, with numbers
     # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
     weight: IssueSeverity
-    # observed value over the detection limit (inverse for a lower limit), 1 to `MAX_REPORTED_LIMIT_VIOLATION_RATIO`
+    # observed value over the detection limit (inverse for a lower limit), 1 to `LIMIT_VIOLATION_RATIO_CAP`
     limit_violation_ratio: float
     advice: str  # recommended action
     # location; empty means all
@@ -322,7 +322,7 @@ class Issue:
         object.__setattr__(
             self,
             "limit_violation_ratio",
-            float(min(max(self.limit_violation_ratio, 1.0), MAX_REPORTED_LIMIT_VIOLATION_RATIO)),
+            float(min(max(self.limit_violation_ratio, 1.0), LIMIT_VIOLATION_RATIO_CAP)),
         )
 
     @property

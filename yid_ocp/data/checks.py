@@ -18,7 +18,7 @@ from scipy.integrate import cumulative_trapezoid
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data import channel_checks
 from yid_ocp.data.channel_checks import (
-    MAX_REPORTED_LIMIT_VIOLATION_RATIO,
+    LIMIT_VIOLATION_RATIO_CAP,
     QUALITY_LIMITS,
     Issue,
     SensorOptionsLookup,
@@ -165,7 +165,7 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
             epoch = (abs(begin) > _MIN_UNIX_TIME) != (abs(first) > _MIN_UNIX_TIME)
             since = "one of them counts from 1970: " if epoch else ""
             spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
-            ratio = MAX_REPORTED_LIMIT_VIOLATION_RATIO if epoch else 1 + far / max(last - first, 1e-9)
+            ratio = LIMIT_VIOLATION_RATIO_CAP if epoch else 1 + far / max(last - first, 1e-9)
             what, advice = f"{since}joints were recorded {spans}", "write the times of all groups on one clock"
             yield Issue("clock_base", what, "refused", ratio, advice, "", group.name, "t")
             continue
@@ -242,7 +242,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
         size, cause = abs(ratio[j]), "angle_scale"
         evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
         if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
-            cause, evidence = "angle_sign", MAX_REPORTED_LIMIT_VIOLATION_RATIO
+            cause, evidence = "angle_sign", LIMIT_VIOLATION_RATIO_CAP
         what = f"the angle of {names[j]} turns {ratio[j]:.3g} times as fast as its recorded velocity says"
         advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}"
         yield Issue(cause, what, "not_trusted", evidence, advice, "", "joints", f"position.{names[j]}")
@@ -337,6 +337,4 @@ def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None
     what = f"{count} samples of {other.name} are those of {one.name} to the last digit"
-    return Issue(
-        "same_data", what, "warning", MAX_REPORTED_LIMIT_VIOLATION_RATIO, "list every measurement once", other.name
-    )
+    return Issue("same_data", what, "warning", LIMIT_VIOLATION_RATIO_CAP, "list every measurement once", other.name)

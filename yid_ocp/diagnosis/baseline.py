@@ -145,7 +145,7 @@ class EarlierRunsBaseline:
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
-    def counterfactual_prediction_errors(
+    def prediction_errors_with_and_without_effects(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> CounterfactualPredictionErrors | None:
         """Test found effects on recordings made with and without them, such as before and after a repair.

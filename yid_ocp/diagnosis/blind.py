@@ -160,7 +160,7 @@ class CaseGroundTruth:
 
 
 @dataclass(frozen=True)
-class BlindCase:
+class UnlabelledCase:
     """A blind case for the diagnosis: recordings, and effect kinds excluded from the candidates."""
 
     name: str
@@ -332,7 +332,7 @@ class BlindCaseGenerator:
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
-    def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
+    def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:
         """Draw recordings and label of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
         name = f"case_{planned.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
@@ -349,7 +349,7 @@ class BlindCaseGenerator:
                 continue  # the motion throws the object about; draw another
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
-            return BlindCase(name, tuple(estimate), held_out, left_out), label
+            return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
         what, allowed = f"none of {MAX_DRAWS_PER_CASE} motions can be simulated", "a motion that MuJoCo can simulate"
         where, hint = f"{name} of {planned.experiment}", "use another --seed: one seed always draws the same motions"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
@@ -495,7 +495,7 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
 
 def diagnose_blind_case(
     ensemble: BlindCaseGenerator,
-    case: BlindCase,
+    case: UnlabelledCase,
     candidates: CandidateNamesOrAll = "all",
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
 ) -> DiagnosisResult:
@@ -505,7 +505,7 @@ def diagnose_blind_case(
 
 
 def true_effects_gap_closure(
-    ensemble: BlindCaseGenerator, case: BlindCase, label: CaseGroundTruth, candidates: CandidateNamesOrAll = "all"
+    ensemble: BlindCaseGenerator, case: UnlabelledCase, label: CaseGroundTruth, candidates: CandidateNamesOrAll = "all"
 ) -> float:
     """Fraction of the held-out gap that a refit of the true effects closes. NaN if the refit fails."""
     problem = ensemble._nominal_problem(case.estimation_recordings)

@@ -16,7 +16,7 @@ import scipy.stats
 
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
-from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStatistics, UnrecordedRefitError
+from yid_ocp.diagnosis.refit import EffectSearchResults, RefitContext, RefitStatistics, UnrecordedRefitError
 from yid_ocp.diagnosis.screening import (
     AllCandidatesScoreModel,
     CandidateDetectability,
@@ -498,7 +498,7 @@ class _RecordedCase:
         flags = (data["are_offsets_stated"], data["has_left_baseline"])
         self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *flags)
         self.located_gap = None if located is None else restored(GapLocalization, located)
-        self.record = EffectSearchRecord(
+        self.record = EffectSearchResults(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
             {

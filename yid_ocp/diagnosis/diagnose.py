@@ -40,8 +40,8 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     RefitStore,
     RefittedModel,
-    refit_in_all_candidates_step,
     refit_with_effects,
+    restore_in_all_candidates_step,
 )
 from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -296,7 +296,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selections:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
-        final = refit_in_all_candidates_step(search.problem, accepted[-1].refitted_model)
+        final = restore_in_all_candidates_step(search.problem, accepted[-1].refitted_model)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
         remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
         # a disturbance that a better model explains was no event
@@ -325,7 +325,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         stage_seconds={name: ends[name] - ends[last] for last, name in itertools.pairwise(ends)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
-        counterfactual=earlier.counterfactual_prediction_errors(nominal, final, search.progress),
+        counterfactual=earlier.prediction_errors_with_and_without_effects(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_finer_time_step=steps if is_finer else None,
         search_seconds=ends["refits"] - ends[""],
@@ -346,7 +346,7 @@ def _fitted_nominal_model(search: RefitContext, start: Mapping[str, float], name
     """The nominal model fitted from a start, with whitening fixed near its end. Raises `SolverError` if it fails."""
     problem, limits = search.problem, search.thresholds
     for store in (None, search.store) if problem.problem.has_process_noise else (search.store,):
-        problem = problem.whitened_at(start)
+        problem = problem.with_whitening_linearized_at(start)
         # a gap may move parameters so far that the solver's equilibrium is not found again from there
         runs = (refit_with_effects(problem, (), own, store, name, limits) for own in (start, {}))
         fit = next(filter(None, runs), None)

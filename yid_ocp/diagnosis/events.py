@@ -37,7 +37,7 @@ from yid_ocp.inference.smoother import (
     generalised_force_unit,
     smoothed_unknown_significance_mask,
 )
-from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces, sensor_bias_location
+from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces, sensor_bias_location_name
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -354,7 +354,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         for column, channel in enumerate(samples.channel_name_per_output):
             location = channel.rpartition(".")[2]
             if sensor.outputs_per_channel > 1:
-                location = sensor_bias_location(problem.system, sensor, sensor.output_frame_names[column])
+                location = sensor_bias_location_name(problem.system, sensor, sensor.output_frame_names[column])
             seen, about = samples.positive_weight_mask[:, column], (location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
             yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)

@@ -162,7 +162,7 @@ class AllCandidatesProblem:
         """Names of the free parameters of the nominal problem."""
         return self.problem.free
 
-    def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
+    def with_whitening_linearized_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
         """Problem whitened by sensor and torque noise, with filters linearised at `values`."""
         if not self.problem.has_process_noise:
             return self
@@ -186,7 +186,7 @@ class AllCandidatesProblem:
         """Truncate held-out recordings where the nominal model's rollout fails. Also returns these recordings.
 
         `margin` is the fraction kept of the duration that the model follows. If too little of every recording remains,
-        estimation recordings are split in blocks instead. Residuals are whitened by sensor noise; see `whitened_at`.
+        estimation recordings are split in blocks instead. Residuals are whitened by sensor noise alone.
         """
         problem, x = self.problem, self.problem.unknown_vector(values)
         kept, cuts = [], []

@@ -271,7 +271,7 @@ def _composed_with_laws(
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
     composed, _ = composed.truncate_failing_held_out_recordings(start, SIMULATED_DURATION_FRACTIONS_TO_KEEP[0])
-    return composed.whitened_at(last.values)
+    return composed.with_whitening_linearized_at(last.values)
 
 
 def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[TorqueLaw]) -> list[_Family]:

@@ -68,7 +68,7 @@ class InverseDynamicsModel:
         squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
         applied = np.zeros((len(nodes), n))
         torque = input_or_servo_torques_of_rollout(self._step, theta, rollout)
-        driven, prescribed = system.driven_coordinate_indices, system.prescribed_coordinate_indices
+        driven, prescribed = system.actuated_coordinate_indices, system.prescribed_coordinate_indices
         for indices, effort in ((driven, torque), (prescribed, rollout.effort)):
             if indices:
                 applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]

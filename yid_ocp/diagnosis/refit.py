@@ -95,8 +95,8 @@ class RefitStatistics(StoredFit):
     has_process_noise: bool  # whether errors of torques drive the motion
 
     @property
-    def effect_parameter_count(self) -> int:
-        """Number of parameters of all effects in the model."""
+    def total_effect_parameter_count(self) -> int:
+        """Number of parameters of all effects in the model together."""
         return sum(len(effect.parameters) for effect in self.effects)
 
     def effect_parameters_as_reported(self, effect: EffectBase) -> dict[str, ReportedParameterValue]:
@@ -135,8 +135,8 @@ class NominalSolutionAndRefitStore:
 
 
 @dataclass(frozen=True)
-class EffectSearchRecord:
-    """Record of all results that a search for effects requested, by name. Other rules can reuse it without refits."""
+class EffectSearchResults:
+    """All results that a search for effects requested, by name. Other rules can reuse them without refits."""
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # by name; next to effects in the model
@@ -162,7 +162,7 @@ class RefitContext:
     store: RefitStore | None = None
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
-    record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
+    record: EffectSearchResults = field(default_factory=EffectSearchResults)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
     is_finished: bool = False
 
@@ -195,7 +195,8 @@ class RefitContext:
         # parameters shared by both sets of recordings, without initial states
         names = (*problem.free, *(name for effect in fit.effects for name in effect.parameters.names))
         start = {name: fit.values[name] for name in fit.values.keys() & names}
-        return refit_with_effects(turned.whitened_at(fit.values), fit.effects, start, self.store, name, self.thresholds)
+        whitened = turned.with_whitening_linearized_at(fit.values)
+        return refit_with_effects(whitened, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
         """Screen all candidates in addition to some effects. `name` says which fit provides `values`."""
@@ -270,8 +271,8 @@ def _restored(problem: AllCandidatesProblem, effects: Sequence[EffectBase], know
     return _model(known, effects, own, finish) if finish.ok else None
 
 
-def refit_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
-    """A refit with its problem and evaluation in the step of all candidates; its estimates are kept."""
+def restore_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
+    """Rebuild a refit's problem and evaluation in the step of all candidates, without a fit. The estimates are kept."""
     if fit.problem.step is problem.problem.step:
         return fit
     return _restored(problem, fit.effects, fit) or fit

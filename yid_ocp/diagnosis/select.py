@@ -97,7 +97,7 @@ def bic_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
     `fit`.
     """
     held = fit.held_out_loss.total_chi2 - other.held_out_loss.total_chi2
-    more = fit.effect_parameter_count - other.effect_parameter_count
+    more = fit.total_effect_parameter_count - other.total_effect_parameter_count
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
 
 
@@ -121,7 +121,7 @@ def _near_best_models(
 
     def order(entry: tuple[RefitStatistics, float]) -> tuple[bool, float, float]:
         fit, distance = entry
-        size = 0 if is_noise else fit.effect_parameter_count
+        size = 0 if is_noise else fit.total_effect_parameter_count
         return not _is_plausible(fit.effects[-1], fit, limits), size, distance if is_noise else _chi2(fit)
 
     return sorted((entry for entry in near if entry[1] <= 1), key=order)
@@ -150,7 +150,8 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     """
     loss, best = fit.held_out_loss, other.held_out_loss
     (lost, error), count = held_out_improvement(loss, best), len(best.block_chi2)
-    fewer = (other.effect_parameter_count - fit.effect_parameter_count) * (best.chi2_per_sample > _MODEL_ERROR_CHI2)
+    fewer = other.total_effect_parameter_count - fit.total_effect_parameter_count
+    fewer *= best.chi2_per_sample > _MODEL_ERROR_CHI2
     if lost <= math.expm1(fewer * math.log(count) / count) * best.chi2_per_sample:
         return 0.0
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))

@@ -241,7 +241,7 @@ def _explained_fraction(
         explainable = 0.0 if leaves_noise(last, limits) else 2 * nominal.cost - nominal.residual_count
     else:
         explainable = 0.0 if located is None else located.chi2_decrease
-    decrease = 2 * (nominal.cost - last.cost) - last.effect_parameter_count
+    decrease = 2 * (nominal.cost - last.cost) - last.total_effect_parameter_count
     return decrease / explainable if explainable > 0 else 1.0
 
 

@@ -140,7 +140,7 @@ def _coordinate_indices(system: System, location: str) -> list[int]:
 
 
 def _servo_input(state: MidpointState, index: int) -> ca.SX:
-    return state.u[state.system.driven_coordinate_indices.index(index)]
+    return state.u[state.system.actuated_coordinate_indices.index(index)]
 
 
 def _quantity(quantity: str, state: MidpointState, label: str, index: int) -> ca.SX:
@@ -214,7 +214,7 @@ def torque_law_quantity_values_along_rollout(
     columns = [own.T if own.shape[1] else ca.DM(0, len(own)) for own in inputs]
     values = np.asarray(function.map(len(q) - 1)(*columns, np.tile(theta[:, None], len(q) - 1)), float).T
     if quantity == "command":
-        inputs_there = nodes["torque"][:, [system.driven_coordinate_indices.index(index) for index in at]]
+        inputs_there = nodes["torque"][:, [system.actuated_coordinate_indices.index(index) for index in at]]
         values[inputs_there >= MOTOR_OFF_COMMAND / 2] = np.nan
     return values
 

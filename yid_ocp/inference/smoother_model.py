@@ -144,7 +144,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
             frame = sensor.output_frame_names[column]
             biased.append((k, column))
             names.append(name)
-            sources.append(SmoothedUnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
+            sources.append(SmoothedUnknownGroup(sensor_bias_location_name(course.system, sensor, frame), "bias"))
             reference.append(limits.bias_prior_std_over_noise * float(np.nanmedian(samples.std[:, column])))
     held, biases = np.array(grasped, int), tuple(biased)
     return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
@@ -171,7 +171,7 @@ def _unknown_forces(
     return names, sources, [size[place[name]] for name in names], forced
 
 
-def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
+def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str:
     """Location of a sensor's bias: `camera`, `wrist:FRAME`, the grasp that holds the frame, or the sensor's group."""
     if sensor.camera_pose is not None:
         return "camera"
@@ -196,7 +196,7 @@ def _loads(course: _LinearizedEpisode) -> Array:
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
     torque = input_or_servo_torques_of_rollout(course.problem.step, course.nominal.theta, rollout)
     for indices, force in (
-        (system.driven_coordinate_indices, torque),
+        (system.actuated_coordinate_indices, torque),
         (system.prescribed_coordinate_indices, rollout.effort),
     ):
         if len(indices):

@@ -293,7 +293,7 @@ def _about_smoothed(
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
         inputs = predictor.corrected_inputs_with_effect_momentum(episode, own, (), result.rollout.state[0])
-        driven = predictor.system.driven_coordinate_indices
+        driven = predictor.system.actuated_coordinate_indices
         guided = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         assert guided is not None
         true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]

@@ -78,8 +78,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
-    if e.impulses_of_force_with_derivatives is not None:
-        bodies = [part + push for part, push in zip(bodies, e.impulses_of_force_with_derivatives, strict=True)]
+    if e.closed_form_force_impulses is not None:
+        bodies = [part + push for part, push in zip(bodies, e.closed_form_force_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)

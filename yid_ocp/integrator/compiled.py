@@ -19,7 +19,7 @@ from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
-    CostDerivativesByRolloutVariables,
+    CostDerivativesByRolloutOutputs,
     NewtonStatusCode,
     Rollout,
     RolloutCostGradient,
@@ -198,7 +198,7 @@ class CompiledKernel:
         rollout: Rollout,
         feedback: TrackingFeedback | None,
         names: tuple[str, ...],
-        by: CostDerivativesByRolloutVariables,
+        by: CostDerivativesByRolloutOutputs,
     ) -> RolloutCostGradient:
         """Compute a cost's gradient along a rollout by the adjoint method. `by` holds its partial derivatives."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)

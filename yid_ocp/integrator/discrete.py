@@ -122,7 +122,7 @@ class DiscreteEquations:
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
-    def impulses_of_force_with_derivatives(self) -> tuple[ca.SX, ca.SX] | None:
+    def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """Impulses of the closed-form force in `momentum_balance` and `p1`, each (n, 1) [N m s]; None without it."""
         if self.force_with_derivatives is None:
             return None
@@ -397,7 +397,7 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
     """Build the equations of static equilibrium: a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
-    driven = list(system.driven_coordinate_indices)
+    driven = list(system.actuated_coordinate_indices)
     given, sought = ca.SX.sym("given", nu + len(fixed)), ca.SX.sym("sought", len(free))
     z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
     held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")
@@ -494,7 +494,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
         1: {"q0": bent, "q1": bent - pulls.midpoint_share * pulls.after_force_by_q},
     }
-    impulses = e.impulses_of_force_with_derivatives or (ca.SX(n, 1), ca.SX(n, 1))
+    impulses = e.closed_form_force_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
     apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
     for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):

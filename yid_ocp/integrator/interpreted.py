@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
-    CostDerivativesByRolloutVariables,
+    CostDerivativesByRolloutOutputs,
     NewtonStatusCode,
     Rollout,
     RolloutCostGradient,
@@ -230,7 +230,7 @@ class InterpretedKernel:
         rollout: Rollout,
         feedback: TrackingFeedback | None,
         names: tuple[str, ...],
-        by: CostDerivativesByRolloutVariables,
+        by: CostDerivativesByRolloutOutputs,
     ) -> RolloutCostGradient:
         """Compute the gradient of a cost J along a rollout by the adjoint method. `by` holds J's partial derivatives.
 

@@ -66,7 +66,7 @@ class EquilibriumSolver:
     def __init__(self, step: Step) -> None:
         self.step = step
         system, e = step.system, step.equations
-        self.known_coordinates = (*system.driven_coordinate_indices, *system.prescribed_coordinate_indices)
+        self.known_coordinates = (*system.actuated_coordinate_indices, *system.prescribed_coordinate_indices)
         self.free_coordinates = system.unprescribed_coordinate_indices
         rows = system.n_coordinates + e.z0.numel() + e.lam.numel()
         self._sought = [*self.free_coordinates, *range(system.n_coordinates, rows)]
@@ -235,7 +235,7 @@ class EquilibriumSolver:
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
         q, z, lam = self._configuration(w, hold.given), w[free : free + nz], h * w[free + nz :]
         none, u = np.zeros(n), hold.held + hold.stiffness * hold.give(q, system)
-        driven = list(system.driven_coordinate_indices)
+        driven = list(system.actuated_coordinate_indices)
         state = np.tile(np.concatenate([q, none, z]), (2, 1))
         found = step.kernel.linearize_step_equations(theta, state, lam[None], u[None], names, True)
 
@@ -281,7 +281,7 @@ class EquilibriumSolver:
         n, nz, nu = (self.step.sizes[key] for key in ("n", "nz", "nu"))
         free, fixed = len(self.free_coordinates), list(self.step.system.prescribed_coordinate_indices)
         (_, rows, push, others), (p, by_p, push_p, others_p) = self._rest_equations(w, theta, hold, h, names)
-        driven = list(self.step.system.driven_coordinate_indices)
+        driven = list(self.step.system.actuated_coordinate_indices)
         push, push_p = hold.stiffness * push, hold.stiffness * push_p
         push[driven, range(nu)] += hold.by_hand
         push_p[driven, range(nu)] += h / 2 * hold.by_hand
@@ -312,7 +312,7 @@ class EquilibriumSolver:
 
 def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     """Sum of 1/2 gain (u - q)^2 over all servos [J]; limits and damping do not change the lowest equilibrium."""
-    at = zip(system.driven, system.driven_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
+    at = zip(system.driven, system.actuated_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
     known = ((system.servos[name], part, q[i]) for name, i, part in at)
     return sum(
         (0.5 * servo.gain * servo.position_error(command, angle) ** 2 for servo, command, angle in known), ca.SX(0)
@@ -341,7 +341,7 @@ class _Hold:
 
     def give(self, q: Any, system: System) -> Any:
         """Distance of the driven joints from their targets."""
-        return self.given[: len(self.held)] - q[list(system.driven_coordinate_indices)]
+        return self.given[: len(self.held)] - q[list(system.actuated_coordinate_indices)]
 
 
 def _damped_newton(

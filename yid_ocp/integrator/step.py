@@ -308,7 +308,7 @@ def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rol
     system, h = step.system, step.time_step
     if not system.servos:
         return rollout.torque
-    e, driven = step.equations, list(system.driven_coordinate_indices)
+    e, driven = step.equations, list(system.actuated_coordinate_indices)
     n = system.n_coordinates
     with CASADI_LOCK:
         force = ca.densify(system.input_force(e.u, e.q0, e.q1)[driven])

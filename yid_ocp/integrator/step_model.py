@@ -202,7 +202,7 @@ class Rollout:
     status: RolloutStatus
 
 
-CostDerivativesByRolloutVariables = tuple[Array, Array | None, Array | None]
+CostDerivativesByRolloutOutputs = tuple[Array, Array | None, Array | None]
 """Partial derivatives of a cost by states (N + 1, nx), multipliers (N, m) and efforts (N, nc) of a rollout."""
 
 

@@ -44,7 +44,7 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
         raise ModelError(what, where="problem.arm_tracking_feedback_gains", allowed="0 or more [N m/rad]")
     steps = len(reference) - 1
     gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
-    return TrackingFeedback(np.array(step.system.driven_coordinate_indices, np.int32), gain, reference[:-1])
+    return TrackingFeedback(np.array(step.system.actuated_coordinate_indices, np.int32), gain, reference[:-1])
 
 
 def lqr_tracking_feedback(
@@ -85,8 +85,8 @@ def lqr_tracking_feedback(
         closed = a - b @ gain[k]
         cost = stage + closed.T @ cost @ closed + gain[k].T @ weight_u @ gain[k]
         cost = 0.5 * (cost + cost.T)
-    n = system.n_coordinates
-    index = np.concatenate([np.array(system.driven_coordinate_indices), n + np.array(system.driven_coordinate_indices)])
+    driven = np.array(system.actuated_coordinate_indices)
+    index = np.concatenate([driven, system.n_coordinates + driven])
     return TrackingFeedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
 
 
@@ -171,7 +171,7 @@ class RecordedMomentumCorrection:
 
     def __init__(self, step: Step) -> None:
         e, system = step.equations, step.system
-        driven = list(system.driven_coordinate_indices)
+        driven = list(system.actuated_coordinate_indices)
         nu = len(driven)
         before, now = ca.SX.sym("before", nu), ca.SX.sym("now", nu)
         whole = []
@@ -221,7 +221,7 @@ class RecordedMomentumCorrection:
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
-    def node_momentum_shifts_and_derivatives(
+    def effect_momentum_shifts_and_derivatives(
         self,
         recorded: JointMotionWithSensitivities,
         true: JointMotionWithSensitivities,

@@ -357,8 +357,8 @@ class System(ReprMixin):
         return sum(grasp.n_constraint_equations for grasp in self.grasps)
 
     @cached_property
-    def driven_coordinate_indices(self) -> tuple[int, ...]:
-        """Indices in q of the driven joints, in the order of the inputs."""
+    def actuated_coordinate_indices(self) -> tuple[int, ...]:
+        """Indices in q of the joints that inputs u drive, in the order of `driven`."""
         return tuple(self.mechanism.joint_index(name) for name in self.driven)
 
     @cached_property
@@ -416,7 +416,7 @@ class System(ReprMixin):
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """Generalized force (n, 1) [N m] of motor torques or servo commands u, at coordinates q and velocities v."""
         force = [ca.SX(0)] * self.n_coordinates
-        for row, (joint, index) in enumerate(zip(self.driven, self.driven_coordinate_indices, strict=True)):
+        for row, (joint, index) in enumerate(zip(self.driven, self.actuated_coordinate_indices, strict=True)):
             servo = self.servos.get(joint)
             force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError, YidError, missing_package_error
+from yid_ocp.errors import ConfigError, DataError, OutputError, ParallelWorkError, YidError, missing_package_error
 from yid_ocp.files import file_sha256, json_sha256, make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel.threads_and_processes import InlineExecutor, available_processor_count, process_pool
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences
@@ -78,7 +78,7 @@ class WorkerConfig:
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_scheduler_available(self) -> None:
-        """Raise `WorkerError` if the scheduler does not answer or a worker is unsuitable. Call it before long work."""
+        """Raise `ParallelWorkError` if no scheduler answers or a worker is unsuitable. Call it before long work."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
                 pass
@@ -101,7 +101,7 @@ def run_tasks(
     A task that raises writes `HASH.error.json` and a warning. The other tasks continue, and the next run repeats the
     failed task. After an interruption, finished results are kept. Workers whose sources differ from this process do not
     run tasks. Raises `DataError` if a task's file cannot be read, `OutputError` if the folder cannot be made, and
-    `WorkerError` if a worker is unsuitable (see `WorkerConfig`).
+    `ParallelWorkError` if a worker is unsuitable (see `WorkerConfig`).
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Return the values of all tasks. Raises `WorkerError` for failures with a known cause, else `RuntimeError`."""
+    """Return all tasks' values. Raises `ParallelWorkError` for failures with a known cause, else `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]
@@ -149,7 +149,7 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
         told = "; ".join(line.strip() for line in rest.splitlines())
         what = f"{what}; {told}" if told else what
         where, hint = f"task '{failed[0].name}'", "correct this, then run the same command: it repeats the failed tasks"
-        raise WorkerError(what, where=where, allowed="tasks without errors", hint=hint)
+        raise ParallelWorkError(what, where=where, allowed="tasks without errors", hint=hint)
     raise RuntimeError(f"{what}; the same command tries them again")
 
 
@@ -222,7 +222,7 @@ _TaskFinishedCallback = Callable[[_Job, TaskResult], None]
 def _perform(job: _Job) -> str:
     """Run a task and write its result file; returns the error message, empty on success."""
     if unlike := software_fingerprint_differences(job.maker, software_fingerprint()):
-        return f"WorkerError: {_unfit(socket.gethostname(), unlike).what}"
+        return f"ParallelWorkError: {_unfit(socket.gethostname(), unlike).what}"
     begun = time.perf_counter()
     entry = {"format": _TASK_FORMAT, "name": job.task.name, "input": job.input}
     failed = job.file.with_suffix(".error.json")
@@ -335,21 +335,22 @@ def _dask_executor(
     try:
         distributed = importlib.import_module("distributed")
     except ImportError as error:
-        raise missing_package_error(WorkerError, "the option --scheduler needs the package dask", "cluster") from error
+        what = "the option --scheduler needs the package dask"
+        raise missing_package_error(ParallelWorkError, what, "cluster") from error
     path = Path(scheduler).expanduser()
     where = {"scheduler_file": str(path)} if path.is_file() else {"address": scheduler}
-    refusal: WorkerError | None = None
+    refusal: ParallelWorkError | None = None
     try:
         client = _client(distributed, where)
     except AssertionError:
         what = f"the event loop of Dask did not start within {10 * _MAX_CLIENT_STARTS} s"
         hint = "run the command again when this machine is less busy"
-        refusal = WorkerError(what, where=scheduler, allowed="a machine with free processors", hint=hint)
+        refusal = ParallelWorkError(what, where=scheduler, allowed="a machine with free processors", hint=hint)
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
         what = f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}"
         allowed = "HOST:PORT of a running `dask scheduler`, or the path of its scheduler file"
         hint = "start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`"
-        refusal = WorkerError(what, where=scheduler, allowed=allowed, hint=hint)
+        refusal = ParallelWorkError(what, where=scheduler, allowed=allowed, hint=hint)
     if refusal is not None:
         gc.collect()  # a half-built client that is finalized while another one starts makes both wait for ever
         raise refusal
@@ -384,7 +385,7 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
         if count > 1:
             what, allowed = f"a worker runs {count} tasks at once in one process", "one task at a time in every process"
             hint = "start workers with --nthreads 1, and --nworkers for as many as the machine has processors"
-            raise WorkerError(what, where=address, allowed=allowed, hint=hint)
+            raise ParallelWorkError(what, where=address, allowed=allowed, hint=hint)
     here = software_fingerprint()
     for address, entry in client.get_versions()["workers"].items():
         said = str(entry["host"]["python"])
@@ -398,7 +399,8 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
         if isinstance(said, str):
             allowed = "workers that import the same modules and see the same folders as this process"
             hint = "install yid-ocp where the workers run, and choose --out on a file system that all of them share"
-            raise WorkerError(f"a worker cannot do the tasks: {said}", where=address, allowed=allowed, hint=hint)
+            what = f"a worker cannot do the tasks: {said}"
+            raise ParallelWorkError(what, where=address, allowed=allowed, hint=hint)
         if unlike := software_fingerprint_differences(here, said):
             raise _unfit(address, unlike)
 
@@ -423,8 +425,8 @@ def _question(module: str, probe: str) -> Callable[[], Any]:
     return asked
 
 
-def _unfit(worker: str, unlike: Sequence[str]) -> WorkerError:
+def _unfit(worker: str, unlike: Sequence[str]) -> ParallelWorkError:
     allowed = "workers of the same versions and sources as this process"
     hint = "install the same version there, and start the workers again"
     what = f"the worker {worker} is of another version: {', '.join(unlike)}"
-    return WorkerError(what, where=worker, allowed=allowed, hint=hint)
+    return ParallelWorkError(what, where=worker, allowed=allowed, hint=hint)

@@ -148,7 +148,7 @@ class EpisodePredictor:
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
         if self._follows_momenta and self.model_functions.recorded_momentum_correction.is_active(theta, wanted):
             return False
-        slopes += self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted) or ()
+        slopes += self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
             slopes += self._delay_in_steps(samples, theta, wanted) or ()
         moved = any(x is not None and np.any(x) for x in slopes)
@@ -183,7 +183,7 @@ class EpisodePredictor:
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
         first = torque[0] if nu else np.zeros(0)
         by_torque = by_first = by_arm = by_path = by_recorded = None
-        late = corrections.joint_delay_or_lag("torque_delay", theta, names)
+        late = corrections.joint_delays_or_lag_times("torque_delay", theta, names)
         if late is not None:
             joints, (delay, by_delay) = episode.recording.joints, late
             assert joints is not None
@@ -202,7 +202,7 @@ class EpisodePredictor:
             if by_recorded is not None and names:
                 by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
-        if (lag := corrections.joint_delay_or_lag("torque_lag", theta, names)) is not None:
+        if (lag := corrections.joint_delays_or_lag_times("torque_lag", theta, names)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
             left = errors.estimated_torque_error_to_subtract
@@ -255,7 +255,7 @@ class EpisodePredictor:
             return start.failure_message
         by_start = start.state_sensitivity
         inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, start.state, by_start)
-        feedback, driven = episode.tracking_feedback_about_smoothed_motion, self.system.driven_coordinate_indices
+        feedback, driven = episode.tracking_feedback_about_smoothed_motion, self.system.actuated_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
@@ -273,7 +273,7 @@ class EpisodePredictor:
             return str(prepared)
         episode, start, inputs, wanted = prepared.episode, prepared.start, prepared.inputs, prepared.wanted
         theta, feedback, directions = prepared.member.theta, prepared.member.feedback, prepared.member.directions
-        driven = self.system.driven_coordinate_indices
+        driven = self.system.actuated_coordinate_indices
         if not rollout.status.is_converged:
             return f"{episode.name}: {rollout.status.message}"
         by_applied = None
@@ -317,7 +317,7 @@ class EpisodePredictor:
         """State values at all nodes of a rollout. Loads are efforts (prescribed joints) or torques (driven joints)."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
-        load[:-1, list(self.system.driven_coordinate_indices)] = rollout.torque
+        load[:-1, list(self.system.actuated_coordinate_indices)] = rollout.torque
         load[-1] = load[-2]
         lam = rollout.multipliers[np.minimum(np.arange(len(load)), len(load) - 2)] / self.integrator_step.time_step
         return TimeGridStateValues.from_trajectory(self.integrator_step, rollout.state, load, lam)
@@ -341,7 +341,8 @@ class EpisodePredictor:
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
         """The rollout with efforts of prescribed joints as sensors record them: with lag and smoothed."""
         effort, slope = rollout.effort, rollout.effort_sensitivity
-        if (lag := self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted)) is not None:
+        lag = self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted)
+        if lag is not None:
             effort, slope = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_node_values(effort, slope)
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
@@ -391,7 +392,7 @@ class EpisodePredictor:
         for by_rate, rate in ((read.by_v, central_difference_velocity), (read.by_a, second_difference_acceleration)):
             if by_rate.shape[2]:
                 total += by_rate @ rate(along.by_state[:, :n], nodes, self.integrator_step.time_step)
-        prescribed, driven = self.system.prescribed_coordinate_indices, self.system.driven_coordinate_indices
+        prescribed, driven = self.system.prescribed_coordinate_indices, self.system.actuated_coordinate_indices
         for index, by_load_there in ((prescribed, along.by_effort), (driven, along.by_torque)):
             by_load = read.by_load[:, :, list(index)]
             if by_load_there is not None and np.any(by_load):
@@ -420,7 +421,8 @@ class EpisodePredictor:
         by_state, by_effort, by_applied, by_multipliers = pulled.values()
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             by_effort = smooth.smoothing_adjoint(by_effort)
-        if (lag := self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted)) is not None:
+        lag = self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted)
+        if lag is not None:
             lagged = FirstOrderLag(*lag, self.integrator_step.time_step)
             by_effort, by_lag = lagged.lagged_node_values_adjoint(rollout.effort, by_effort)
             total += by_lag
@@ -435,7 +437,7 @@ class EpisodePredictor:
             episode, theta, wanted, start.state, start.state_sensitivity
         )
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
-        by_torque = inputs.nominal_torque_derivatives(feedback, self.system.driven_coordinate_indices, len(own))
+        by_torque = inputs.nominal_torque_derivatives(feedback, self.system.actuated_coordinate_indices, len(own))
         if by_torque is not None:
             own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.prescribed_path_sensitivity is not None:
@@ -474,7 +476,7 @@ class EpisodePredictor:
                 by_state[:, :n] += adjoint(np.einsum("mk,mkq->mq", at_nodes, by_rate), nodes, len(by_state), h)
         if read.by_lam.shape[2]:
             np.add.at(pulled["multipliers"], last, np.einsum("mk,mkq->mq", at_nodes, read.by_lam) / h)
-        prescribed, driven = self.system.prescribed_coordinate_indices, self.system.driven_coordinate_indices
+        prescribed, driven = self.system.prescribed_coordinate_indices, self.system.actuated_coordinate_indices
         for index, key in ((prescribed, "effort"), (driven, "torque")):
             if index:
                 np.add.at(pulled[key], last, np.einsum("mk,mkq->mq", at_nodes, read.by_load[:, :, list(index)]))

@@ -247,7 +247,7 @@ def estimated_initial_state_names(
     """
     found: list[str] = []
     if options.initial_state == "estimated":
-        known = {*(() if system.servos else system.driven_coordinate_indices), *system.prescribed_coordinate_indices}
+        known = {*(() if system.servos else system.actuated_coordinate_indices), *system.prescribed_coordinate_indices}
         known |= {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
         coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
         found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]

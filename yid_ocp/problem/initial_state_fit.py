@@ -73,7 +73,7 @@ class InitialStateFitter:
         self.step = step
         self.fitted_parameters = tuple(fitted_parameters)
         system, e = step.system, step.equations
-        self._known = [*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]
+        self._known = [*system.actuated_coordinate_indices, *system.prescribed_coordinate_indices]
         # compliant coordinates follow their load and have no initial state
         idle = {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
         self._free = [i for i in range(system.n_coordinates) if i not in set(self._known) | idle]

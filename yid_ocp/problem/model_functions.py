@@ -86,7 +86,7 @@ class CorrectedInputs:
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
         true = JointMotionWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
-        momentum, slope = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, names)
+        momentum, slope = shift.effect_momentum_shifts_and_derivatives(recorded, true, theta, names)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
     def nominal_torque_derivatives(
@@ -187,7 +187,7 @@ class InputCorrectionFunctions:
         a_theta, e_theta = (x[:, :, at] for x in slopes) if names else (np.zeros((*a.shape[:2], 0)),) * 2
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
-    def joint_delay_or_lag(
+    def joint_delays_or_lag_times(
         self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
         """Delays or lag time constants (nj,) [s] of driven joints' torques or of prescribed joints' efforts.

@@ -19,7 +19,7 @@ from yid_ocp.problem.measurements import ResidualWeightingName
 from yid_ocp.sensors import SensorOptions as SensorOptions
 
 _InitialStateKind = Literal["equilibrium", "estimated", "fitted_to_points"]
-RefinedDiscretisation = Literal["links", "time_step"]
+RefinementKind = Literal["links", "time_step"]
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class ProblemOptions:
     has_uncertain_point_clocks: bool = False
     data_issues: tuple[Issue, ...] = ()
     excess_residual_criteria: ExcessResidualCriteria = ExcessResidualCriteria()
-    checked_discretisations: tuple[RefinedDiscretisation, ...] = ("links", "time_step")
+    checked_discretisations: tuple[RefinementKind, ...] = ("links", "time_step")
     divided_links_model: DividedLinksModel | None = field(default=None, compare=False, repr=False)
     cable_topology: CableTopology | None = field(default=None, compare=False, repr=False)
 

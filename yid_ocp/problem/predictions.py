@@ -55,10 +55,10 @@ def naive_cable_predictions(
     junction. The first two frames are as measured. Raises `DataError` if a point is not recorded or not measured in the
     second frame, or if there are fewer than three frames.
     """
-    start, parent, held = _start_frame(recording, points), cable.parent_branch_vertex_names, cable.clamped_vertex_names
+    start, parent, held = _start_frame(recording, points), cable.main_branch_vertex_names, cable.clamped_vertex_names
     line = np.cumsum(np.linalg.norm(np.diff(_start_frame(recording, parent), axis=0), axis=1))
     arc = dict(zip(parent, [0.0, *line], strict=True))
-    junction = {point: branch[0] for branch in cable.vertex_names_by_child_branch.values() for point in branch[1:]}
+    junction = {point: branch[0] for branch in cable.child_branch_vertex_names.values() for point in branch[1:]}
     ends = sorted(knots or (parent[0], parent[-1]), key=arc.__getitem__)
     places, between = [arc[junction.get(point, point)] for point in points], [arc[point] for point in ends]
     shares = {

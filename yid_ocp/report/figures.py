@@ -398,7 +398,7 @@ def _even(value: Any) -> Any:
     return np.arcsinh(np.asarray(value, float) / 2)
 
 
-def candidate_ranking_figure(
+def candidate_gap_closure_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, predicted: str
 ) -> _Figure:
     """Plot each candidate's gap closure after a refit [%], with interval, and the decrease that screening predicts.

@@ -143,7 +143,7 @@ def _resting(
     for table in (state, pull):
         for column in range(table.shape[1]):
             table[:, column] = np.interp(times, times[chosen], table[chosen, column])
-    driven = list(problem.system.driven_coordinate_indices)
+    driven = list(problem.system.actuated_coordinate_indices)
     state[:, driven] = episode.measured_driven_angles[nodes]
     velocity = np.gradient(state[:, :n], times, axis=0)
     state[:, n : 2 * n] += generalized_momentum_from_velocity(step, state[:, :n], velocity, theta)

@@ -274,8 +274,8 @@ class ProgramVectorLayout:
         self.size += len(values)
         return np.arange(self.size - len(values), self.size)
 
-    def register_block(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Register indices of the vector as a named block. Without indices nothing is registered."""
+    def name_indices(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
+        """Name existing indices of the vector as a block. Without indices nothing is named."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
@@ -284,7 +284,7 @@ class ProgramVectorLayout:
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table
         index = self.append_values(table.ravel(order="F")).reshape(table.shape, order="F")
-        self.register_block(name, index, rows, unit)
+        self.name_indices(name, index, rows, unit)
         return index
 
 

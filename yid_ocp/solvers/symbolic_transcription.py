@@ -263,7 +263,7 @@ class _Maker:
         )
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.append_values(x[:shared], low[:shared], high[:shared])
-        self._w.register_block("theta", theta[:, None], problem.shared_parameters)
+        self._w.name_indices("theta", theta[:, None], problem.shared_parameters)
         constraints: list[MappedFunctionTerm] = []
         residuals: list[ResidualTerm] = []
         at_ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
@@ -272,7 +272,7 @@ class _Maker:
                 shared : shared + len(problem.local_parameters)
             ]
             local = self._w.append_values(x[at], low[at], high[at])
-            self._w.register_block(f"local[{episode.name}]", local[:, None], problem.local_parameters)
+            self._w.name_indices(f"local[{episode.name}]", local[:, None], problem.local_parameters)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
             at_ridge.append(local)
             places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
@@ -305,7 +305,7 @@ class _Maker:
         grasped = [name for grasp in system.grasps for name in grasp.constraint_equation_names]
         at_rest = [*(joints[k] for k in sought), *system.effect_internal_coordinate_symbols, *grasped]
         rest_at = self._w.append_values(rest)
-        self._w.register_block(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
+        self._w.name_indices(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
         table = np.zeros((3, len(state), nx + m))
         table[0, :, :nx], table[0, :-1, nx:] = state, pull
         table[1], table[2] = -np.inf, np.inf
@@ -316,9 +316,9 @@ class _Maker:
         index = np.append(at, np.zeros(m, np.int64)).reshape(len(state), nx + m)
         states, multipliers = index[:, :nx], index[:-1, nx:]
         for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
-            self._w.register_block(f"{label}[{name}]", part.T, rows)
-        self._w.register_block(f"z[{name}]", states[:, 2 * n :].T, tuple(system.effect_internal_coordinate_symbols))
-        self._w.register_block(f"lam[{name}]", multipliers.T, grasped)
+            self._w.name_indices(f"{label}[{name}]", part.T, rows)
+        self._w.name_indices(f"z[{name}]", states[:, 2 * n :].T, tuple(system.effect_internal_coordinate_symbols))
+        self._w.name_indices(f"lam[{name}]", multipliers.T, grasped)
         theta_at = self._p.append_block(f"theta[{name}]", theta, system.parameters.names)
         torque = self._p.append_block(f"torque[{name}]", episode.torque.T, system.driven, "N m")
         gain, reference = self._followed(episode)
@@ -366,7 +366,7 @@ class _Maker:
             zero = np.zeros(nu * count)
             at = self._w.append_values(zero, np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
             places[label] = at.reshape(count, nu)
-            self._w.register_block(f"{label}[{name}]", places[label].T, driven)
+            self._w.name_indices(f"{label}[{name}]", places[label].T, driven)
             weight = self._p.append_block(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
             data = np.zeros((count, 0), np.int64)
             term = MappedFunctionTerm(f"{label}[{name}]", driven, itself, places[label], data, weight[:0, 0])
@@ -486,8 +486,8 @@ class _Maker:
         last, size = ca.SX.sym("last"), step.v.numel()
         node = (1 - last) * step.state_before + last * step.state_after
         load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, size)
-        pairs = ((system.prescribed_coordinate_indices, *step.effort), (system.driven_coordinate_indices, *step.torque))
-        for index, values, by_these in pairs:
+        at = system.prescribed_coordinate_indices, system.actuated_coordinate_indices
+        for index, (values, by_these) in zip(at, (step.effort, step.torque), strict=True):
             for k, row in enumerate(index):
                 load[row], by_v[row, :] = values[k], by_these[k, :]
         read = function(q=node[:n], z=node[2 * n :], load=load, theta=self._freed.theta)

@@ -197,7 +197,7 @@ def _held_and_visible_points(system: System) -> tuple[tuple[str, ...], tuple[str
 def _joints(
     system: System, run: SimulationResult, experiment: VirtualExperimentSettings, streams: _Generators
 ) -> JointGroup:
-    driven, noise = list(system.driven_coordinate_indices), experiment.arm_noise
+    driven, noise = list(system.actuated_coordinate_indices), experiment.arm_noise
     names = ("effort_std", "effort_bias_std")
     white, bias = (_by_joint(getattr(noise, name), len(driven), f"ArmSensorNoise.{name}") for name in names)
     offset = bias * streams["effort_bias"].standard_normal(len(driven))

@@ -569,7 +569,7 @@ class _InjectedTerms:
             else:
                 self._forces.append(OUT_OF_LIBRARY_FORCE_BUILDERS[effect.kind](scene, model, place, size["size"]))
 
-    def prepare_motion(self, data: Any) -> None:
+    def begin_motion(self, data: Any) -> None:
         self._scene.has_motion_begun = True
 
     def add_forces(self, model: Any, data: Any) -> None:

@@ -118,7 +118,7 @@ def random_multisine_motion(
     q0[[tree.joint_index(name) for name in start]] = list(start.values())
     holders = [tree.frame(grasp.holder_frame) for grasp in system.grasps]
     chains = [tree.ancestor_joint_indices(frame.joint_index) for frame in holders]
-    arms = [[i for i, j in enumerate(system.driven_coordinate_indices) if j in chain] for chain in chains]
+    arms = [[i for i, j in enumerate(system.actuated_coordinate_indices) if j in chain] for chain in chains]
     for arm in arms:  # the same angle near the base moves the hand further
         motion = _scaled(motion, arm, np.linspace(0.5, 1.0, len(arm)))
     q = ca.SX.sym("q", system.n_coordinates)
@@ -126,7 +126,7 @@ def random_multisine_motion(
     for frame, arm in zip(holders, arms, strict=True):
         tip = ca.Function("tip", [q], [kinematics.frame_position(frame)]).map(len(times))
         waves = np.array([motion.offset_and_derivatives(t)[:2] for t in times])[:, :, arm]
-        scale = _scale(chosen, tip, q0, [system.driven_coordinate_indices[i] for i in arm], waves)
+        scale = _scale(chosen, tip, q0, [system.actuated_coordinate_indices[i] for i in arm], waves)
         motion = _scaled(motion, arm, np.full(len(arm), scale))
     if not holders:
         fastest = max(float(np.abs(motion.offset_and_derivatives(t)[1]).max()) for t in times)
@@ -137,7 +137,7 @@ def random_multisine_motion(
     rest = ca.SX(ca.DM.zeros(system.n_coordinates))
     rigid = rigid_body_lagrangian_derivatives(kinematics, rest, ca.SX(ca.DM.zeros(3)))
     inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
-    return _shaken(motion, chosen, inertia[list(system.driven_coordinate_indices)], rng)
+    return _shaken(motion, chosen, inertia[list(system.actuated_coordinate_indices)], rng)
 
 
 def _scaled(motion: MultisineMotion, joints: Sequence[int], factors: Array) -> MultisineMotion:
@@ -217,7 +217,7 @@ def grasping_joint_angles(
     if sought:
         gap = _gap_function(system, tree, value, offsets or {}, sought)
         posture = _reached(system, tree, posture, sought, gap)
-    wanted = sorted(set(sought) | set(system.driven_coordinate_indices))
+    wanted = sorted(set(sought) | set(system.actuated_coordinate_indices))
     return {tree.joints[j].name: float(posture[j]) for j in wanted}
 
 

@@ -44,7 +44,7 @@ class InjectedSimulatorTerms(Protocol):
     def edit_model(self, model: Any) -> None:
         """Edit the compiled `mujoco.MjModel`."""
 
-    def prepare_motion(self, data: Any) -> None:
+    def begin_motion(self, data: Any) -> None:
         """Prepare for a motion that starts at equilibrium. Called once per motion."""
 
     def add_forces(self, model: Any, data: Any) -> None:
@@ -171,7 +171,7 @@ def simulate_in_mujoco(
         else:
             controller = TrackingController(scene, motion, settle_to_equilibrium(scene, nominal_damping))
         if injected is not None:
-            injected.prepare_motion(scene.data)
+            injected.begin_motion(scene.data)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)
@@ -198,7 +198,7 @@ class MujocoScene:
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
-        moved = order[list(system.driven_coordinate_indices or system.prescribed_coordinate_indices)]
+        moved = order[list(system.actuated_coordinate_indices or system.prescribed_coordinate_indices)]
         return MujocoScene(mujoco, model, mujoco.MjData(model), order, moved, sites)
 
 
@@ -267,7 +267,7 @@ class TrackingController:
         zero = np.zeros(len(scene.moved_joint_ids))
         self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
 
-    def apply_input(self, t: float) -> Array:
+    def apply_input_to_scene(self, t: float) -> Array:
         """Apply and return the torques (nu,) [N m] at time t [s], computed from the scene's present state."""
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
@@ -293,7 +293,7 @@ class _ServoCommander:
         self._scene, self._motion = scene, motion
         self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
 
-    def apply_input(self, t: float) -> Array:
+    def apply_input_to_scene(self, t: float) -> Array:
         commands = np.asarray(self.initial_command + self._motion.offset_and_derivatives(t)[0])
         self._scene.data.ctrl[:] = commands
         return commands
@@ -365,7 +365,7 @@ def _play(
     for tick, done in enumerate(ticks.tolist()):
         end = done if tick == len(ticks) - 1 else int(ticks[tick + 1])
         mujoco.mj_kinematics(model, data)
-        torques.append(controller.apply_input(done / steps_per_second))
+        torques.append(controller.apply_input_to_scene(done / steps_per_second))
         if tick % periods == 0:
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])
@@ -456,7 +456,7 @@ def replay_mismatch_by_channel(
         return _errors(system, recording, joints, columns, _driven(scene, path, t, effort))
     controller = TrackingController(scene, path, balance)
     scene.data.qvel[scene.moved_joint_ids] = path.offset_and_derivatives(0.0)[1]  # a recording may begin in motion
-    played = _played(scene, t[-1], lambda k, now: controller.apply_input(now))
+    played = _played(scene, t[-1], lambda k, now: controller.apply_input_to_scene(now))
     return _errors(system, recording, joints, columns, played)
 
 

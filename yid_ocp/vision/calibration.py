@@ -84,7 +84,7 @@ class _StampDelay(NamedTuple):
         return abs(self.delay) > max(_MAX_STAMP_DELAY, _STAMP_ERROR_STDS * self.std)
 
 
-def stamp_delay_beyond_clock_offset(
+def frame_stamp_delay(
     arm: ArmSurface, state: CalibrationState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Estimate the delay [s] of a frame's time stamp beyond the common clock offset. None if the arm is not in view.
@@ -299,7 +299,7 @@ class _Calibrator:
                 state, chosen, _RAY_REACH, True, _LAST_STAGE_POINTS, _LAST_STAGE_ITERATIONS
             )
             placed = [(g.stamp, state.measured_to_world_points(g.points)) for g in used]
-            own = [stamp_delay_beyond_clock_offset(self.arm, state, *seen, self.rng) for seen in placed]
+            own = [frame_stamp_delay(self.arm, state, *seen, self.rng) for seen in placed]
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:

@@ -24,7 +24,7 @@ from yid_ocp.vision.calibration import (
     CameraCalibration,
     calibrate_camera,
     calibration_without_estimation,
-    stamp_delay_beyond_clock_offset,
+    frame_stamp_delay,
 )
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
@@ -395,7 +395,7 @@ class FrameTracker:
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
-            own = stamp_delay_beyond_clock_offset(self.arm_surface, state, stamp, cloud.points, rng, typical)
+            own = frame_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
                 if own.is_significant:

@@ -27,7 +27,7 @@ from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.run_folder import local_time_text
+from yid_ocp.workflow.run_folder import current_local_time_text
 from yid_ocp.workflow.run_history import estimate_history_to_dict, read_estimates, require_same_model
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve
@@ -109,8 +109,8 @@ def run_batch(
 
     The batch is successful if all runs are; a failed run states its reason. The folder `out` contains `runs/NAME/` (run
     folders), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which
-    shows `command_line`. Raises `OutputError` if `out` holds something else or cannot be created; `WorkerError` as in
-    `run_tasks`.
+    shows `command_line`. Raises `OutputError` if `out` holds something else or cannot be created; `ParallelWorkError`
+    as in `run_tasks`.
     """
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)
@@ -142,7 +142,7 @@ def run_batch(
         "again": command_line,
         "runs": entries,
         "history": _history([folder / _RUNS_FOLDER / entry["name"] for entry in entries if entry["ok"]]),
-        "date": local_time_text(),
+        "date": current_local_time_text(),
         "versions": installed_versions(),
     }
     written: dict[str, Any] = to_json_types(result)

@@ -321,9 +321,9 @@ def _true_effect_closure(
     return best if math.isfinite(best) else None
 
 
-def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> blind.BlindCase:
+def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> blind.UnlabelledCase:
     *estimate, held_out = map(read_recording, recordings)
-    return blind.BlindCase(name, tuple(estimate), held_out, tuple(without))
+    return blind.UnlabelledCase(name, tuple(estimate), held_out, tuple(without))
 
 
 @dataclass(frozen=True)

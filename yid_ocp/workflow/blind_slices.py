@@ -21,7 +21,7 @@ from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import package_source_hash
 from yid_ocp.workflow.command_runner import CommandOutcome
-from yid_ocp.workflow.run_folder import local_time_text
+from yid_ocp.workflow.run_folder import current_local_time_text
 
 _SLICE_FORMAT = "yid-blind-slice/1"
 
@@ -105,7 +105,7 @@ def score_slices(
     result = blind_scores.detection_and_false_alarm_rates(marks) | {
         **{key: first[key] for key in (*own, "ensemble_sha256")},
         "slices": [part["slice"] for part in parts],
-        "date": local_time_text(),
+        "date": current_local_time_text(),
     }
     if first["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1]:
         found = blind_scores.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)

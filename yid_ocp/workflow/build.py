@@ -25,7 +25,7 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
-from yid_ocp.model.objects.base import CableTopology, ClampedObject
+from yid_ocp.model.objects.base import CableTopology, ObjectBetweenClamps
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
@@ -51,7 +51,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     model, arms = run.model, run.model.arms
     run_inputs.input_files_by_name(run)
     run_inputs.load_plugins(run)
-    if isinstance(model.object, ClampedObject):
+    if isinstance(model.object, ObjectBetweenClamps):
         return _completed(run, _clamped_system(run, model.object, model.object.kind))
     robot = None
     if model.robot is not None:
@@ -123,7 +123,7 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
     """Measured vertices and clamps of a run's cable. None for an object without its own clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
-        return run.model.object.topology() if isinstance(run.model.object, ClampedObject) else None
+        return run.model.object.topology() if isinstance(run.model.object, ObjectBetweenClamps) else None
 
 
 def arms_are_estimated_states(run: RunSettings) -> bool:
@@ -168,7 +168,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     return damping, of_object
 
 
-def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
+def _clamped_system(run: RunSettings, item: ObjectBetweenClamps, kind: str) -> System:
     for key in ("robot", "grasp", "springs", "frames"):
         if getattr(run.model, key):
             what, allowed = f"model.{key} is not possible with object.kind: {kind}, which clamps hold", f"no {key}"

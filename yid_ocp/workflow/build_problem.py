@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.discretisation import longest_accurate_time_step, smallest_possible_grasp_gaps
+from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_grasp_gaps_at_posture
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
@@ -26,10 +26,10 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model import System
-from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
+from yid_ocp.model.objects.base import CableTopology, ClampPoseDefinition, ObjectBetweenClamps
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.options import DividedLinksModel, RefinedDiscretisation
+from yid_ocp.problem.options import DividedLinksModel, RefinementKind
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
 from yid_ocp.sensors.base import additional_sensor_channel_kinds
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
@@ -80,7 +80,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
     clamps: tuple[ClampPoseDefinition, ...] = ()
-    if cable is not None and isinstance(run.model.object, ClampedObject):
+    if cable is not None and isinstance(run.model.object, ObjectBetweenClamps):
         clamps = cable.clamp_pose_definitions_from_points
         for name in {group.name for group in groups}:
             said = sensors.setdefault(name, SensorOptions())
@@ -105,12 +105,12 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     )
 
 
-def _checked_discretisations(run: RunSettings) -> tuple[RefinedDiscretisation, ...]:
+def _checked_discretisations(run: RunSettings) -> tuple[RefinementKind, ...]:
     """Discretisations that are checked after a solve: from the settings, by default those relevant to the object."""
     said, item = run.output.discretisation_check, run.model.object
     if said is None:
         said = "both" if item is not None and item.default_link_refinement else "time_step"
-    kinds: dict[str, tuple[RefinedDiscretisation, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
+    kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
     return kinds.get(said, ())
 
 
@@ -131,7 +131,7 @@ def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:
 
 def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> None:
     """Raise `ConfigError` if the tracking filter would take the object's momentum for an error of the arm."""
-    tree, driven = system.mechanism, set(system.driven_coordinate_indices)
+    tree, driven = system.mechanism, set(system.actuated_coordinate_indices)
     for i, name in enumerate(tree.joint_names):
         of_arm = i in driven or name in run.model.arms.passive_joints
         if not of_arm and driven.intersection(tree.ancestor_joint_indices(i)):
@@ -184,7 +184,7 @@ def build_problem(
     return problem
 
 
-def smallest_possible_initial_grasp_gaps(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
     """Smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
     system = problem.system
     if not system.grasps:
@@ -194,7 +194,7 @@ def smallest_possible_initial_grasp_gaps(problem: EstimationProblem, episode: Ep
     theta = problem.theta.copy()
     for name, value in episode.known_parameters.items():
         theta[system.parameters.index(name)] = value
-    return smallest_possible_grasp_gaps(system, posture, theta)
+    return min_grasp_gaps_at_posture(system, posture, theta)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
@@ -202,7 +202,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
         hint = f"first correct these issues: {'; '.join(f'{issue.location_text}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in smallest_possible_initial_grasp_gaps(problem, episode).items():
+        for name, gap in min_grasp_gaps_at_start(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
                 where, allowed = run.setting_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
@@ -264,7 +264,7 @@ def _check_recordings(
     return *kept, tuple(doubts)
 
 
-def recording_quality_issues_with_model(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
+def all_recording_quality_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
     """Find all data quality issues of one uncut recording. Errors are as in `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)

@@ -25,7 +25,7 @@ from yid_ocp.report.animation import Animation, animation_of_trajectories, recor
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
-from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, smallest_possible_initial_grasp_gaps
+from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_grasp_gaps_at_start
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_settings_command
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -87,7 +87,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
     if problem is not None:
         first = problem.episodes[0]
         theta = problem.predictor.theta_with_episode_values(first, theta)
-        known = [*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]
+        known = [*system.actuated_coordinate_indices, *system.prescribed_coordinate_indices]
         posture[known] = first.initial_known_coordinates
     found = {"built": compare_system_with_pinocchio(system, theta, posture)}
     path = input_files_by_name(run)[run.model.robot] if run.model.robot is not None else None
@@ -140,7 +140,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
-    entry["grasp_gaps"] = smallest_possible_initial_grasp_gaps(problem, episode)
+    entry["grasp_gaps"] = min_grasp_gaps_at_start(problem, episode)
     return entry
 
 
@@ -243,7 +243,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     return {"links": rows, "time_step": steps, "message": ""}
 
 
-def _row(value: float, found: discretisation.NaturalFrequencies) -> dict[str, Any]:
+def _row(value: float, found: discretisation.StepMapNaturalFrequencies) -> dict[str, Any]:
     hertz = found.frequencies_hz[:_N_MODES].tolist()
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 

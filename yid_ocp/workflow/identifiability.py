@@ -220,7 +220,7 @@ class _IdentifiabilityTasks:
     def evaluate_experiment_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
-        """Information gained by sets of changes, one task per changed mechanics (an `ExperimentChangeSetEvaluator`)."""
+        """Information gained by sets of changes, one task per changed mechanics (an `ChangeSetEvaluationFunction`)."""
         groups: dict[str, list[int]] = {}
         for i, changes in enumerate(sets):
             mechanics = sorted({change.mechanical_change for change in changes if change.mechanical_change})

@@ -21,7 +21,7 @@ from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitCommandObject, init_command_object_factories, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.options import dataclass_options
+from yid_ocp.options import options_by_key
 from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
 from yid_ocp.report.animation import recording_animation
 from yid_ocp.report.html import write_report
@@ -309,7 +309,7 @@ def _of_object(item: InitCommandObject, proposal: ProposedConfigChoices) -> dict
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
     """Settings that differ from their defaults or concern every reader, with their descriptions."""
-    for key, option in dataclass_options(cast(Any, type(settings))).items():
+    for key, option in options_by_key(cast(Any, type(settings))).items():
         value = getattr(settings, option.field_name)
         if key == "mount" or (value == option.default_value and key not in _ALWAYS_WRITTEN_SETTINGS):
             continue

@@ -190,7 +190,7 @@ def _dependence(
 ) -> tuple[step_diagnostics.ParameterInfluence, ...]:
     """Equations and sensors that depend on each parameter; along the recordings if the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
-    found = step_diagnostics.parameter_influences(step, symbols, episode, point.state, point.theta, rows)
+    found = step_diagnostics.parameter_equations_and_responses(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found
@@ -211,7 +211,7 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
 
 def _entry_result(entry: EquationOrDerivativeFormula, symbols: NamedStepEquations, at: Array) -> dict[str, Any]:
     names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
-    value = entry.numeric_value(symbols.column_symbols, at)
+    value = entry.numeric_value(symbols.all_variable_symbols, at)
     return attributes_by_name(entry, names) | {"operations": entry.formula.n_operations, "value": value}
 
 

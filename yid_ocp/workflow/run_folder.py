@@ -64,7 +64,7 @@ class RunFolder:
 
     def write_result(self, result: Mapping[str, Any], name: str = "result.json") -> dict[str, Any]:
         """Write a result with command, date, inputs and versions. Infinities become null and are listed in `notes`."""
-        made = {"command": self._command_line, "date": local_time_text(), "inputs": self.input_hashes}
+        made = {"command": self._command_line, "date": current_local_time_text(), "inputs": self.input_hashes}
         notes: list[str] = []
         clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_and_plugin_versions()}, notes)
         if notes:
@@ -309,7 +309,7 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
                 parent.rmdir()
 
 
-def local_time_text() -> str:
+def current_local_time_text() -> str:
     """Local date and time with UTC offset, as text."""
     return datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
 

@@ -34,7 +34,7 @@ from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_prin
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
 from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_recording_path
+from yid_ocp.workflow.run_inputs import expand_recording_path, read_recordings_of_role
 
 log = logging.getLogger(__name__)
 
@@ -218,7 +218,7 @@ def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recor
     """Load recordings without the sought effect, from settings or baseline, and the reason if there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):
-        file = resolve_recording_path(path)
+        file = expand_recording_path(path)
         if not is_file(file):
             where = ("recordings", "without_effect", i)
             what, allowed = f"there is no such recording: {file}", "the path of an existing file"
@@ -228,7 +228,7 @@ def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recor
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
-                found.append(read_recording(resolve_recording_path(path)))
+                found.append(read_recording(expand_recording_path(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
     return tuple(replace(recording, name=f"{recording.name} (without)") for recording in found), ""

@@ -145,7 +145,7 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
         files[name] = _existing(run, Path(name), "file", "model", "object", key)
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
-            files[path] = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
+            files[path] = _existing(run, expand_recording_path(path), "recording", "recordings", which, i)
     return files
 
 
@@ -158,8 +158,8 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 
-def resolve_recording_path(path: str) -> Path:
-    """Path of a recording named in the settings; `default:NAME` is a recording shipped with the package."""
+def expand_recording_path(path: str) -> Path:
+    """Path of a recording, in which `default:NAME` becomes the file shipped with the package; others are unchanged."""
     if not path.startswith("default:"):
         return Path(path)
     return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
@@ -173,7 +173,7 @@ def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: in
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
     for i, path in enumerate(paths[:count]):
-        file = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
+        file = _existing(run, expand_recording_path(path), "recording", "recordings", which, i)
         with add_setting_location_to_errors(run, "recordings", which, i):
             recording = read_recording(file)
         if recording.name in [entry.name for entry in result]:

@@ -44,10 +44,10 @@ from yid_ocp.vision.surface_meshes import SceneModel, VirtualFramesWithTruth
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import issues_to_plain_data, recording_quality_issues_with_model
+from yid_ocp.workflow.build_problem import all_recording_quality_issues, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path, unknown_name_error
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, expand_recording_path, unknown_name_error
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
@@ -70,7 +70,7 @@ def _run_track(
         try:
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.settings, system)
-                doubts = [] if recording is None else recording_quality_issues_with_model(run, system, recording)
+                doubts = [] if recording is None else all_recording_quality_issues(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("tracking")
@@ -96,7 +96,7 @@ def _run_track(
             write_recording(tracked, folder.path / "recording.h5")
             # tracked points can be out of the object's reach if the model defines its position
             if settings.options.root_placement == "model":
-                own = recording_quality_issues_with_model(run, system, tracked)
+                own = all_recording_quality_issues(run, system, tracked)
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
             theta = system.parameters.vector()
             shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
@@ -241,7 +241,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
     if not run.recordings.estimate:
         return None
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = resolve_recording_path(run.recordings.estimate[0])
+        path = expand_recording_path(run.recordings.estimate[0])
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
@@ -303,7 +303,7 @@ def _frame_tasks(
 ) -> tuple[_FrameTasks, VirtualFramesWithTruth | None]:
     """Tracking tasks of frames in files, first written if a virtual camera renders them, and their true motion."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
-    joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
+    joints = expand_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
         _read_joints(run)
         _read_frames(run, "frames_path")  # raises errors about the files with the names of the settings

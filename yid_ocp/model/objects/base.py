@@ -18,7 +18,7 @@ from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
+from yid_ocp.options import OptionInfo, options_by_key, split_annotated
 from yid_ocp.registry import Registry
 
 START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
@@ -60,22 +60,24 @@ class ClampPoseDefinition:
 class CableTopology:
     """Vertices of a branched cable along the parent and child branches, and their undeformed positions."""
 
-    parent_branch_vertex_names: tuple[str, ...]  # from clamp to clamp; the clamps hold the first and last two vertices
-    vertex_names_by_child_branch: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
+    main_branch_vertex_names: tuple[
+        str, ...
+    ]  # parent, from clamp to clamp; clamps hold the first and last two vertices
+    child_branch_vertex_names: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
     undeformed_positions: Mapping[str, ArrayLike]  # position of every unloaded vertex, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
-        free = self.parent_branch_vertex_names[2:-2]
+        free = self.main_branch_vertex_names[2:-2]
         if not free:
-            what = f"the parent has {len(self.parent_branch_vertex_names)} vertices"
+            what = f"the parent has {len(self.main_branch_vertex_names)} vertices"
             allowed, hint = "5 or more: two are held at each end", "add vertices between the ends"
-            raise ModelError(what, where="cable: parent_branch_vertex_names", allowed=allowed, hint=hint)
-        for name, vertices in self.vertex_names_by_child_branch.items():
+            raise ModelError(what, where="cable: main_branch_vertex_names", allowed=allowed, hint=hint)
+        for name, vertices in self.child_branch_vertex_names.items():
             if len(vertices) < 2 or vertices[0] not in free:
                 what = f"the branch '{name}' has {len(vertices)} vertices, starting with {vertices[:1] or 'none'}"
                 allowed = f"two or more vertices, the first of them one of {', '.join(free)}"
-                raise ModelError(what, where=f"cable: vertex_names_by_child_branch.{name}", allowed=allowed)
+                raise ModelError(what, where=f"cable: child_branch_vertex_names.{name}", allowed=allowed)
         for vertex in self.vertex_names:
             if vertex not in self.undeformed_positions:
                 said = unknown_name_error_arguments(vertex, self.undeformed_positions)
@@ -88,14 +90,14 @@ class CableTopology:
     def vertex_names(self) -> tuple[str, ...]:
         """Names of all vertices, those of the parent branch first."""
         return (
-            *self.parent_branch_vertex_names,
-            *(vertex for chain in self.vertex_names_by_child_branch.values() for vertex in chain[1:]),
+            *self.main_branch_vertex_names,
+            *(vertex for chain in self.child_branch_vertex_names.values() for vertex in chain[1:]),
         )
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
         """Names of the four clamped vertices: the first and last two of the parent branch."""
-        return (*self.parent_branch_vertex_names[:2], *self.parent_branch_vertex_names[-2:])
+        return (*self.main_branch_vertex_names[:2], *self.main_branch_vertex_names[-2:])
 
     @property
     def unclamped_vertex_names(self) -> tuple[str, ...]:
@@ -105,7 +107,7 @@ class CableTopology:
     @property
     def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
         """Vertex names of every branch, by segment name. The parent branch comes first."""
-        return {self.parent_segment: self.parent_branch_vertex_names, **self.vertex_names_by_child_branch}
+        return {self.parent_segment: self.main_branch_vertex_names, **self.child_branch_vertex_names}
 
     @property
     def edge_vertex_names(self) -> tuple[tuple[str, str], ...]:
@@ -115,7 +117,7 @@ class CableTopology:
     @property
     def clamp_pose_definitions_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Pose definitions of the start clamp and the end clamp."""
-        a, b, *_, y, z = self.parent_branch_vertex_names
+        a, b, *_, y, z = self.main_branch_vertex_names
         start = ClampPoseDefinition(START_CLAMP, a, b)
         return start, ClampPoseDefinition(END_CLAMP, y, z)
 
@@ -150,7 +152,7 @@ class InitCommandObjectFactory:
     has_branches: bool = False
 
 
-def require_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
+def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
     """Return the numbers that an object requires, in the order of `meanings`. Raises `ConfigError` if one is absent."""
     for name, meaning in meanings.items():
         if name not in numbers:
@@ -192,7 +194,7 @@ class ObjectBuilder:
     """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
 
     A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that is a whole system is also a
-    `ClampedObject`.
+    `ObjectBetweenClamps`.
     """
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
@@ -237,7 +239,7 @@ class ObjectBuilder:
         own: Any = type(self)
         return {
             key: getattr(self, option.field_name)
-            for key, option in dataclass_options(own).items()
+            for key, option in options_by_key(own).items()
             if any(isinstance(m, OptionInfo) and m.is_path for m in split_annotated(option.type_hint)[1])
         }
 
@@ -248,7 +250,7 @@ class ObjectBuilder:
 
 
 @runtime_checkable
-class ClampedObject(Protocol):
+class ObjectBetweenClamps(Protocol):
     """Interface of objects that form a whole system with clamps, such as a cable. The clamps follow measured points."""
 
     def topology(self) -> CableTopology:

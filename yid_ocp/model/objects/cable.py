@@ -54,7 +54,7 @@ INITIAL_RMS_SPEED_PARAMETER = "start.speed"
 
 
 @dataclass(frozen=True)
-class CableBranchOptions:
+class CableBranchProperties:
     """Nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
 
     bend_rigidity: float = 1.5e-3  # a configuration sets this and the next two under `parameters`
@@ -77,10 +77,10 @@ class CableOptions:
     entry have the `default_branch`. `gravity` is in m/s^2.
     """
 
-    branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by branch, parent and children")] = (
+    branch_properties: Annotated[Mapping[str, CableBranchProperties], OptionInfo("by branch, parent and children")] = (
         field(default_factory=dict)
     )
-    default_branch: CableBranchOptions = field(default_factory=CableBranchOptions)
+    default_branch: CableBranchProperties = field(default_factory=CableBranchProperties)
     radius: Annotated[float, Gt(0), Le(1), OptionInfo("radius of the cylinders for the links' inertia", "m")] = 0.005
     end_clamp_grasp_kind: Annotated[
         Literal["axis", "weld"],
@@ -115,9 +115,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of a cable's length parameters from its edge lengths [m]."""
-    values = {
-        f"{START_CLAMP}.length": lengths[cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[1]]
-    }
+    values = {f"{START_CLAMP}.length": lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]]}
     for name, chain in cable.vertex_names_by_branch.items():
         first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
@@ -141,7 +139,7 @@ def clamped_cable_system(
         item = _with_rest_angles(item)
     if options.shape_memory_fraction is not None:
         item = _with_memory(item, options.shape_memory_fraction)
-    clamps = _start_clamp(lengths[cable.parent_branch_vertex_names[0], cable.parent_branch_vertex_names[1]], cable)
+    clamps = _start_clamp(lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]], cable)
     clamps = clamps.with_attached_mechanism(floating_joint_mechanism(END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
     if options.end_clamp_grasp_kind == "weld":
@@ -208,9 +206,9 @@ def _with_vertices(
     last = tree.joint_index(item.segment_layouts[0].link_joints[-1][-1])
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
-    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_branch_vertex_names)])
+    edges = np.array([lengths[edge] for edge in pairwise(cable.main_branch_vertex_names)])
     whole = ArcLengthChain(
-        (cable.parent_branch_vertex_names[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
+        (cable.main_branch_vertex_names[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
     )
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
@@ -226,8 +224,8 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     frames = {
         **clamp.frames,
-        cable.parent_branch_vertex_names[0]: carrier,
-        cable.parent_branch_vertex_names[1]: tip,
+        cable.main_branch_vertex_names[0]: carrier,
+        cable.main_branch_vertex_names[1]: tip,
         _START_EDGE_FRAME: tip,
     }
     return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
@@ -236,7 +234,7 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
 def _segments(
     cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions
 ) -> list[FlexibleSegment]:
-    parent = cable.parent_branch_vertex_names
+    parent = cable.main_branch_vertex_names
     turns = edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
@@ -281,8 +279,8 @@ class Cable(CableOptions, ObjectBuilder):
 model:
   object:
     kind: cable
-    parent_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
-    vertex_names_by_child_branch: {side: [p2, s1, s2]}
+    main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
+    child_branch_vertex_names: {side: [p2, s1, s2]}
     undeformed_shape_file: undeformed.csv
     end_clamp_grasp_kind: axis
 """,
@@ -290,19 +288,19 @@ model:
 model:
   object:
     kind: cable
-    parent_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
+    main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
-    vertex_names_by_child_branch: {side: [p2, s1, s2]}
+    child_branch_vertex_names: {side: [p2, s1, s2]}
     branch_properties:
       side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     }
 
     kind: Annotated[Literal["cable"], OptionInfo("kind of object")] = "cable"
-    parent_branch_vertex_names: Annotated[
+    main_branch_vertex_names: Annotated[
         tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")
     ]
-    vertex_names_by_child_branch: Annotated[
+    child_branch_vertex_names: Annotated[
         Mapping[str, tuple[str, ...]],
         OptionInfo("points of every child branch; the first one is the point of the parent at which it leaves"),
     ] = field(default_factory=dict)
@@ -314,7 +312,7 @@ model:
 
     def topology(self) -> CableTopology:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
-        found = CableTopology(self.parent_branch_vertex_names, dict(self.vertex_names_by_child_branch), undeformed)
+        found = CableTopology(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
         for name in self.branch_properties:
             if name not in found.vertex_names_by_branch:
                 said = unknown_name_error_arguments(name, found.vertex_names_by_branch)

@@ -104,7 +104,7 @@ def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> 
 
 
 def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    length, mass, radius = base.require_object_numbers("a cable", numbers, base.SIZE_AND_MASS_DESCRIPTIONS)
+    length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_AND_MASS_DESCRIPTIONS)
     section = _section(numbers)
     segment = _init_segment(links, length, mass, None if section else radius, cross_section_size=section)
     return _init_object("cable", {"cable": segment})
@@ -112,7 +112,7 @@ def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 
 def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     sizes = {name: base.SIZE_AND_MASS_DESCRIPTIONS[name] for name in ("length", "mass")}
-    length, mass = base.require_object_numbers("a beam", numbers, sizes)
+    length, mass = base.required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
     if section is None and "radius" not in numbers:
         what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
@@ -128,7 +128,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
         allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
         hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
         raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
-    length, mass, radius = base.require_object_numbers(
+    length, mass, radius = base.required_object_numbers(
         "each branch of a tree", numbers, base.SIZE_AND_MASS_DESCRIPTIONS
     )
     count, quarter = numbers["branches"], 1.5707963
