@@ -44,6 +44,7 @@ hypothesis.settings.load_profile("tests")
 if "PYTEST_XDIST_WORKER" in os.environ:
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    os.environ.setdefault("YID_OCP_THREADS", "1")
     threadpoolctl.threadpool_limits(1)
 
 

@@ -262,10 +262,10 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
     events = EventSet((claimed, odd))
     module = sys.modules["yid_ocp.diagnosis.diagnose"]
     monkeypatch.setattr(module, "find_force_and_fault_events", lambda *_: events)
-    rubbing = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, seed) for seed in (1, 2)]
+    heavy = [bench.recording({"link_mass@elbow": {"scale": 1.3}}, seed, 2.0) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
         limits = Thresholds(min_force_event_gap_fraction=share)
-        finding = diagnose(bench.problem(rubbing[:1]), ["effort_offset@elbow"], rubbing[1:], thresholds=limits)
+        finding = diagnose(bench.problem(heavy[:1]), ["effort_offset@elbow"], heavy[1:], thresholds=limits)
         assert finding.verdict == "unknown"
         assert finding.events.disturbances == expected
 

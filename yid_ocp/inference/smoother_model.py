@@ -318,7 +318,7 @@ def _steps(
     with_forces: bool,
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and derivatives of efforts (and forces) (steps, nc, ns + nd')."""
-    a, e, effort = [], [], []
+    a, e, effort, done = [], [], [], span.start
     feedback, nominal, step = course.episode.tracking_feedback, course.nominal, course.problem.step
     nx, width, forces = step.sizes["nx"], loads[1].shape[1], pushes.shape[1]
     inputs = np.zeros((len(pushes), step.sizes["nu"], width))
@@ -327,15 +327,16 @@ def _steps(
         # as that of this step)
         followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
         inputs = feedback.gain @ followed
-    found = step_derivatives_along_rollout(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span)
-    for k, pair in enumerate((pair for some in found for pair in zip(*some, strict=True)), span.start):
-        state, own = (np.hstack([one[:, moving], one[:, nx : nx + width] + one[:, nx + width :]]) for one in pair)
-        loaded = slice(len(moving), len(moving) + forces)
-        a.append(state[moving][:, : len(moving)])
-        e.append(np.hstack([state[moving][:, len(moving) :], state[moving][:, loaded] @ pushes[k]]))
-        own = own if with_forces else own[: step.sizes["nc"]]
-        effort.append(np.hstack([own, own[:, loaded] @ pushes[k]]))
-    return np.stack(a), np.stack(e), np.stack(effort)
+    for pair in step_derivatives_along_rollout(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
+        push, done = pushes[done : done + len(pair[0])], done + len(pair[0])
+        by_state = (one[:, :, moving] for one in pair)
+        by_load = [one[:, :, nx : nx + width] + one[:, :, nx + width :] for one in pair]
+        by_load = [np.concatenate([one, one[:, :, :forces] @ push], axis=2) for one in by_load]
+        state, own = (np.concatenate(both, axis=2) for both in zip(by_state, by_load, strict=True))
+        a.append(state[:, moving, : len(moving)])
+        e.append(state[:, moving, len(moving) :])
+        effort.append(own if with_forces else own[:, : step.sizes["nc"]])
+    return np.concatenate(a), np.concatenate(e), np.concatenate(effort)
 
 
 def _recording(
