@@ -24,13 +24,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
 
 from yid_ocp import interruption
-from yid_ocp.errors import (
-    ConfigError,
-    InsufficientMemoryError,
-    OutputError,
-    YidError,
-    unknown_name_error_arguments,
-)
+from yid_ocp.errors import ConfigError, InsufficientMemoryError, OutputError, YidError, unknown_name_error_arguments
 
 _EXIT_WRONG_INPUT, _EXIT_BUG, _EXIT_INTERRUPTED = 2, 3, 130
 _ERROR_FORMAT = "yid-error/1"

@@ -20,12 +20,7 @@ from yid_ocp.analysis.profile import (
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import (
-    ConfigError,
-    SolverError,
-    failed_rollout_error,
-    unknown_name_error_arguments,
-)
+from yid_ocp.errors import ConfigError, SolverError, failed_rollout_error, unknown_name_error_arguments
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (

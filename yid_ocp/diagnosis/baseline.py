@@ -23,13 +23,7 @@ from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_rmse_a
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
 from yid_ocp.effects import EffectBase
-from yid_ocp.errors import (
-    ConfigError,
-    SolverError,
-    YidError,
-    failed_rollout_error,
-    nearest_name_question,
-)
+from yid_ocp.errors import ConfigError, SolverError, YidError, failed_rollout_error, nearest_name_question
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only

@@ -116,11 +116,7 @@ class _Family:
 
 
 def find_gap_law(
-    search: RefitContext,
-    problem: EstimationProblem,
-    last: RefittedModel,
-    places: Sequence[str],
-    events: EventSet,
+    search: RefitContext, problem: EstimationProblem, last: RefittedModel, places: Sequence[str], events: EventSet
 ) -> GapLaw | None:
     """Estimate the remaining gap as a torque law, or return None if no location allows a law or no law closes enough.
 

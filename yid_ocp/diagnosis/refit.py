@@ -22,11 +22,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
-from yid_ocp.inference.uncertainty import (
-    assess_goodness_of_fit,
-    misfit_robust_covariance,
-    unknowns_covariance_factor,
-)
+from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, unknowns_covariance_factor
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_with_sensor_noise_only,

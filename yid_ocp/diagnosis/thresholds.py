@@ -7,10 +7,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from yid_ocp.inference.null_test import (
-    DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-    RESIDUAL_WINDOW_SECONDS,
-)
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, RESIDUAL_WINDOW_SECONDS
 from yid_ocp.inference.smoother_model import SmootherThresholds
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.options import ExcessResidualCriteria

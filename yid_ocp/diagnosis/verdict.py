@@ -13,13 +13,7 @@ from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult
-from yid_ocp.diagnosis.select import (
-    UNDEFINED_GAP_CLOSURE,
-    GapClosure,
-    SelectedEffect,
-    leaves_noise,
-    select_effects,
-)
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, SelectedEffect, leaves_noise, select_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise

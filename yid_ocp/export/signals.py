@@ -77,10 +77,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
             with atomic_write(path) as temporary:
                 os.replace(file, temporary)
     except OSError as error:
-        what, hint = (
-            f"the file cannot be written: {os_error_reason(error)}",
-            "choose another folder, or free space",
-        )
+        what, hint = f"the file cannot be written: {os_error_reason(error)}", "choose another folder, or free space"
         raise OutputError(what, where=str(path), hint=hint) from error
     return shift
 

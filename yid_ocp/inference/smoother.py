@@ -538,9 +538,7 @@ def gap_locations_from_effect_closures(
 
 
 def z_scores_of_smoothed_unknowns(
-    smoothed: SmoothedUnknownsResult,
-    recording: int = 0,
-    informed_fraction: float = 0.5,
+    smoothed: SmoothedUnknownsResult, recording: int = 0, informed_fraction: float = 0.5
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Return the z scores (J, nd) of nd smoothed unknowns in J intervals: posterior mean over standard deviation.
 

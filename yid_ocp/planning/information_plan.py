@@ -240,10 +240,7 @@ def _unseen(experiment: SplineMotionExperiment, told: Sequence[Array | None]) ->
 
 
 def _check_seen(
-    chosen: Sequence[str],
-    rivals: Sequence[EffectBase],
-    unseen: Mapping[str, float],
-    experiment: SplineMotionExperiment,
+    chosen: Sequence[str], rivals: Sequence[EffectBase], unseen: Mapping[str, float], experiment: SplineMotionExperiment
 ) -> None:
     lost = [name for name in chosen if name in unseen]
     if chosen and len(lost) == len(chosen):

@@ -97,10 +97,7 @@ class PlanOptions:
         tuple[str, ...] | None, OptionInfo("goal information: effects to discriminate, kind@location")
     ] = None
     n_random_starts: Annotated[
-        int,
-        Ge(1),
-        Le(1000),
-        OptionInfo("goal information: number of random initial motions; the best result is kept"),
+        int, Ge(1), Le(1000), OptionInfo("goal information: number of random initial motions; the best result is kept")
     ] = 5
     seed: Annotated[int, Ge(0), OptionInfo("random seed of these motions")] = 0
     limits: Annotated[PlanLimits, OptionInfo("limits of joints and springs")] = field(default_factory=PlanLimits)

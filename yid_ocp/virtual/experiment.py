@@ -92,10 +92,7 @@ class VirtualArmOptions:
         OptionInfo("law of the joints' dry friction, which MuJoCo's solver simulates; varied: one law per experiment"),
     ] = "varied"
     max_relative_link_mass_error: Annotated[
-        float,
-        Ge(0),
-        Le(0.2),
-        OptionInfo("largest relative error of a link's mass; the smallest is three fifths of it"),
+        float, Ge(0), Le(0.2), OptionInfo("largest relative error of a link's mass; the smallest is three fifths of it")
     ] = 0.05
     encoder_counts_per_turn: Annotated[int, Ge(0), OptionInfo("encoder steps per turn; 0: continuous")] = 16384
     period_jitter_std: Annotated[

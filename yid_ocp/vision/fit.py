@@ -64,10 +64,7 @@ class ShapeFitOptions:
 
     node_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
-        OptionInfo(
-            "scale of the robust loss on skeleton nodes, per pass: wide first, for poor initial shapes",
-            "m",
-        ),
+        OptionInfo("scale of the robust loss on skeleton nodes, per pass: wide first, for poor initial shapes", "m"),
     ] = (0.15, 0.05)
     surface_loss_scales: Annotated[
         tuple[PositiveFloat, ...],

@@ -21,12 +21,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, relative_message_time_function
 from yid_ocp.errors import DataError
 from yid_ocp.vision.frame_folder import STAMP_FILE, metres_per_unit, read_frame_folder
-from yid_ocp.vision.frames import (
-    CameraIntrinsics,
-    FrameSequence,
-    PointColourArray,
-    validated_camera_pose,
-)
+from yid_ocp.vision.frames import CameraIntrinsics, FrameSequence, PointColourArray, validated_camera_pose
 
 _CLOUD_MESSAGE, _IMAGE_MESSAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
 _CAMERA_INFO_MESSAGE = "sensor_msgs/msg/CameraInfo"

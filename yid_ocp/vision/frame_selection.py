@@ -79,11 +79,7 @@ class TrackOptions:
     frame_stamp_std: Annotated[
         float, Ge(0), OptionInfo("standard deviation of a frame's time stamp, beyond the common offset", "s")
     ] = 0.003
-    exposure_time: Annotated[
-        float,
-        Ge(0),
-        OptionInfo("exposure time of a frame, centred on its stamp", "s"),
-    ] = 0.0
+    exposure_time: Annotated[float, Ge(0), OptionInfo("exposure time of a frame, centred on its stamp", "s")] = 0.0
     tracked_points: Annotated[
         tuple[str, ...] | None,
         OptionInfo("points to record; default: those that no arm holds, because arms measure held points better"),
@@ -96,8 +92,7 @@ class TrackOptions:
         ),
     ] = "model"
     approximate_root_position: Annotated[
-        XyzTuple | None,
-        OptionInfo("position nearer to the root than to other ends, unless root is model", "m"),
+        XyzTuple | None, OptionInfo("position nearer to the root than to other ends, unless root is model", "m")
     ] = None
     robot_mesh_kind: Annotated[UrdfMeshKind, OptionInfo("meshes of the robot's self-filter")] = "visual"
     seed: Annotated[int, Ge(0), OptionInfo("random seed of subsampling and skeleton extraction")] = 0

@@ -20,14 +20,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import mean_sample_rate
 from yid_ocp.data.foreign_formats import column_meanings, select_mocap_table_reader
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import (
-    JOINT_CHANNEL_UNITS,
-    ClockKind,
-    JointGroup,
-    PointGroup,
-    Recording,
-    SensorChannelGroup,
-)
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, ClockKind, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
 from yid_ocp.sensors import CHANNEL_KINDS

@@ -286,10 +286,7 @@ def _library_curves(table: TorqueLawTable, at: Array) -> dict[str, Array]:
     """The curve of the library's laws that best fits a table, by weighted least squares of its amplitudes."""
     shapes: dict[str, Callable[[Array], Sequence[Array]]] = {}
     if table.quantity == "speed":
-        shapes = {
-            "viscous": lambda v: [v],
-            "viscous and Coulomb": lambda v: [v, np.tanh(v / SIGN_SMOOTHING_SPEED)],
-        }
+        shapes = {"viscous": lambda v: [v], "viscous and Coulomb": lambda v: [v, np.tanh(v / SIGN_SMOOTHING_SPEED)]}
     elif table.quantity == "angle":
         shapes = {"spring": lambda q: [np.ones_like(q), q], "cubic spring": lambda q: [np.ones_like(q), q, q**3]}
     weight = 1 / np.where(table.torque_std > 0, table.torque_std, np.inf)
