@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import operator
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -107,12 +107,7 @@ def describe_type(hint: Any) -> str:
     """Describe a type with its range and unit for messages."""
     bare, markers = split_annotated(hint)
     unit = next((marker.unit for marker in markers if isinstance(marker, OptionInfo) and marker.unit), "")
-    limits = [
-        f"{word} {getattr(marker, name):g}"
-        for marker in markers
-        for kind, name, _, word in _BOUND_MARKERS
-        if isinstance(marker, kind)
-    ]
+    limits = [f"{word} {limit:g}" for limit, _, word in _bounds(markers)]
     text = " or ".join(dict.fromkeys(map(_words, union_members(bare))))
     least = [f", {marker.min_length} at least" for marker in markers if isinstance(marker, annotated_types.Len)]
     return " ".join([text, *limits]) + "".join(least) + (f" [{unit}]" if unit else "")
@@ -152,9 +147,10 @@ def _within(hint: Any, value: Any) -> bool:
     if not isinstance(value, (int, float)):
         return True
     markers = [marker for part in (hint, *union_members(hint)) for marker in split_annotated(part)[1]]
-    return all(
-        compare(value, getattr(marker, name))
-        for marker in markers
-        for kind, name, compare, _ in _BOUND_MARKERS
-        if isinstance(marker, kind)
-    )
+        return all(is_within(value, limit) for limit, is_within, _ in _bounds(markers))
+
+
+    def _bounds(markers: Iterable[Any]) -> list[tuple[float, Callable[[Any, Any], bool], str]]:
+        """Limit, comparison and word of each bound among the markers of a type."""
+        pairs = [(marker, row) for marker in markers for row in _BOUND_MARKERS if isinstance(marker, row[0])]
+        return [(getattr(marker, name), compare, word) for marker, (_, name, compare, word) in pairs]

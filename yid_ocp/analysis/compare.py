@@ -166,7 +166,7 @@ def _descent_errors(
     known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
     # the same limit applies to the standard deviation of an identifiable parameter
-    wrong = [name for name in known if not _near(found[name], truth[name])]
+    wrong = [n for n in known if abs(found[n] - truth[n]) > MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[n])]
     verdicts = {name: VERDICT_TABLE_TEXTS[entry.verdict] for name, entry in known.items()}
     hidden = [name for name in known if known[name].verdict != "identifiable"]
     within = f"within {100 * MAX_IDENTIFIABLE_RELATIVE_STD:.0f} % of the truth"
@@ -185,10 +185,6 @@ def _descent_errors(
     if lucky:
         text += f"; {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} came out near the truth all the same"
     return text
-
-
-def _near(value: float, truth: float) -> bool:
-    return abs(value - truth) <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth)
 
 
 class _Memory:

@@ -296,11 +296,8 @@ def _prediction_error_entry(
     """RMSE of one recording per channel and point group (without frames that fixed the start) and per baseline."""
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
     options = problem.options
-    fixed = (
-        options.initial_state_fit_window / problem.step.time_step
-        if options.initial_state == "fitted_to_points"
-        else -1.0
-    )
+    window = options.initial_state_fit_window / problem.step.time_step
+    fixed = window if options.initial_state == "fitted_to_points" else -1.0
     if isinstance(outcome, str):
         entry["message"] = outcome
     else:

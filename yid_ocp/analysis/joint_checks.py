@@ -426,13 +426,8 @@ def _by_joint(data: _Data) -> Iterator[Issue]:
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
             words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion need"
-            yield _issue(
-                "effort_gain",
-                words,
-                off / _MIN_Z,
-                "find out what the recorded effort is (unit, gear side, scale)",
-                names[j],
-            )
+            advice = "find out what the recorded effort is (unit, gear side, scale)"
+            yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)
     lost = fit.left > _WRONG_ROBOT_RMS
     if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:

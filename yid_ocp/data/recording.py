@@ -200,10 +200,8 @@ class SensorChannelGroup(ReprMixin):
         object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t",))
         values = {key: read_only_copy(value, f"{self.name}/{key}") for key, value in self.values_by_quantity.items()}
-        stds = {
-            key: _constant(std, f"{self.name}, attribute {key}")
-            for key, std in self.noise_and_bias_stds_by_attribute.items()
-        }
+        known = self.noise_and_bias_stds_by_attribute.items()
+        stds = {key: _constant(std, f"{self.name}, attribute {key}") for key, std in known}
         object.__setattr__(self, "values_by_quantity", values)
         object.__setattr__(self, "noise_and_bias_stds_by_attribute", stds)
 

@@ -80,16 +80,6 @@ class BlindCaseScore:
         """Labels of the effects named by the diagnosis: the confusable set, or the first effect added."""
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
-    @property
-    def _true_class_label(self) -> str:
-        """Row of the case in the confusion matrix: the kind of a single effect, else the category."""
-        return self.truth.partition("@")[0] if self.category == "single" else self.category
-
-    @property
-    def _answered_class_label(self) -> str:
-        """Column of the answer in the confusion matrix: the kind of the first effect added, else the verdict."""
-        return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
-
 
 def score_blind_case(
     label: CaseGroundTruth, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
@@ -248,10 +238,12 @@ def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 
 def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """The confusion matrix: true classes (rows), answers (columns) and counts."""
-    pairs = [(m._true_class_label, m._answered_class_label) for m in marks]
-    rows = sorted({true for true, _ in pairs}, key=lambda name: (name in _CATEGORIES, name))
-    columns = sorted({answered for _, answered in pairs}, key=lambda name: (name in _VERDICTS, name))
+    """Confusion matrix with counts: kinds of single effects or categories (rows), first kinds or verdicts (columns)."""
+    true = [m.truth.partition("@")[0] if m.category == "single" else m.category for m in marks]
+    answered = [m.verdict if m.answer == "-" else m.answer.partition("@")[0] for m in marks]
+    pairs = list(zip(true, answered, strict=True))
+    rows = sorted({*true}, key=lambda name: (name in _CATEGORIES, name))
+    columns = sorted({*answered}, key=lambda name: (name in _VERDICTS, name))
     counts = [[pairs.count((row, column)) for column in columns] for row in rows]
     return {"true": rows, "said": columns, "counts": counts}
 
@@ -545,23 +537,15 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     time step) are not repeated. `DataError` if another version recorded the case.
     """
     if data.get("format") != _EVIDENCE_FORMAT:
-        what = f"the evidence has the format '{data.get('format')}'"
-        raise DataError(
-            what,
-            where="evidence in the recorded answer of a case",
-            allowed=_EVIDENCE_FORMAT,
-            hint="record the cases again with this version",
-        )
+        what, hint = f"the evidence has the format '{data.get('format')}'", "record the cases again with this version"
+        raise DataError(what, where="evidence in the recorded answer of a case", allowed=_EVIDENCE_FORMAT, hint=hint)
     known = {entry.name for entry in fields(Thresholds)}
     kept = {name: value for name, value in data["thresholds"].items() if name in known}
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))
     case = _RecordedCase(data)
     try:
-        judged = judge(
-            RefitContext(cast(Any, None), limits, NULL_PROGRESS, record=case.record, is_finished=True),
-            case.evidence,
-            case.locate,
-        )
+        search = RefitContext(cast(Any, None), limits, NULL_PROGRESS, record=case.record, is_finished=True)
+        judged = judge(search, case.evidence, case.locate)
     except UnrecordedRefitError:
         judged = Judgement(_NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, (), 0.0)
     where = () if case.located_gap is None else case.located_gap.locations

@@ -237,11 +237,9 @@ class AllCandidatesProblem:
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Relinearise held-out filters at the fitted values. `own`: from `with_effects_and_relinearized_filters`."""
-        return (
-            problem_with_relinearized_held_out_whitening(own, *_beside(own, effects, at))
-            if own.has_process_noise
-            else own
-        )
+        if not own.has_process_noise:
+            return own
+        return problem_with_relinearized_held_out_whitening(own, *_beside(own, effects, at))
 
 
 def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFunctions) -> EstimationProblem | None:

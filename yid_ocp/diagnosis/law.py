@@ -153,7 +153,8 @@ def find_gap_law(
             best = better[0]
     closure = held_out_gap_closure(before.held_out_loss, best.loss)
     least = _MIN_LEFTOVER_CLOSURE if last.effects else search.thresholds.min_gap_closed
-    if not _closes(before.held_out_loss, best.loss, closure, least):
+    gained, error = held_out_improvement(before.held_out_loss, best.loss)
+    if not (gained > error and closure.ci_low > least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
     tables = _tables(best.law, best.fit)
@@ -205,12 +206,6 @@ def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
     """Whether a fitted law's knots reach far beyond the values that its model visits."""
     low, high = _visited_range(found.fit, found.law.location, quantity)
     return high - low < _MIN_VISITED_PART * float(np.ptp((found.law.knots or {})[quantity]))
-
-
-def _closes(before: HeldOutLoss, after: HeldOutLoss, closure: GapClosure, least: float) -> bool:
-    """Whether a law closes at least a required fraction of the gap (lower 95 % bound)."""
-    gained, error = held_out_improvement(before, after)
-    return gained > error and closure.ci_low > least
 
 
 def _neutral_law(

@@ -327,11 +327,8 @@ class EpisodePredictor:
     ) -> tuple[Array, Array] | None:
         """Delay of each output in steps (k,), and its derivative (k, d); None without delays."""
         found = self.model_functions.input_corrections.sensor_delays_with_derivatives(samples.sensor, theta, wanted)
-        return (
-            None
-            if found is None
-            else (found[0] / self.integrator_step.time_step, found[1] / self.integrator_step.time_step)
-        )
+        h = self.integrator_step.time_step
+        return None if found is None else (found[0] / h, found[1] / h)
 
     def delay_corrected_measurements(self, samples: SensorMeasurements, theta: Array) -> SensorMeasurements:
         """Shift measurements earlier by the sensor's delay at `theta`, to the times of the true values."""

@@ -204,11 +204,8 @@ def synthesize_recording(
 ) -> Recording:
     """Roll out an episode at `theta` and make a synthetic recording, with noise if a `seed` is given."""
     refit = predictor.options.initial_state == "fitted_to_points"
-    fresh = (
-        predictor.episode_with_fitted_initial_state(replace(episode, fixed_initial_state=None), theta)
-        if refit
-        else episode
-    )
+    bare = replace(episode, fixed_initial_state=None)
+    fresh = predictor.episode_with_fitted_initial_state(bare, theta) if refit else episode
     found = predictor.predict_episode(fresh, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
     if isinstance(found, str):
         raise failed_rollout_error(found, f"recording '{episode.name}'")

@@ -381,10 +381,8 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         p = _relation(result["p_value"])
         yield f"No parameter changed: all {len(runs)} runs agree within what they state (p {p})."
     elif not drifted:
-        yield (
-            f"Together the runs differ (p {_relation(result['p_value'])}), though no parameter alone does: look at "
-            "what they have in common."
-        )
+        differ = f"Together the runs differ (p {_relation(result['p_value'])}), though no parameter alone does"
+        yield f"{differ}: look at what they have in common."
     for name in drifted:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
@@ -398,10 +396,8 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield "No single run differs from the others."
     poor = [entry["name"] for entry in runs if not entry["explains"]]
     if poor:
-        yield (
-            f"The model did not explain the recordings of {', '.join(poor)}: the ± there counts the misfit and may "
-            "still be too small."
-        )
+        text = f"The model did not explain the recordings of {', '.join(poor)}"
+        yield f"{text}: the ± there counts the misfit and may still be too small."
 
 
 def _relation(p_value: float) -> str:

@@ -59,15 +59,9 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         std = "" if failed or entry["std"] is None or entry["verdict"] == "at_bound" else f"{entry['std']:.2g}"
         interval = "" if failed else _interval_cell(entry, entry["std"])
         verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
-        own = (
-            "–" if not failed and entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}",
-            std,
-            interval,
-            entry["unit"],
-            verdict,
-            f"{entry['initial']:.4g}",
-        )
-        rows.append((name, *own, parameter_bounds_text(entry, 4)))
+        value = "–" if not failed and entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}"
+        own = (name, value, std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
+        rows.append((*own, parameter_bounds_text(entry, 4)))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     rows = [("channel", "error (rms)", "unit", "samples")]
     for name, entry in result["residuals"].items():
@@ -86,11 +80,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
     if use := result.get("to_use"):
         yield "to use these numbers (± is one standard deviation, all that is counted in it):"
-        yield CodeBlock(
-            "\n".join(
-                [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
-            )
-        )
+        lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
+        yield CodeBlock("\n".join(lines))
     yield result.get("safeguard", "")
     ended = f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
@@ -130,10 +121,8 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         ]
         guesses = {name: _rms([e["baselines"][name][c] for e in entries for c in channels]) for name in names}
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
-        sizes = [
-            " ".join(format_error_value_and_unit(x, unit)).rstrip()
-            for x in (error, fitted, noise, guesses.get(best or ""))
-        ]
+        known = (error, fitted, noise, guesses.get(best or ""))
+        sizes = [" ".join(format_error_value_and_unit(x, unit)).rstrip() for x in known]
         guess = f", and {sizes[3]} without a model, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
         text = f"held-out errors of {group} are {sizes[0]} (rms), beside {sizes[1]} on the fitted recordings{guess}"
         if noise is None or error is None or fitted is None:
@@ -196,10 +185,8 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_TABLE_TEXTS}
     found, weak, lost = (by[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
-        yield (
-            f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value or, near zero, of "
-            f"their usual size: {abbreviated_names_text(found)}"
-        )
+        within = "10 % of their value or, near zero, of their usual size"
+        yield f"{len(found)} of {len(free)} free parameters are found to within {within}: {abbreviated_names_text(found)}"
     if lost:
         yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {abbreviated_names_text(lost)}"
     if weak:
@@ -209,10 +196,9 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
-                what = (
-                    f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}: nothing beyond was tried"
-                )
-                yield f"{what}; widen `parameters.{name}.bounds`, or fix it there if that is a physical limit"
+                what = f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}"
+                remedy = f"widen `parameters.{name}.bounds`, or fix it there if that is a physical limit"
+                yield f"{what}: nothing beyond was tried; {remedy}"
 
 
 @register_summary("yid-identifiability/1")
@@ -330,10 +316,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
-    yield (
-        f"start {result['best'] + 1} of {len(starts)} is the most informative: "
-        f"{best['value'] - best['first']:.3g} nat more than the random motion from which it came{others}"
-    )
+    more = f"{best['value'] - best['first']:.3g} nat more than the random motion from which it came{others}"
+    yield f"start {result['best'] + 1} of {len(starts)} is the most informative: {more}"
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     yield f"what limits it: {'; '.join(reached)}" if reached else "it reaches no limit"
     yield from (
@@ -348,10 +332,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 @register_summary("yid-check/1")
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     model = result["model"]
-    yield (
-        f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
-        f"{model['ntheta']} parameters"
-    )
+    driven = f"{model['nu']} driven, {model['nc']} prescribed"
+    yield f"model: {model['n']} coordinates, {model['m']} constraints, {driven}, {model['ntheta']} parameters"
     yield from (entry["words"] for entry in result["mechanics"].values() if entry["agrees"])
     rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
     rests = []

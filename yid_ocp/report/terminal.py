@@ -146,11 +146,8 @@ def misfit_summary_blocks(
         if doubted and fit["believed"]:
             known = []
             for name, entry in doubted.items():
-                std = (
-                    entry["std"]
-                    if "std" in entry
-                    else entry["std_relative"] and entry["std_relative"] * abs(entry["value"])
-                )
+                relative = entry.get("std_relative")
+                std = entry["std"] if "std" in entry else relative and relative * abs(entry["value"])
                 if std is not None and std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry["value"]):
                     known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL

@@ -467,10 +467,8 @@ class NonlinearProgram(ReprMixin):
             weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
             total += self.lam_f * ca.mtimes(slope.T, weighted)
             if exact:
-                matrix, pull = (
-                    residual._residual_jacobian_by_term_values(self.p),
-                    residual._loss_gradient_by_residual(r),
-                )
+                matrix = residual._residual_jacobian_by_term_values(self.p)
+                pull = residual._loss_gradient_by_residual(r)
                 pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
                 total += self._curvature(residual.term, self.lam_f * pull)
         return total

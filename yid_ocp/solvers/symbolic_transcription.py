@@ -219,10 +219,8 @@ def _driven_stage(
         by_before[:, index] = -matrix
     symbols = [stage.x0, stage.x1, stage.lam, stage.u, stage.theta]
     values = (stage.residual, stage.prescribed_effort)
-    by_free, slopes = (
-        stage.residual_and_effort_jacobians_by_parameters(freed.names),
-        (stage.residual_jacobians, stage.effort_jacobians),
-    )
+    by_free = stage.residual_and_effort_jacobians_by_parameters(freed.names)
+    slopes = (stage.residual_jacobians, stage.effort_jacobians)
     made = []
     for value, own, by in zip(values, by_free, slopes, strict=True):
         parts = [value, own, *(by[name] for name in ("x0", "x1", "lam", "u"))]

@@ -230,12 +230,8 @@ class ShapeFitter:
     def _failed(self, evidence: ShapeFitQualityAndPointClasses) -> set[str]:
         """Tubes of which too large a part is visibly empty."""
         own = {name: self._lengths * self._links_of({name}) for name in self.link_segments}
-        return {
-            name
-            for name, mine in own.items()
-            if mine @ evidence.visibly_empty_fraction > 0
-            and evidence.covered_fraction_of_visible_links(mine) < _MIN_TUBE_COVERAGE
-        }
+        empty, covered = evidence.visibly_empty_fraction, evidence.covered_fraction_of_visible_links
+        return {name for name, mine in own.items() if mine @ empty > 0 and covered(mine) < _MIN_TUBE_COVERAGE}
 
     def _without(
         self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud, links: BoolArray

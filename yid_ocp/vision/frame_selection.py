@@ -115,11 +115,8 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
-    widest, noise = (
-        options.max_mean_surface_distance_in_radii * float(shape.link_radii.mean()),
-        shape.options.surface_noise_std,
-    )
-    limit = math.hypot(widest, _MEAN_ABS_DEVIATION * noise)
+    widest = options.max_mean_surface_distance_in_radii * float(shape.link_radii.mean())
+    limit = math.hypot(widest, _MEAN_ABS_DEVIATION * shape.options.surface_noise_std)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
@@ -229,9 +226,8 @@ def _hint(sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], otherw
 
 
 _TOUCHING_DISTANCE = 1e-3  # [m]
-_MIN_CROSSING_SEPARATION_RADII = (
-    4.0  # parts of an object nearer than so many radii along it cannot help being near each other
-)
+# parts of an object nearer than so many radii along it cannot help being near each other
+_MIN_CROSSING_SEPARATION_RADII = 4.0
 _MAX_SHAPE_STATIONS = 400  # places along a shape that are compared
 _FIXED_ROOT_MOTION_RATIO = 2.0  # times
 _SAME_ROOT_FRACTION = 0.1  # of the length between the ends; closer roots are the same

@@ -233,10 +233,8 @@ _MAX_EDGE_POINTS = 24  # largest number of points near a narrow passage
 _NARROWEST_RATIO = 0.8  # times the narrowest place, up to which what is sorted stays enough
 _SORTED_MARGIN = 0.02  # sorted region of the image beyond the requested one, as x/z
 _DECIDING_FRACTION = 0.5  # fraction of the points in a direction that decides
-_EDGE_STRIP_WIDTH, _EDGE_STRIP_PIECES = (
-    0.02,
-    20,
-)  # of a picture: width of the strip along a side and the pieces of it, half of them filled
+# of a picture: width of the strip along a side, and the pieces of it, half of them filled
+_EDGE_STRIP_WIDTH, _EDGE_STRIP_PIECES = 0.02, 20
 _MIN_PICTURE_WIDTH = 0.3  # smallest image width, as x/z; a narrower cloud is a cut-out
 _MIN_DEPTH = 0.05  # smallest depth in front of the camera [m]
 

@@ -163,11 +163,9 @@ def fit_quality_and_point_classes(
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
     close = size < near
     tree, spacing = seen._point_tree, seen._point_spacing
-    noise = (
-        _MAD_TO_STD * weighted_median(size[close], seen.point_weights[close])
-        if close.any()
-        else near / _ON_SURFACE_STDS
-    )
+    noise = near / _ON_SURFACE_STDS
+    if close.any():
+        noise = _MAD_TO_STD * weighted_median(size[close], seen.point_weights[close])
     # positions are not known better than the spacing of the points
     noise = max(noise, spacing / math.sqrt(12.0))
     gate = min(_ON_SURFACE_STDS * noise, near)

@@ -45,6 +45,7 @@ UrdfMeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
 _MAX_MESH_BYTES = 1 << 28
+_EXTRA_MESH_SHAPES = ("mesh_file", "box_size", "cylinder_radius_and_length", "sphere_radius")
 _TUBE_FACETS = 48  # facets of a tube, whose surface is then within 0.2 % of the radius
 _TOUCHING_DISTANCE = 5e-4  # [m]
 _MIN_PROJECTED_DISTANCE = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
@@ -340,15 +341,10 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
         where = f"model: extra_meshes: {number}"
-        given = [
-            kind
-            for kind in ("mesh_file", "box_size", "cylinder_radius_and_length", "sphere_radius")
-            if getattr(entry, kind) is not None
-        ]
+        given = [kind for kind in _EXTRA_MESH_SHAPES if getattr(entry, kind) is not None]
         if len(given) != 1:
             what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "keep or add one shape"
-            allowed = "one of mesh_file, box_size, cylinder_radius_and_length, sphere_radius"
-            raise ConfigError(what, where=where, allowed=allowed, hint=hint)
+            raise ConfigError(what, where=where, allowed=f"one of {', '.join(_EXTRA_MESH_SHAPES)}", hint=hint)
         mesh = _solid(entry.box_size, entry.cylinder_radius_and_length, entry.sphere_radius)
         if entry.mesh_file is not None:
             if not is_file(Path(entry.mesh_file)):

@@ -167,11 +167,8 @@ class FrameTracker:
         """Estimate what all frames share, from some of them: camera calibration, tube dimensions and background."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
-        seen = (
-            ()
-            if self.empty_scene is None
-            else (self._finite(self.empty_scene, i)[0] for i in range(len(self.empty_scene)))
-        )
+        scene = self.empty_scene
+        seen = [] if scene is None else [self._finite(scene, i)[0] for i in range(len(scene))]
         clouds = [calibration.camera_state.measured_to_world_points(points) for points in seen]
         background = BackgroundPoints.from_point_clouds(clouds, filters.voxel_size, noise)
         looks = [look for i in self._asked if (look := self._look(i, calibration, background)[1]) is not None]
@@ -230,11 +227,8 @@ class FrameTracker:
 
     def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
         """The shape fitter with the estimated dimensions of the object."""
-        key = (
-            tuple(np.where(sizes.estimated_dimension_mask, sizes.log_ratio, 0.0).tolist())
-            if any(sizes.estimated_dimension_mask)
-            else ()
-        )
+        used = sizes.estimated_dimension_mask
+        key = tuple(np.where(used, sizes.log_ratio, 0.0).tolist()) if any(used) else ()
         if key not in self._shapes:
             self._shapes[key] = self._shape_of(sizes.parameter_values(self.system, self.parameter_values))
         return self._shapes[key]

@@ -56,12 +56,10 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     if arguments.join:
         together = functools.partial(score_joined_slices, arguments.join, arguments.out or "joined-slices")
         return run_command_and_print(arguments, together)
-    runs = [
-        load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
-        for path in arguments.configs or [None]
-    ]
+    said, default = arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME
+    runs = [load_config(path, said, default) for path in arguments.configs or [None]]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
-        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG_FILE_NAME))
+        runs.append(load_config(None, said, DEFAULT_CONFIG_FILE_NAME))
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     purpose = blind.BLIND_ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
@@ -342,10 +340,8 @@ class _ExperimentVariation:
     def simulation_overrides(self, arm: VirtualArmOptions) -> tuple[str, ...]:
         # settings of the object and its sensors do not apply without it
         bare = ("model.object=null", "model.grasp={}", "model.measured_points=null", "sensors={}", "parameters={}")
-        own = (
-            f"model.arms.relative_link_mass_std={arm.max_relative_link_mass_error}",
-            *(bare if self.is_without_object else ()),
-        )
+        mass = f"model.arms.relative_link_mass_std={arm.max_relative_link_mass_error}"
+        own = (mass, *bare) if self.is_without_object else (mass,)
         return own if arm.friction_law == "none" else (*own, "model.friction=null")
 
     def diagnosis_overrides(self, driven: Sequence[str], arm: VirtualArmOptions) -> list[str]:

@@ -208,11 +208,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     h = run.problem.time_step_or_default if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
-        return {
-            "links": [],
-            "time_step": [],
-            "message": "joint positions are unknown: the configuration names no recording",
-        }
+        message = "joint positions are unknown: the configuration names no recording"
+        return {"links": [], "time_step": [], "message": message}
     theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
     rule = (run.problem.force_split, run.problem.constraint_force_at)
     if problem is not None:

@@ -221,9 +221,7 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
             prior_stds={name: share * std for name, std in options.prior_stds.items()},
             multivariate_prior=prior.with_parameters_scaled_by(dict.fromkeys(prior.parameter_names, share)),
             huber_threshold=options.huber_threshold / share,
-            weak_prior_geometric_std=options.weak_prior_geometric_std**share
-            if options.weak_prior_geometric_std > 0
-            else 0.0,
+            weak_prior_geometric_std=options.weak_prior_geometric_std**share,  # 0 stays 0
             initial_configuration_prior_std=share * options.initial_configuration_prior_std,
             initial_velocity_prior_std=share * options.initial_velocity_prior_std,
         )

@@ -370,10 +370,8 @@ def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any
         kept = {"value": None, "std": None, "free": True, "verdict": None}
         values = {label: {key: own.get(key, kept[key]) for key in kept} for label, own in known.items()}
         both = [own["value"] for own in values.values() if own["verdict"] != "not_identifiable"]
-        apart, largest = (
-            both[1] - both[0] if len(both) == 2 else None,
-            max(own["std"] or 0.0 for own in values.values()),
-        )
+        apart = both[1] - both[0] if len(both) == 2 else None
+        largest = max(own["std"] or 0.0 for own in values.values())
         over = None if apart is None or largest == 0 else apart / largest
         unit = next(iter(known.values()))["unit"]
         parameters[name] = {"unit": unit, "values": values, "difference": apart, "difference_in_std": over}

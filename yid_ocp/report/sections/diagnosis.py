@@ -237,11 +237,8 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         entries[name] = (closed, promised.get(name, 0.0))
     if not entries:
         return None
-    unit = (
-        "as a fraction of the excess over noise"
-        if percent
-        else "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
-    )
+    absolute = "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
+    unit = "as a fraction of the excess over noise" if percent else absolute
     promise = f"redicted decrease of the fitted misfit by each, to first order, {unit}."
     sentences = [f"P{promise}", "No predicted decrease is large enough for a refit."]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
