@@ -147,10 +147,10 @@ def _within(hint: Any, value: Any) -> bool:
     if not isinstance(value, (int, float)):
         return True
     markers = [marker for part in (hint, *union_members(hint)) for marker in split_annotated(part)[1]]
-        return all(is_within(value, limit) for limit, is_within, _ in _bounds(markers))
+    return all(is_within(value, limit) for limit, is_within, _ in _bounds(markers))
 
 
-    def _bounds(markers: Iterable[Any]) -> list[tuple[float, Callable[[Any, Any], bool], str]]:
-        """Limit, comparison and word of each bound among the markers of a type."""
-        pairs = [(marker, row) for marker in markers for row in _BOUND_MARKERS if isinstance(marker, row[0])]
-        return [(getattr(marker, name), compare, word) for marker, (_, name, compare, word) in pairs]
+def _bounds(markers: Iterable[Any]) -> list[tuple[float, Callable[[Any, Any], bool], str]]:
+    """Limit, comparison and word of each bound among the markers of a type."""
+    pairs = [(marker, row) for marker in markers for row in _BOUND_MARKERS if isinstance(marker, row[0])]
+    return [(getattr(marker, name), compare, word) for marker, (_, name, compare, word) in pairs]

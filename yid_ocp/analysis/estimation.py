@@ -112,12 +112,8 @@ def _with_equilibrium_guesses(
         known = [(e, None if isinstance(own, str) else own.equilibrium_guess) for e, own in pairs]
         return [e if guess is None else replace(e, equilibrium_guess=guess) for e, guess in known]
 
-    return problem.with_episodes(
-        guessed(problem.episodes, predictions),
-        guessed(problem.held_out, held_out_predictions),
-        problem.whitening_filters,
-        problem.held_out_whitening_filters,
-    )
+    episodes, held_out = guessed(problem.episodes, predictions), guessed(problem.held_out, held_out_predictions)
+    return problem.with_episodes(episodes, held_out, problem.whitening_filters, problem.held_out_whitening_filters)
 
 
 def _with_discretisation_errors(

@@ -15,7 +15,7 @@ import scipy.interpolate
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period, white_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.effects.base import joint_names_by_arm
+from yid_ocp.effects.base import EffectBase, joint_names_by_arm
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
@@ -36,7 +36,6 @@ _SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither
 _MOTION_BANDWIDTH_HZ = 5.0  # bandwidth of an arm's motion; faster components are removed [Hz]
 _MAX_MOTION_SAMPLES = 300  # approximate number of samples used of a motion
 _VISCOUS_FRICTION_FRACTION = 0.04  # usual viscous friction beside a joint's largest effort [per rad/s]
-_LOAD_EFFECT_PREFIXES = ("payload@", "point_mass@")
 _LOAD_RANGE_FRACTION = 0.1  # typical size of an unknown load parameter, of the range between its bounds
 _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
 
@@ -56,7 +55,8 @@ class RecordedJointsModel:
     def from_system(system: System, free: Sequence[str] = ()) -> RecordedJointsModel | None:
         """Return the model of a system's driven and prescribed joints, or None without such joints."""
         names = (*system.driven, *system.prescribed)
-        unknown = tuple(name for name in free if name.startswith(_LOAD_EFFECT_PREFIXES))
+        loads = (effect for effect in system.effects if isinstance(effect, EffectBase) and effect.is_load)
+        unknown = tuple(name for effect in loads for name in effect.parameters.names if name in free)
         return RecordedJointsModel(system, names, unknown) if names else None
 
     def has_all_angles_recorded(self, recording: Recording) -> bool:

@@ -300,13 +300,8 @@ class NamedStepEquations(ReprMixin):
                 said.append(_headline(name, count, used))
         whole = "`inspect --entry 'NAME'` prints any of them whole, with ', COLUMN' its derivative"
         blocks = [block for block in self.column_blocks if block.labels]
-        return [
-            f"equations of one step; {whole}",
-            "",
-            *said,
-            "",
-            *(f"{b.name} ({b.meaning}): {', '.join(b.full_names)}" for b in blocks),
-        ]
+        names = (f"{b.name} ({b.meaning}): {', '.join(b.full_names)}" for b in blocks)
+        return [f"equations of one step; {whole}", "", *said, "", *names]
 
 
 def _headline(title: str, count: int, variables: Sequence[str]) -> str:

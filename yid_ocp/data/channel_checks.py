@@ -319,11 +319,8 @@ class Issue:
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSE_DESCRIPTIONS:
             raise ValueError(f"there is no cause '{self.cause}'")
-        object.__setattr__(
-            self,
-            "limit_violation_ratio",
-            float(min(max(self.limit_violation_ratio, 1.0), LIMIT_VIOLATION_RATIO_CAP)),
-        )
+        ratio = min(max(self.limit_violation_ratio, 1.0), LIMIT_VIOLATION_RATIO_CAP)
+        object.__setattr__(self, "limit_violation_ratio", float(ratio))
 
     @property
     def certainty_word(self) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors, EarlierRunsComparison
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
@@ -21,6 +23,7 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_by_name, to_json_types
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult, main_gap_locations
+from yid_ocp.inference.uncertainty import priors_that_determine_unknown
 
 _EFFECT = "kind location"
 _PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
@@ -245,7 +248,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         text.append(result.law.sentence)
     stopped = f"The search stopped after {result.search_seconds:.3g} s; it would go on with "
     text += [_listed(stopped, result.untried), *map(held_out_truncation_message, result.truncated_recordings)]
-    text += _earlier_runs(result)
+    text += [*_bound_by_priors(result), *_earlier_runs(result)]
     if result.is_split_in_blocks:
         text.append("No other recording could be held out, so alternate blocks of the recordings were.")
     events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
@@ -335,6 +338,23 @@ def _causes(result: DiagnosisResult) -> list[str]:
         if len(places) > 1:
             advice = "add it to the model at all of them (`model.effects`, or `yid-ocp friction` for friction)"
             text.append(f"{best[0]} is significant at {abbreviated_names_text(places)}: {advice}.")
+    return text
+
+
+def _bound_by_priors(result: DiagnosisResult) -> list[str]:
+    """One sentence per refitted effect whose amplitudes only the priors of nominal parameters determine."""
+    text = []
+    for fit in result.single_effect_models:
+        if not isinstance(fit, RefittedModel) or fit.evaluation.jacobian is None:
+            continue
+        names, rows, own = fit.problem.unknown_names, fit.problem.residual_rows, fit.effects[-1]
+        data, priors = (fit.evaluation.jacobian[part] for part in (rows.data, rows.stated_priors))
+        others: dict[str, None] = {}
+        for name in own.amplitude_parameter_names:
+            by = priors_that_determine_unknown(data, priors, names.index(name))
+            others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
+        beside = f"These motions determine {own.label} only in relation to "
+        text.append(_listed(beside, others, ": state one of them exactly."))
     return text
 
 

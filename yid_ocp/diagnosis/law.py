@@ -220,9 +220,9 @@ def _neutral_law(
         room = max(high - low, _MIN_KNOT_RANGE) / (_N_KNOTS - 3)
         # half a gap of room, so that the ends are estimated and what lies beyond is flat
         tables.append(TorqueLawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
-    return make_torque_law(
-        place, system or model.problem.system, tables, _RIDGE_STD_RATIO * _torque_scale(model, place)
-    )
+    # of the torque of springs or through a joint [N m]
+    size = float(np.std(_visited(model, place, "load"))) or 1.0
+    return make_torque_law(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * size)
 
 
 def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:
@@ -245,12 +245,6 @@ def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
 def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[float, float]:
     values = _visited(model, place, quantity)
     return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-
-
-def _torque_scale(model: RefittedModel, place: str) -> float:
-    """Standard deviation of the torque at a location [N m], of springs or through a joint; 1 if it is zero."""
-    size = float(np.std(_visited(model, place, "load")))
-    return size if size > 0 else 1.0
 
 
 def _composed_with_laws(

@@ -241,8 +241,10 @@ def refit_with_effects(
     """
     problem = problem.restricted_to_effect_location(effects)
     name = f"{name or join_effect_labels(effects)} at {problem.problem.step.time_step:g} s"
-    if store is not None and (stored := store.get(name)) and (known := _restored(problem, effects, stored)):
-        return known
+    if store is not None and (stored := store.get(name)):
+        placed, at_stored = _evaluated(problem, effects, stored.values)
+        if at_stored.ok:
+            return _model(stored, effects, placed, at_stored)
     runs = [_attempt(problem, effects, start)]
     runs += [_attempt(problem, effects, other) for other in _other_starts(problem, effects, start, runs[0], limits)]
     best = min(filter(None, runs), key=lambda run: run[-1].cost, default=None)
@@ -252,26 +254,31 @@ def refit_with_effects(
     values = own.named_values(outcome.x)
     own = problem.with_relinearized_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
-    std = _mark_uninformative_std(effects, own.named_values(np.linalg.norm(factor, axis=1)))
+    ranges = {name: high - low for effect in effects for name, (low, high) in effect.prior_ranges.items()}
+    most = {name: _UNINFORMATIVE_STD_RATIO * width for name, width in ranges.items()}
+    sizes = own.named_values(np.linalg.norm(factor, axis=1))
+    std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
     found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
     if store is not None:
         store.put(name, found)
     return _model(found, effects, own, finish)
 
 
-def _restored(problem: AllCandidatesProblem, effects: Sequence[EffectBase], known: StoredFit) -> RefittedModel | None:
-    """A refit evaluated at its known values. None if the rollout fails."""
-    own = problem.with_effects_and_relinearized_filters(effects, known.values)
-    finish = own.evaluate(own.unknown_vector(known.values))
-    own = problem.with_relinearized_held_out_filters(own, effects, known.values)
-    return _model(known, effects, own, finish) if finish.ok else None
+def _evaluated(
+    problem: AllCandidatesProblem, effects: Sequence[EffectBase], values: Mapping[str, float]
+) -> tuple[EstimationProblem, Evaluation]:
+    """The problem with effects at known values, and its evaluation there."""
+    own = problem.with_effects_and_relinearized_filters(effects, values)
+    finish = own.evaluate(own.unknown_vector(values))
+    return problem.with_relinearized_held_out_filters(own, effects, values), finish
 
 
 def restore_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
-    """Rebuild a refit's problem and evaluation in the step of all candidates, without a fit. The estimates are kept."""
+    """A refit with its problem and evaluation in the step of all candidates; its estimates and predictions are kept."""
     if fit.problem.step is problem.problem.step:
         return fit
-    return _restored(problem, fit.effects, fit) or fit
+    own, finish = _evaluated(problem, fit.effects, fit.values)
+    return replace(fit, problem=own, evaluation=finish, cost=finish.cost) if finish.ok else fit
 
 
 def _model(
@@ -362,12 +369,6 @@ def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Arr
         whitened = np.linalg.lstsq(rows / scale[:, None], away / scale, rcond=None)[0]
         found[effect.label] = chi2_p_value(float(whitened @ whitened), len(sized))
     return found
-
-
-def _mark_uninformative_std(effects: Sequence[EffectBase], std: Mapping[str, float]) -> dict[str, float]:
-    """Standard deviations, infinite above `_UNINFORMATIVE_STD_RATIO` times the width of the prior range."""
-    most = {n: _UNINFORMATIVE_STD_RATIO * (b - a) for effect in effects for n, (a, b) in effect.prior_ranges.items()}
-    return {name: math.inf if size > most.get(name, math.inf) else size for name, size in std.items()}
 
 
 def refit_with_each_effect(

@@ -119,7 +119,7 @@ class _PointMass(EffectBase):
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
     required_excitation = "how hard it accelerates"
-    is_local = True
+    is_local = is_load = True
     possible_locations = _moving_frames
     candidate_locations = _tips_and_link_ends
 
@@ -158,7 +158,7 @@ class Payload(EffectBase):
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
     required_excitation = "its orientation to gravity"
-    is_local = True
+    is_local = is_load = True
     possible_locations = _moving_frames
     # payloads at two frames of one link are equivalent
     candidate_locations = base.one_frame_name_per_arm_link

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg.lapack
 from numpy.typing import ArrayLike
 
-from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.arrays import Array
 from yid_ocp.integrator.codegen import nonzero_indices
 from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
 from yid_ocp.integrator.step import Step, float_array_with_checked_shape
@@ -112,7 +112,8 @@ class EquilibriumSolver:
         stiffness = measured_angle_hold_stiffness(system, torque is not None)
         nu, nz, m = step.sizes["nu"], step.sizes["nz"], step.sizes["m"]
         held = np.zeros(nu) if torque is None else float_array_with_checked_shape("torque", torque, (nu,))
-        hold = _Hold(given, held, stiffness, np.where(_is_motor_off(system, held), _HOLD_STIFFNESS, 0.0))
+        is_motor_off = bool(system.servos) & (held >= MOTOR_OFF_COMMAND / 2)
+        hold = _Hold(given, held, stiffness, np.where(is_motor_off, _HOLD_STIFFNESS, 0.0))
         count, h = len(self.free_coordinates) + nz, step.clock_scaled_time_step(theta)
         sought = b"" if guess is not None else np.concatenate([given, theta, held, [torque is None]]).tobytes()
 
@@ -317,10 +318,6 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     return sum(
         (0.5 * servo.gain * servo.position_error(command, angle) ** 2 for servo, command, angle in known), ca.SX(0)
     )
-
-
-def _is_motor_off(system: System, command: Array) -> BoolArray:
-    return np.asarray(bool(system.servos) & (command >= MOTOR_OFF_COMMAND / 2))
 
 
 def measured_angle_hold_stiffness(system: System, known: bool) -> float:

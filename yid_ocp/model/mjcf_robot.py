@@ -134,18 +134,9 @@ def _body(
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
         if carried != name:
             links.append(SimpleNamespace(name=carried, inertial=None))
-        joints.append(
-            SimpleNamespace(
-                name=label,
-                type=kind if model.jnt_limited[j] or kind == "prismatic" else "continuous",
-                origin=origin,
-                axis=np.array(axis),
-                limit=_limits(model, j),
-                mimic=follows.get(label),
-                parent=parent,
-                child=carried,
-            )
-        )
+        made = {"name": label, "type": kind if model.jnt_limited[j] or kind == "prismatic" else "continuous"}
+        made |= {"axis": np.array(axis), "limit": _limits(model, j), "mimic": follows.get(label)}
+        joints.append(SimpleNamespace(**made, origin=origin, parent=parent, child=carried))
         parent, at, last = carried, np.eye(4), place
     if parent != name:
         joints.append(_fixed(f"{name}_fixed", parent, name, at @ _shift(-last)))

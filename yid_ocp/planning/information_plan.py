@@ -218,14 +218,12 @@ def _smooth(experiment: SplineMotionExperiment, w: Array) -> tuple[Array, Array 
     for _ in range(10):
         rows = experiment.sensitivities_to_unknowns(w)
         there = None if rows is None else experiment.sensitivities_to_unknowns((1.0 + 1e-4) * w)
-        if rows is not None and there is not None and _is_near(there, rows):
-            return w, rows
+        if rows is not None and there is not None:
+            change = np.linalg.norm(there - rows)
+            if change <= _MAX_RELATIVE_SENSITIVITY_CHANGE * np.linalg.norm(rows):
+                return w, rows
         w = 0.5 * w
     return w, experiment.sensitivities_to_unknowns(w)
-
-
-def _is_near(there: Array, rows: Array) -> bool:
-    return bool(np.linalg.norm(there - rows) <= _MAX_RELATIVE_SENSITIVITY_CHANGE * np.linalg.norm(rows))
 
 
 def _unseen(experiment: SplineMotionExperiment, told: Sequence[Array | None]) -> dict[str, float]:

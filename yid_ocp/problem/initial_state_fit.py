@@ -89,17 +89,15 @@ class InitialStateFitter:
         held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
         self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)
-        at = [system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints]
+        names = [spring.joint_name for spring in system.elastic_joints]
+        at = [system.mechanism.joint_index(name) for name in names]
         stiffness, rest = ca.SX(system.n_coordinates, 1), ca.SX(system.n_coordinates, 1)
         for index, spring in zip(at, system.elastic_joints, strict=True):
             stiffness[index] += spring.stiffness
             rest[index] = spring.rest_angle
         self._elastic = ca.Function("elastic", [e.theta], [ca.densify(stiffness), ca.densify(rest)])
-        self._presets = tuple(
-            (index, spring.joint_name)
-            for index, spring in zip(at, system.elastic_joints, strict=True)
-            if f"{spring.joint_name}.{INITIAL_ANGLE_AND_TORQUE_SUFFIXES[0]}" in system.parameters
-        )
+        pairs, suffix = list(zip(at, names, strict=True)), INITIAL_ANGLE_AND_TORQUE_SUFFIXES[0]
+        self._presets = tuple((index, name) for index, name in pairs if f"{name}.{suffix}" in system.parameters)
         loads = [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
         self._load = ca.Function("load", e.arguments, loads)
 

@@ -185,8 +185,8 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_TABLE_TEXTS}
     found, weak, lost = (by[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
-        within = "10 % of their value or, near zero, of their usual size"
-        yield f"{len(found)} of {len(free)} free parameters are found to within {within}: {abbreviated_names_text(found)}"
+        text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
+        yield f"{text} or, near zero, of their usual size: {abbreviated_names_text(found)}"
     if lost:
         yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {abbreviated_names_text(lost)}"
     if weak:

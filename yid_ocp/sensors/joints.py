@@ -217,11 +217,10 @@ def _joint_noise_std(
     values, given, step = getattr(joints, channel.quantity)[:, columns], choice.std, np.zeros(len(names))
     if given is None and group == JOINT_POSITION_GROUP_NAME:
         found = joints.position_resolution
-        step = (
-            np.array([quantization_step(column) for column in values.T])
-            if found is None
-            else (expand_to_joint_values(found, joints.names, names, "position_resolution"))
-        )
+        if found is None:
+            step = np.array([quantization_step(column) for column in values.T])
+        else:
+            step = expand_to_joint_values(found, joints.names, names, "position_resolution")
     step_std = step / math.sqrt(12)
     if given is None:
         given = getattr(joints, channel.std_attribute_names[0])

@@ -128,13 +128,9 @@ class MultipleShooting(SolverWithCheckedSettings):
             hint = "use hessian: gauss_newton"
             told = f"hessian = '{self.hessian}'", "hessian", "gauss_newton, exact", hint
         elif str(self.ipopt_options.get("hessian_approximation", "exact")) != "exact":
+            what = "a limited-memory Hessian is too slow for thousands of node states"
             hint = "leave the option out, and use hessian: gauss_newton"
-            told = (
-                "a limited-memory Hessian is too slow for thousands of node states",
-                "ipopt_options.hessian_approximation",
-                "exact",
-                hint,
-            )
+            told = what, "ipopt_options.hessian_approximation", "exact", hint
         elif self.node_interval not in (None, 1):
             hint = "set condensing: true, or node_interval: 1"
             told = f"node_interval = {self.node_interval} without condensing", "node_interval", "1", hint

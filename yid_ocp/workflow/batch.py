@@ -171,11 +171,8 @@ def _run_batch_task(
         result = run_solve(run, target).result
         judged, fit = result["parameters"], result["fit"]
         status, ok, message = result["status"], result["status"] == "converged", result["message"]
-    parameters = {
-        parameter: {key: own.get(key) for key in _PARAMETER_KEYS}
-        for parameter, own in judged.items()
-        if own.get("free", True)
-    }
+    free = {parameter: own for parameter, own in judged.items() if own.get("free", True)}
+    parameters = {parameter: {key: own.get(key) for key in _PARAMETER_KEYS} for parameter, own in free.items()}
     effects = [f"{entry['kind']}@{entry['location']}" for entry in result.get("effects", ())]
     found = {"status": status, "ok": ok, "message": message, "chi2_per_dof": fit.get("chi2_per_dof")}
     found |= {"effects": effects, "parameters": parameters, "seconds": time.perf_counter() - begun}

@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.diagnosis_result import diagnosis_decision_statistics
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
-from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_strict_json, write_text
+from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmOptions
@@ -189,12 +189,8 @@ class _Proof:
 
     def _draw(self, commitment: Path, configs: Mapping[str, str]) -> None:
         cases, prepared = self.folder / "cases", self.whole / "prepared"
-        try:
-            for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
-                part.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            what, hint = f"the folder cannot be made: {error.strerror}", "choose another --out in a writable folder"
-            raise OutputError(what, where=str(self.folder), hint=hint) from error
+        for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
+            make_folder(part)
         for name, text in configs.items():
             write_text(self.config_file(name), text)
         files = {name: self.config_file(name) for name in configs}

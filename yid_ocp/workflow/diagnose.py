@@ -34,11 +34,7 @@ from yid_ocp.files import (
     write_text,
 )
 from yid_ocp.inference.smoother import smoothed_unknown_units
-from yid_ocp.inference.uncertainty import (
-    covariance_to_dict,
-    priors_that_determine_unknown,
-    unknowns_covariance_and_reduced_chi2,
-)
+from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -107,7 +103,6 @@ def run_diagnose(
             if len(refits):
                 log.warning("%d finished refits are in %s; the same command resumes them", len(refits), refits.file)
             raise
-        finding = replace(finding, summary=" ".join([finding.summary, *_sentences_on_prior_bound_effects(finding)]))
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
         prediction_outputs.write_diagnosis_hdf5(folder.path / "trajectories.h5", finding, predicted)
@@ -133,24 +128,6 @@ def run_diagnose(
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
     refits.delete_file()
     return CommandOutcome(folder.path, written, finding)
-
-
-def _sentences_on_prior_bound_effects(finding: DiagnosisResult) -> list[str]:
-    """One sentence per refitted effect whose amplitudes only the priors of nominal parameters determine."""
-    text = []
-    for fit in finding.single_effect_models:
-        if not isinstance(fit, RefittedModel) or fit.evaluation.jacobian is None:
-            continue
-        names, rows, own = fit.problem.unknown_names, fit.problem.residual_rows, fit.effects[-1]
-        data, priors = (fit.evaluation.jacobian[part] for part in (rows.data, rows.stated_priors))
-        others: dict[str, None] = {}
-        for name in own.amplitude_parameter_names:
-            by = priors_that_determine_unknown(data, priors, names.index(name))
-            others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
-        if others:
-            which = ", ".join(others)
-            text.append(f"These motions determine {own.label} only in relation to {which}: state one of them exactly.")
-    return text
 
 
 def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
@@ -254,11 +231,8 @@ def _held_out_predictions(finding: DiagnosisResult) -> list[EpisodeWithNominalAn
         problem_with_sensor_noise_only(fit.problem).predict_held_out(fit.problem.unknown_vector(fit.values))
         for fit in (finding.nominal_model, finding.final_model)
     )
-    return [
-        (episode, first, last)
-        for (episode, first), (_, last) in zip(before, after, strict=True)
-        if not isinstance(first, str) and not isinstance(last, str)
-    ]
+    pairs = ((episode, first, last) for (episode, first), (_, last) in zip(before, after, strict=True))
+    return [(e, first, last) for e, first, last in pairs if not isinstance(first, str) and not isinstance(last, str)]
 
 
 def _scenes(finding: DiagnosisResult, predicted: Sequence[EpisodeWithNominalAndEffectPredictions]) -> list[Animation]:

@@ -64,21 +64,12 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     about = f"{'An arm of position servos' if proposal.arm_mode == 'servo' else 'The arm'}, {where}, with a payload."
     about = about if item is None else f"A {arguments.object.replace('_', ' ')} moved by {where}."
     _write(out, _config_text(where, about, item, proposal, files, options), written)
-    result: dict[str, Any] = {
-        "format": "yid-init/1",
-        "configuration": str(out),
-        "recordings": files,
-        "proposal": asdict(proposal),
-    }
+    result: dict[str, Any] = {"format": "yid-init/1", "configuration": str(out), "recordings": files}
+    result["proposal"] = asdict(proposal)
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
-    doubts = [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]
-    print_result(
-        arguments,
-        result,
-        lambda: [*_summary_lines(proposal, out, recordings, result["picture"] is not None), *doubts],
-        f"configuration: {out}",
-        str(out),
-    )
+    lines = _summary_lines(proposal, out, recordings, result["picture"] is not None)
+    lines += [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]
+    print_result(arguments, result, lambda: lines, f"configuration: {out}", str(out))
     return EXIT_DONE
 
 
@@ -252,14 +243,11 @@ def _config_text(
     known: dict[str, Any] = {"about": about, "robot": robot, "item": item, "files": recordings, "imports": imports}
     known |= {"p": proposal, "sensors": _sensors(proposal), "motors": list(MOTOR_PRESETS)}
     known |= {"schema": _SCHEMA_FILE, "version": package_version()}
-    text = environment.get_template("init.yaml.jinja").render(
-        known | ({} if item is None else _of_object(item, proposal))
-    )
+    known |= {} if item is None else _of_object(item, proposal)
+    text, width = environment.get_template("init.yaml.jinja").render(known), _COMMENT_COLUMN - 2
     parts = (line.partition(_COMMENT_MARK) for line in text.splitlines())
-    return "".join(
-        f"{own.rstrip():<{_COMMENT_COLUMN - 2}}  # {comment}\n" if comment else f"{own.rstrip()}\n"
-        for own, _, comment in parts
-    )
+    lines = (f"{own.rstrip():<{width}}  # {comment}" if comment else own.rstrip() for own, _, comment in parts)
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _value(value: Any) -> str:
@@ -296,15 +284,10 @@ def _of_object(item: InitCommandObject, proposal: ProposedConfigChoices) -> dict
     of_points = [places for group, places in proposal.point_placements.items() if "." not in group]
     marked = [place for places in of_points for place in places if place.frame]
     wanted = dict.fromkeys([*tips, *(place.model_frame for place in marked), *proposal.grasps.values()])
-    return {
-        "dampings": [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")],
-        "uncertain": {
-            place.point: {"parent_frame": place.frame, "position_std": float(f"{place.position_std:.2g}")}
-            for place in marked
-            if place.position_std > 0
-        },
-        "points": wanted if set(wanted) > set(tips) else (),
-    }
+    unsure = [(place, float(f"{place.position_std:.2g}")) for place in marked if place.position_std > 0]
+    uncertain = {place.point: {"parent_frame": place.frame, "position_std": std} for place, std in unsure}
+    dampings = [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")]
+    return {"dampings": dampings, "uncertain": uncertain, "points": wanted if set(wanted) > set(tips) else ()}
 
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:

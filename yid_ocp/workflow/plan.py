@@ -251,8 +251,5 @@ def discrimination_plan_settings(
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]
-    return {
-        "goal": "information",
-        "effects_to_discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS],
-        "parameter_run_folder": str(folder),
-    }
+    asked = {"goal": "information", "effects_to_discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS]}
+    return asked | {"parameter_run_folder": str(folder)}

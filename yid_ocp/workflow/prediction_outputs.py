@@ -93,16 +93,14 @@ def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, fold
             note = f"{layout.name} {deformation}, {links} links; n links: times n/{links}"
             note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
             lines.append(f'<joint stiffness="{np.median(stiffness):.4g}"/> <!-- {note} -->')
+    labels = {n: n.replace("_", r"\_") for n in found}
+    rows = [rf"{labels[n]} & ${e.value:.4g} \pm {e.std:.2g}$ & {e.unit} \\" for n, e in found.items()]
     return {
         "values": [f"{n} = {e.value:.4g} ± {e.std:.2g} {e.unit}" for n, e in found.items()],
         "joints": joints,
         "yaml": ["parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
         "mjcf": lines,
-        "latex": [
-            re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row)
-            for n, e in found.items()
-            for row in [f"{n.replace('_', chr(92) + '_')} & ${e.value:.4g} \\pm {e.std:.2g}$ & {e.unit} \\\\"]
-        ],
+        "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
         "export": f"yid-ocp export {folder} --out model.xml",
         "cite": "CITATION.cff of yid_ocp, and Caldwell, Coleman and Correll (ISER 2014) for the problem",
     }

@@ -205,12 +205,8 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     estimated = parameter_values_by_effect_label(dict(zip(known.parameter_names, known.values, strict=True)))
     added = {label: {**said, **estimated.get(label, {})} for label, said in known.effects.items()}
-    freed = {
-        f"{label}.{quantity}": ParameterSettings(free=True)
-        for label in added
-        for quantity in estimated.get(label, ())
-        if label not in present
-    }
+    names = [f"{label}.{quantity}" for label in added if label not in present for quantity in estimated.get(label, ())]
+    freed = dict.fromkeys(names, ParameterSettings(free=True))
     return replace(settings_with_added_effects(run, added), parameters={**run.parameters, **freed})
 
 
@@ -288,13 +284,11 @@ def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
         own = attributes_by_name(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
         parameters[entry.name] = own | {"values": values}
     names = "name=run_name chi2 degrees=degrees_of_freedom p_value worst=worst_parameter"
+    names += " explains=is_fit_adequate distrusted=is_outlier"
     return {
         "format": "yid-history/1",
         **attributes_by_name(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
-        "runs": [
-            attributes_by_name(entry, f"{names} explains=is_fit_adequate distrusted=is_outlier")
-            for entry in found.run_outlier_tests
-        ],
+        "runs": [attributes_by_name(entry, names) for entry in found.run_outlier_tests],
         "parameters": parameters,
     }
 
@@ -305,17 +299,12 @@ def _have_same_recordings(folders: Sequence[Path]) -> bool:
     known = [{digest: path for path, digest in own.items() if has_native_recording_suffix(path)} for own in inputs]
     if not known[0].keys() & known[1].keys():
         return False
-    lacking = [
-        f"{Path(path).name} only in {folder}"
-        for folder, own, other in zip(folders, known, reversed(known), strict=True)
-        for digest, path in own.items()
-        if digest not in other
-    ]
+    lacking = []
+    for folder, own, other in zip(folders, known, reversed(known), strict=True):
+        lacking += [f"{Path(path).name} only in {folder}" for digest, path in own.items() if digest not in other]
     if lacking:
         what = f"the runs share some recordings but not all: {', '.join(lacking)}"
-        allowed = (
-            "two runs of the same recordings, to overlay them; or of recordings that do not overlap, for a history"
-        )
+        allowed = "two runs of the same recordings (overlaid), or of recordings that do not overlap (a history)"
         hint = "run one of them again with the other's `recordings`; a file that changed counts as another one"
         raise ConfigError(what, where="report", allowed=allowed, hint=hint)
     return True
@@ -350,15 +339,12 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in folders}
         folder.log_command_start(["report", *map(str, folders)])
-        written = folder.write_result_and_report(
-            settings,
-            progress,
-            told,
-            "overlay.json",
-            animations=_overlaid_motions(folders, labels, found),
-            section_data={"overlay": pairs},
-            robot=None if first is None else first.model.robot,
-        )
+        about: dict[str, Any] = {
+            "robot": None if first is None else first.model.robot,
+            "section_data": {"overlay": pairs},
+        }
+        about["animations"] = _overlaid_motions(folders, labels, found)
+        written = folder.write_result_and_report(settings, progress, told, "overlay.json", **about)
     return CommandOutcome(folder.path, written, None)
 
 

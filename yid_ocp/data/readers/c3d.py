@@ -117,12 +117,10 @@ def _markers(path: Path) -> _Markers:
     if not kept:
         what = "no labelled marker of the C3D file was ever seen"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
-    others = [
-        base.TopicOrColumnSummary(
-            labels[i] or f"marker {i + 1}", "marker", int(np.sum(~unseen[:, i])), rate, "", reason
-        )
-        for i, reason in why.items()
-    ]
+    others = []
+    for i, reason in why.items():
+        name, count = labels[i] or f"marker {i + 1}", int(np.sum(~unseen[:, i]))
+        others.append(base.TopicOrColumnSummary(name, "marker", count, rate, "", reason))
     others += [base.TopicOrColumnSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
     names, t = _short([labels[i] for i in kept]), np.arange(len(position)) / rate
     return _Markers(names, t, position[:, kept], unit, tuple(others))

@@ -222,12 +222,8 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     carrier = clamp.frame(START_CLAMP)
     turn = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], roll.symbol)
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
-    frames = {
-        **clamp.frames,
-        cable.main_branch_vertex_names[0]: carrier,
-        cable.main_branch_vertex_names[1]: tip,
-        _START_EDGE_FRAME: tip,
-    }
+    first, second = cable.main_branch_vertex_names[:2]
+    frames = {**clamp.frames, first: carrier, second: tip, _START_EDGE_FRAME: tip}
     return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
