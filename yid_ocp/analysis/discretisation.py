@@ -143,9 +143,8 @@ def predicted_refit_residual_at_finer_step(
         return None if isinstance(made, str) else made[1]
     start = refined._unknowns(coarse.unknown_names, x)
     before = fine.evaluate(start, False, at_x.equilibrium_guesses)
-    changed = (
-        before.residual - at_x.residual if before.ok and len(before.residual) == len(at_x.residual) else np.zeros(1)
-    )
+    is_alike = before.ok and len(before.residual) == len(at_x.residual)
+    changed = before.residual - at_x.residual if is_alike else np.zeros(1)
     if changed @ changed <= at_x.residual @ at_x.residual:
         return made[1]
     fitted = fine.evaluate(GaussNewton().minimize_cost(fine, start, None).x, False, at_x.equilibrium_guesses)

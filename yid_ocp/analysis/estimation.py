@@ -123,9 +123,8 @@ def _with_discretisation_errors(
     if solution.evaluation is None:
         return solution, EstimateChecksBeyondFit()
     kinds = problem.options.checked_discretisations
-    shifts, notes = discretisation.estimate_shifts_by_discretisation(
-        problem, solution.x, solution.evaluation, kinds, progress
-    )
+    fit = solution.x, solution.evaluation
+    shifts, notes = discretisation.estimate_shifts_by_discretisation(problem, *fit, kinds, progress)
     sizes = typical_parameter_magnitudes(problem, solution.x)
     inflated = discretisation.estimates_with_discretisation_error(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}

@@ -136,9 +136,8 @@ class _Motion:
 
     def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        momentum = course.model_functions.recorded_momentum_correction.momentum_derivative_by_previous_torque(
-            course.theta
-        )
+        shift = course.model_functions.recorded_momentum_correction
+        momentum = shift.momentum_derivative_by_previous_torque(course.theta)
         self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
         nu, count = len(errors.torque_std), len(errors.sample_of_step)
         known, pulled = np.tile(np.eye(nu), (count, 1, 1)), np.zeros((count, nu, nu))

@@ -325,9 +325,8 @@ class Issue:
     @property
     def certainty_word(self) -> str:
         """Certainty of the issue: `perhaps`, `likely` or `certain`."""
-        return (
-            "perhaps" if self.limit_violation_ratio < 1.5 else "likely" if self.limit_violation_ratio < 3 else "certain"
-        )
+        ratio = self.limit_violation_ratio
+        return "perhaps" if ratio < 1.5 else "likely" if ratio < 3 else "certain"
 
     @property
     def location_text(self) -> str:

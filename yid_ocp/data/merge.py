@@ -202,7 +202,6 @@ def _with_unique_names(recordings: Sequence[Recording], groups: Sequence[Sequenc
     made: list[PointGroup | SensorChannelGroup] = []
     for recording, own in zip(recordings, groups, strict=True):
         for group in own:
-            made.append(
-                group if names.count(group.name) == 1 else replace(group, name=f"{group.name}_{recording.name}")
-            )
+            is_unique = names.count(group.name) == 1
+            made.append(group if is_unique else replace(group, name=f"{group.name}_{recording.name}"))
     return tuple(made)

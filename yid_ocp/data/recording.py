@@ -497,9 +497,7 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
     if np.ndim(std) > 0:
         _check_shape(np.asarray(std), (count,), where, letters)
     good = np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD))
-    raise_data_error_unless(
-        good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", "leave it out if it is not known"
-    )
+    raise_data_error_unless(good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", "leave it out if unknown")
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:

@@ -411,9 +411,8 @@ class BlindCaseGenerator:
             "segment": tuple(segment.name for segment in system.segment_layouts),
             "grasp": tuple(grasp.name for grasp in system.grasps),
         }
-        kind = str(
-            rng.choice([kind for kind in OUT_OF_LIBRARY_FORCE_BUILDERS if places[_OUT_OF_LIBRARY_SIZES[kind][0]]])
-        )
+        kinds = [kind for kind in OUT_OF_LIBRARY_FORCE_BUILDERS if places[_OUT_OF_LIBRARY_SIZES[kind][0]]]
+        kind = str(rng.choice(kinds))
         place, low, high, part_of = _OUT_OF_LIBRARY_SIZES[kind]
         location = str(rng.choice(places[place]))
         size = float(rng.uniform(low, high))

@@ -443,9 +443,7 @@ _MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of
 def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
     """The numbers on which a diagnosis' rules are based; `rejudge_diagnosis_evidence` uses them to judge it again."""
     record, plain = result.record, to_lossless_plain_data
-    pairs = {
-        name: [[[e.label for e in both], decrease] for both, _, decrease in own] for name, own in record.pairs.items()
-    }
+    pairs = {name: [[[e.label for e in both], fall] for both, _, fall in own] for name, own in record.pairs.items()}
     candidates = {entry.effect.label: entry.effect for entry in result.screening.detectability}
     return {
         "format": _EVIDENCE_FORMAT,
@@ -471,9 +469,7 @@ def _refit_to_json(fit: RefitStatistics) -> dict[str, Any]:
 
 def _screening_to_json(screened: ScreeningResult) -> dict[str, Any]:
     labels, overlaps = screened.confusability.labels, screened.confusability.overlap_fractions
-    near = [
-        (i, j, overlaps[i, j]) for i, j in zip(*np.nonzero(overlaps >= _MIN_RECORDED_OVERLAP), strict=True) if i != j
-    ]
+    near = [(i, j, overlaps[i, j]) for i, j in np.argwhere(overlaps >= _MIN_RECORDED_OVERLAP) if i != j]
     scores = [{**vars(score), "effect": score.effect.label} for score in screened.candidate_scores]
     seen = {entry.effect.label: entry.is_detectable for entry in screened.detectability}
     return dict(to_lossless_plain_data({"labels": labels, "alike": near, "scores": scores, "detectable": seen}))

@@ -208,12 +208,10 @@ def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
     return high - low < _MIN_VISITED_PART * float(np.ptp((found.law.knots or {})[quantity]))
 
 
-def _neutral_law(
-    model: RefittedModel, place: str, quantities: Sequence[str], system: System | None = None
-) -> TorqueLaw:
+def _neutral_law(model: RefittedModel, place: str, names: Sequence[str], system: System | None = None) -> TorqueLaw:
     """A neutral law at a location, a sum over quantities, with knots over the visited range."""
     tables, zeros = [], np.zeros(_N_KNOTS)
-    for quantity in quantities:
+    for quantity in names:
         low, high = _visited_range(model, place, quantity)
         if quantity == "command":
             low, high = min(low, -high), max(high, -low)

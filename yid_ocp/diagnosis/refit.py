@@ -281,12 +281,10 @@ def restore_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedM
     return replace(fit, problem=own, evaluation=finish, cost=finish.cost) if finish.ok else fit
 
 
-def _model(
-    known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, finish: Evaluation
-) -> RefittedModel:
-    kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), finish.cost)
+def _model(known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation) -> RefittedModel:
+    kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
     loss = _held_out_loss(own, own.unknown_vector(known.values))
-    return RefittedModel(*kept, loss, len(finish.residual), own.has_process_noise, own, finish)
+    return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
 
 
 def _other_starts(

@@ -89,9 +89,7 @@ class _EncoderOffset(_DistortedReading):
     equation = "measured angle = true + offset"
     required_excitation = "its orientation to gravity"
     possible_locations = _recorded_joints
-    declared_parameters = (
-        ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured less true angle"),
-    )
+    declared_parameters = (ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured less true"),)
 
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["offset"]
@@ -104,9 +102,7 @@ class _SeriesElasticity(_DistortedReading):
     equation = "measured angle = q + effort/stiffness"
     required_excitation = "how hard it pulls at its ends"
     required_sensors = frozenset({"joints.position", "joints.effort"})
-    declared_parameters = (
-        base.compliance_parameter_definition("rad/(N m)", 0.02, (1 / 2000, 1 / 100), "gear", "N m/rad"),
-    )
+    declared_parameters = (base.compliance_parameter_definition("rad/(N m)", 0.02, (5e-4, 0.01), "gear", "N m/rad"),)
 
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["compliance"] * effort
@@ -241,9 +237,7 @@ class _EffortDelay(_LateTorque):
 
     equation = "the torque that acts at t was recorded at t - delay"
     possible_locations = _effort_arms
-    declared_parameters = (
-        ParameterDefinition("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late recorded torque acts"),
-    )
+    declared_parameters = (ParameterDefinition("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late the torque acts"),)
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         return self._lateness(channel, self.arm_joints, self["delay"])
@@ -308,9 +302,7 @@ class _SupplyVoltage(_ServoChange):
 
     equation = "torque = clip(scale gain (u - q), scale limit) - damping v"
     possible_locations = _dc_motor_joints
-    declared_parameters = (
-        ParameterDefinition("scale", "1", 1.0, 0.2, 5.0, (0.5, 1.5), "true over nominal supply voltage"),
-    )
+    declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 5.0, (0.5, 1.5), "true over nominal voltage"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         tightness = servo.torque_limit_tightness * self["scale"] ** -TORQUE_SATURATION_EXPONENT

@@ -65,9 +65,7 @@ class _Density(_ScaledBodies):
 
     equation = "masses and inertias times scale"
     possible_locations = base.segment_names
-    declared_parameters = (
-        ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on masses and inertias"),
-    )
+    declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on mass and inertia"),)
 
     def _joints(self, system: System) -> tuple[str, ...]:
         return tuple(joint for link in system.segment_layout(self.location).link_joints for joint in link)
@@ -274,9 +272,7 @@ class _RotorInertia(EffectBase):
     required_excitation = "how hard it accelerates"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.effort_limit_scaled_parameter_definition(
-            "armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"
-        ),
+        base.effort_limit_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "rotor inertia at the joint"),
     )
 
     def step_terms(self, state: MidpointState) -> EffectStepTerms:
@@ -333,9 +329,7 @@ class _GravityScale(EffectBase):
     equation = "V += -fraction x sum of m g.x over the object"
     required_excitation = "its orientation to gravity"
     possible_locations = _object
-    declared_parameters = (
-        ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "weight added over full weight"),
-    )
+    declared_parameters = (ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "added over full weight"),)
 
     def apply_to_system(self, system: System) -> System:
 

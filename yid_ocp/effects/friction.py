@@ -10,7 +10,7 @@ from typing import Literal
 import casadi as ca
 
 from yid_ocp.effects import base
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, effort_limit_scaled_parameter_definition
 from yid_ocp.model.system import Effect, EffectStepTerms, MidpointState, System
 
 SIGN_SMOOTHING_SPEED = 0.02
@@ -67,9 +67,7 @@ class _JointViscous(_JointFriction):
     """Viscous friction F = -b v of an arm joint, in addition to the model's damping."""
 
     equation = "F = -b v"
-    declared_parameters = (
-        base.effort_limit_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),
-    )
+    declared_parameters = (effort_limit_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["b"] * v
@@ -80,9 +78,7 @@ class _JointCoulomb(_JointFriction):
     """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s = `SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    declared_parameters = (
-        base.effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),
-    )
+    declared_parameters = (effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["tau_c"] * self._sign(v)
@@ -94,8 +90,8 @@ class _JointStribeck(_JointFriction):
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
-        base.effort_limit_scaled_parameter_definition(
-            "tau_s", "N m", 10.0, 2.0, "friction at low speed in addition to sliding friction"
+        effort_limit_scaled_parameter_definition(
+            "tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"
         ),
         ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
     )
@@ -122,10 +118,9 @@ class _JointLoadFriction(_JointFriction):
     def _load(self, state: MidpointState) -> ca.SX:
         """Torque through the gear [N m]."""
         system, index = state.system, state.system.mechanism.joint_index(self.location)
-        outside = system.weight_and_grasp_force_on_coordinate(state, index)
         if self.location not in system.driven:  # its motor is assumed to balance the external torque
-            return -2 * outside
-        return system.input_force(state.u, state.q, state.v)[index] - outside
+            return -2 * system.weight_and_grasp_force_on_coordinate(state, index)
+        return system.gear_torque_on_coordinate(state, index)
 
     def step_terms(self, state: MidpointState) -> EffectStepTerms:
         load = self._load(state)
@@ -157,7 +152,7 @@ class _JointPresliding(EffectBase):
     required_excitation = "how fast it moves"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
+        effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
         ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
     )
 
@@ -203,7 +198,7 @@ class _JointSpring(EffectBase):
     required_excitation = "how far it bends"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.effort_limit_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
+        effort_limit_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 

@@ -155,9 +155,7 @@ def _quantity(quantity: str, state: MidpointState, label: str, index: int) -> ca
         u, servo = _servo_input(state, index), system.servos[system.mechanism.joints[index].name]
         drag = servo.damping * state.v[index] if servo.motor_kind == "dc" else 0
         return ca.if_else(u < MOTOR_OFF_COMMAND / 2, servo.torque(u, state.q[index], state.v[index]) + drag, 0)
-    return system.input_force(state.u, state.q, state.v)[index] - system.weight_and_grasp_force_on_coordinate(
-        state, index
-    )
+    return system.gear_torque_on_coordinate(state, index)
 
 
 def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[str, ...]:

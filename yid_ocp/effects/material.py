@@ -86,9 +86,7 @@ class _StandardLinearSolid(_SegmentMemory):
 
     equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
     declared_parameters = (
-        ParameterDefinition(
-            "ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness of the branch over that of the spring"
-        ),
+        ParameterDefinition("ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness of branch over that of spring"),
         ParameterDefinition("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "of the branch", True),
     )
 

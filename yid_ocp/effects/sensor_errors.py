@@ -108,9 +108,7 @@ class _CameraLatency(_CameraEffect):
     required_excitation = "when it is read"
     required_sensors = frozenset()
     is_at_point_groups = True
-    declared_parameters = (
-        ParameterDefinition("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "how long ago the point was there"),
-    )
+    declared_parameters = (ParameterDefinition("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "how long ago it was there"),)
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:

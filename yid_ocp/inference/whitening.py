@@ -196,9 +196,8 @@ def _filter_steps(
         feedback = None
     elif feedback is not None:
         # momenta that the filter follows contain torques of the previous step
-        momentum = course.model_functions.recorded_momentum_correction.momentum_derivative_by_previous_torque(
-            course.theta
-        )
+        shift = course.model_functions.recorded_momentum_correction
+        momentum = shift.momentum_derivative_by_previous_torque(course.theta)
         driving = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
         # only errors of the filter's reference angles count; those of momenta average out
         shaken = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)

@@ -34,9 +34,8 @@ class Parameter:
             what, allowed = f"{self.name} = {self.value} is not a finite number", f"a finite number [{self.unit}]"
             raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed)
         if not self.lower <= self.value <= self.upper:
-            side, bound = (
-                ("below its lower", self.lower) if self.value < self.lower else ("above its upper", self.upper)
-            )
+            is_low = self.value < self.lower
+            side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)
             what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
             where, hint = f"parameter {self.name}", "change the value, or widen the bounds under `parameters`"
             raise ConfigError(what, where=where, allowed=f"{self.lower:g} to {self.upper:g} {self.unit}", hint=hint)

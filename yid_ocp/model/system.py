@@ -435,6 +435,11 @@ class System(ReprMixin):
             force -= ca.dot(slope, state.constraint_force)
         return force
 
+    def gear_torque_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
+        """Torque [N m or N] through the gear of a driven joint: input minus weight and grasps beyond."""
+        outside = self.weight_and_grasp_force_on_coordinate(state, index)
+        return self.input_force(state.u, state.q, state.v)[index] - outside
+
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Constraint residual phi(q) of all grasps, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))

@@ -183,9 +183,8 @@ def _size(effect: EffectBase) -> Array:
     known = np.array([effect.parameters[name].value - neutral[name] for name in effect.amplitude_parameter_names])
     if np.any(known):
         return known[:, None]
-    half = [
-        (effect.prior_ranges[name][1] - effect.prior_ranges[name][0]) / 2 for name in effect.amplitude_parameter_names
-    ]
+    ranges = (effect.prior_ranges[name] for name in effect.amplitude_parameter_names)
+    half = [(high - low) / 2 for low, high in ranges]
     return np.diag(half)
 
 
@@ -330,9 +329,8 @@ def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str,
     """Parameter precisions from the recordings, the plan and both, and the directions left unidentifiable."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
-    after = identifiability(
-        experiment.planned_estimation_problem(w).with_free_parameters_without_recompiling(problem.free)
-    )
+    planned = experiment.planned_estimation_problem(w)
+    after = identifiability(planned.with_free_parameters_without_recompiling(problem.free))
     shared = [name for name in problem.free if name not in problem.options.local_parameters]
     at = [[entry.parameter_names.index(name) for name in shared] for entry in (before, after)]
     both = sum(entry.fisher_information[np.ix_(i, i)] for entry, i in zip((before, after), at, strict=True))

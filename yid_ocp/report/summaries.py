@@ -116,13 +116,12 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         error, noise = (
             _rms([e[key][c] for e in entries for c in channels if c in e.get(key, {})]) for key in ("rmse", "expected")
         )
-        names = [
-            n for n in entries[0]["baselines"] if all(set(channels) <= set(e["baselines"].get(n, {})) for e in entries)
-        ]
-        guesses = {name: _rms([e["baselines"][name][c] for e in entries for c in channels]) for name in names}
+        known = [e["baselines"] for e in entries]
+        names = [n for n in known[0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
+        guesses = {name: _rms([own[name][c] for own in known for c in channels]) for name in names}
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
-        known = (error, fitted, noise, guesses.get(best or ""))
-        sizes = [" ".join(format_error_value_and_unit(x, unit)).rstrip() for x in known]
+        errors = (error, fitted, noise, guesses.get(best or ""))
+        sizes = [" ".join(format_error_value_and_unit(x, unit)).rstrip() for x in errors]
         guess = f", and {sizes[3]} without a model, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
         text = f"held-out errors of {group} are {sizes[0]} (rms), beside {sizes[1]} on the fitted recordings{guess}"
         if noise is None or error is None or fitted is None:

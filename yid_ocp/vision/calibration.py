@@ -105,9 +105,8 @@ def frame_stamp_delay(
         start = float(grid[int(np.argmin([_mean_square(one.normal_distance, len(few)) for one in met]))])
         if abs(start) > _MIN_STAMP_ERROR:
             other = _nearby(arm, origin, t, chosen, start)
-            trial = (
-                other if other.mean_square_distance < _MAX_BETTER_START_RATIO * trial.mean_square_distance else trial
-            )
+            if other.mean_square_distance < _MAX_BETTER_START_RATIO * trial.mean_square_distance:
+                trial = other
     return trial
 
 

@@ -293,9 +293,8 @@ class OcclusionMap:
                 for end, value in enumerate((low[axis], high[axis])):
                     strip = np.abs(seen[axis] - value) <= _EDGE_STRIP_WIDTH * (high[axis] - low[axis])
                     along = (seen[other, strip] - low[other]) / max(high[other] - low[other], 1e-12)
-                    pieces = np.unique(
-                        np.minimum((along * _EDGE_STRIP_PIECES).astype(np.int64), _EDGE_STRIP_PIECES - 1)
-                    )
+                    piece = np.floor(along * _EDGE_STRIP_PIECES)
+                    pieces = np.unique(np.minimum(piece, _EDGE_STRIP_PIECES - 1))
                     if len(pieces) / _EDGE_STRIP_PIECES > _DECIDING_FRACTION:
                         borders[end, axis] = value
         return borders
@@ -325,9 +324,8 @@ class OcclusionMap:
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
         """Whether a nearer surface hides the point from the projector or second camera."""
-        widest = (
-            _MAX_STEREO_BASELINE * (1.0 / max(float(distance.min()), _MIN_DEPTH) - 1.0 / limit) if limit > 0 else 0.0
-        )
+        nearest = max(float(distance.min()), _MIN_DEPTH)
+        widest = _MAX_STEREO_BASELINE * (1.0 / nearest - 1.0 / limit) if limit > 0 else 0.0
         if widest <= 0:
             return False
         around = np.asarray(tree.query_ball_point(asked, widest), dtype=np.int64)

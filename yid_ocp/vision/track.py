@@ -296,9 +296,8 @@ class FrameTracker:
         anywhere = self.make_shape_guess_finder is not None
         if anywhere and not reason and frame_selection.is_shape_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
-        other = (
-            fits[1] if len(fits) > 1 and fits[1].mean_distance < _RIVAL_SHAPE_RATIO * fits[0].mean_distance else None
-        )
+        is_rival = len(fits) > 1 and fits[1].mean_distance < _RIVAL_SHAPE_RATIO * fits[0].mean_distance
+        other = fits[1] if is_rival else None
         spent = work.report.cpu_seconds + time.process_time() - begun
         work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
         return work.report

@@ -120,9 +120,7 @@ def run_batch(
         try:
             run = load_config(member.config_file, member.overrides)
             # input files beside the settings; their content counts, not their path
-            inputs = [
-                Path(path) for path in sorted({str(path.absolute()) for path in input_files_by_name(run).values()})
-            ]
+            inputs = sorted({path.absolute() for path in input_files_by_name(run).values()})
             for path in inputs:
                 file_sha256(path)
         except YidError as error:

@@ -293,9 +293,8 @@ def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[s
     arms = {name.rpartition(".")[0] for name in parameters.names if name.endswith(".damping")}
     arms = {name for name in arms if parameters[f"{name}.damping"].description.endswith(f"of {name}")}  # no segments
     joints = arms if wanted is None else arms & set(wanted)
-    starts = tuple(
-        f"{kind}@{joint}." for kind in EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law] for joint in joints
-    )
+    kinds = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law]
+    starts = tuple(f"{kind}@{joint}." for kind in kinds for joint in joints)
     dampings = {f"{joint}.damping" for joint in joints}
     return [name for name in parameters.names if name in dampings or name.startswith(starts)]
 

@@ -211,9 +211,8 @@ def _refuse_losses(
     """Refuse a file that lacks effects, estimates or grasps of the model, unless losses are accepted."""
     lost = [label for label, entry in effects.items() if entry.is_lost]
     for name, entry in parameters.items():
-        is_lost = (
-            entry["estimated"] and name.rpartition(".")[0] not in effects and entry["status"] == "not representable"
-        )
+        is_own = name.rpartition(".")[0] not in effects
+        is_lost = entry["estimated"] and is_own and entry["status"] == "not representable"
         lost += [name] if is_lost else []
     lost += [f"grasp {name}" for name in grasps]
     if lost and not is_lossy:

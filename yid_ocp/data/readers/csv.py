@@ -28,9 +28,7 @@ from yid_ocp.sensors import CHANNEL_KINDS
 _AXES = ("x", "y", "z")
 _Meaning = tuple[str, str] | None
 """Meaning of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None if it is omitted."""
-_MOUNTED = [
-    channel for key in CHANNEL_KINDS if (channel := CHANNEL_KINDS[key]).components and channel.group != "points"
-]
+_MOUNTED = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
 _COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
 """Components of vectors measured by sensors on a link, such as `force_x`."""
 _MOST_BAD = 0.5  # fraction of bad lines above which the table is refused

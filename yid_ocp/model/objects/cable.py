@@ -319,6 +319,6 @@ model:
         return clamped_cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
 
     def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        return (
-            edge_length_parameter_values(self.topology(), edge_lengths) if self.has_edge_lengths_per_recording else {}
-        )
+        if not self.has_edge_lengths_per_recording:
+            return {}
+        return edge_length_parameter_values(self.topology(), edge_lengths)

@@ -75,6 +75,5 @@ model:
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         root = _FOOT_POSE if self.mount is None else None
-        return flexible_object(
-            self.segment_definitions(damping, link_division), root, "y_object", self.gravity_fraction
-        )
+        segments = self.segment_definitions(damping, link_division)
+        return flexible_object(segments, root, "y_object", self.gravity_fraction)

@@ -91,9 +91,8 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
 
 def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
     item = _SegmentedObject(named_segments=segments)
-    return InitCommandObject(
-        item, base.initial_parameters_with_comments(item.segment_definitions(), _RIGIDITY_RATIO[word])
-    )
+    start = base.initial_parameters_with_comments(item.segment_definitions(), _RIGIDITY_RATIO[word])
+    return InitCommandObject(item, start)
 
 
 def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:

@@ -72,9 +72,8 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
-        sentences.append(
-            f"With {names}, chi² per degree of freedom goes from {first:.3g} to {last:.3g} (one is noise alone)."
-        )
+        change = f"goes from {first:.3g} to {last:.3g} (one is noise alone)"
+        sentences.append(f"With {names}, chi² per degree of freedom {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
             errors = (" ".join(format_error_value_and_unit(*model[most])) for model in (before, after))
@@ -180,9 +179,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     for k in kept:
         spans = [f"{edges[j]:.2f} to {edges[j + 1]:.2f} s" for j in range(len(mean))]
         texts = [f"{names[k]}, {span}: {said(j, k)}" for j, span in enumerate(spans)]
-        rows.append(
-            TimeHeatMapRow(names[k], f"{groups[k].location} {groups[k].kind} [{units[k]}]", values[:, k], texts)
-        )
+        about = f"{groups[k].location} {groups[k].kind} [{units[k]}]"
+        rows.append(TimeHeatMapRow(names[k], about, values[:, k], texts))
     return figures.time_heat_map_figure(edges, rows, axis), sentence
 
 
