@@ -80,9 +80,7 @@ class _JointSpringSettings:
 
     stiffness: Annotated[float, Ge(0), OptionInfo("stiffness", "N m/rad or N/m")]
     rest_position: Annotated[float, OptionInfo("coordinate at which the spring has no torque", "rad or m")] = 0.0
-    damping: Annotated[
-        float | None, Ge(0), OptionInfo("viscous damping; default: model.damping", "N m s/rad or N s/m")
-    ] = None
+    damping: Annotated[float | None, Ge(0), OptionInfo("damping; default: model.damping", "N m s/rad or N s/m")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,9 +162,7 @@ class _ModelSettings:
             "null for an object held by the world or by clamps"
         ),
     ] = None
-    arms: Annotated[_JointActuationSettings, OptionInfo("joints of the robot and their drive")] = (
-        _JointActuationSettings()
-    )
+    arms: Annotated[_JointActuationSettings, OptionInfo("robot joints and their drive")] = _JointActuationSettings()
     frames: Annotated[
         Mapping[str, _FrameSettings],
         OptionInfo("additional frames on robot, object or world, by name, such as a tool tip or a marker"),
@@ -218,16 +214,12 @@ class RecordingsSettings:
 class ImportSettings:
     """Settings for the conversion of another tool's file by `import`. A command-line flag overrides its key here."""
 
-    joint_topics: Annotated[
-        _Names | None, OptionInfo("bag: topics of joint states, merged on one clock; default: all")
-    ] = None
+    joint_topics: Annotated[_Names | None, OptionInfo("bag: topics of joint states to merge; default: all")] = None
     command_topic: Annotated[
         str | None, OptionInfo("bag: topic of joint states whose positions are commands, not measurements")
     ] = None
     message_fields: Annotated[_Texts, OptionInfo("bag: /TOPIC.FIELD of an array in a message, by joint channel")] = None
-    joints: Annotated[
-        _Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; default: all")
-    ] = None
+    joints: Annotated[_Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in order; default: all")] = None
     point_names: Annotated[
         _Texts, OptionInfo("point, such as cable:40%, by its source: topic, TOPIC:FRAME of /tf, marker or column stem")
     ] = None
@@ -242,9 +234,7 @@ class ImportSettings:
     ] = None
     has_header: Annotated[bool | None, OptionInfo("table: whether the first row has names (else 1, 2, ...)")] = None
     skip_bad_lines: Annotated[bool | None, OptionInfo("table: whether lines that are not numbers are skipped")] = None
-    delimiter: Annotated[
-        str | None, OptionInfo("table: character between cells; default: detected in the first line")
-    ] = None
+    delimiter: Annotated[str | None, OptionInfo("table: character between cells; default: from the first line")] = None
     units: Annotated[
         _Texts,
         OptionInfo(
@@ -256,9 +246,7 @@ class ImportSettings:
         _Numbers, OptionInfo("torque per current by joint or pattern, if efforts are motor currents", "N m/A")
     ] = None
     gear_ratios: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
-    clock_offsets: Annotated[
-        _Numbers, OptionInfo("several files: time added to the times of each, by file stem", "s")
-    ] = None
+    clock_offsets: Annotated[_Numbers, OptionInfo("several files: added to times of each, by file stem", "s")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
     clock_kind: Annotated[ClockKind | None, OptionInfo("table: whether its times were measured")] = None
     point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None
@@ -314,9 +302,7 @@ class DiagnosisSettings(Thresholds):
     ] = 1.0
     baseline_run_folders: Annotated[
         tuple[_FilePath, ...],
-        OptionInfo(
-            "run folders of `solve` or `diagnose` with the same model; the diagnosis reports what changed since"
-        ),
+        OptionInfo("run folders of `solve` or `diagnose` with the same model; a diagnosis reports what changed since"),
     ] = ()
 
     @property
@@ -357,9 +343,7 @@ class _VirtualFramesSettings:
 
     seed: Annotated[int, Ge(0), OptionInfo("random seed of motion, noise and camera")] = 0
     duration: Annotated[float, Gt(0), Le(600), OptionInfo("duration of the experiment", "s")] = 5.0
-    max_gripper_travel: Annotated[
-        float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
-    ] = 0.11
+    max_gripper_travel: Annotated[float, Gt(0), Le(1), OptionInfo("largest gripper distance from start", "m")] = 0.11
     gripper_start_from_object_end: Annotated[
         Mapping[str, _Vector3], OptionInfo("start relative to the end of the undeformed object, by grasp", "m")
     ] = field(default_factory=dict)
@@ -378,18 +362,14 @@ class _TrackSettings:
 
     frames_path: Annotated[
         _FilePath | None,
-        OptionInfo(
-            "folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"
-        ),
+        OptionInfo("folder of clouds or depth images, bag, MCAP or RealSense file; virtual frames when absent"),
     ] = None
     frame_topic: Annotated[str | None, OptionInfo("topic of the clouds or depth images, if a bag has several")] = None
     camera_pose: Annotated[
         tuple[_Vector4, _Vector4, _Vector4, _Vector4] | None,
         OptionInfo("pose of the camera (x right, y down, z ahead) in the world, by rows; default: the folder's", "m"),
     ] = None
-    point_cloud_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("unit of the clouds; default: the folder's")] = (
-        None
-    )
+    point_cloud_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("unit of clouds; default: the folder's")] = None
     background_frames_path: Annotated[
         _FilePath | None,
         OptionInfo("frames of the scene without robot and object from the same camera pose, whose points are removed"),

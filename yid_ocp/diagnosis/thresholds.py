@@ -63,17 +63,11 @@ class Thresholds(SmootherThresholds):
         float, Ge(0), Le(1), OptionInfo("fraction of the smoother's decrease that effects must reach")
     ] = 0.75
     # where the gap lies
-    gap_window_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero that mark a window of the gap")] = (
-        3.0
-    )
-    informed_fraction: Annotated[
-        float, Ge(0), Lt(1), OptionInfo("1 - posterior/prior variance of an informed value")
-    ] = 0.5
+    gap_window_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero that mark a gap window")] = 3.0
+    informed_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("1 - posterior/prior variance, if informed")] = 0.5
 
     # events
-    inverse_dynamics_rtol: Annotated[
-        float, Ge(0), Lt(1), OptionInfo("relative torque error allowed for a good model")
-    ] = 0.03
+    inverse_dynamics_rtol: Annotated[float, Ge(0), Lt(1), OptionInfo("relative torque error of a good model")] = 0.03
     max_event_duration: Annotated[float, Gt(0), OptionInfo("largest duration of an event", "s")] = 1.0
     min_force_event_gap_fraction: Annotated[
         float, Ge(0), Lt(1), OptionInfo("smallest fraction of the gap that force events must remove")

@@ -112,9 +112,7 @@ class MotorOptions:
             "recordings state it (`proportional_gain`)"
         ),
     ] = "ideal"
-    preset: Annotated[
-        _MotorPreset | None, OptionInfo("dc motor whose published data are initial values and priors")
-    ] = None
+    preset: Annotated[_MotorPreset | None, OptionInfo("dc motor with published initial values and priors")] = None
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.kind != "dc":

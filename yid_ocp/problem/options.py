@@ -112,9 +112,7 @@ class ProblemOptions:
         Len(1),
         OptionInfo("gains of the filter `proportional`, for one arm or for all driven joints", "N m/rad"),
     ] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
-    weighting: Annotated[ResidualWeightingName, OptionInfo("residual weights; paper: Caldwell et al. (2014)")] = (
-        "whitened"
-    )
+    weighting: Annotated[ResidualWeightingName, OptionInfo("residual weights; paper: Caldwell et al.")] = "whitened"
     huber_threshold: Annotated[
         float,
         Gt(0),

@@ -39,15 +39,12 @@ class SensorOptions:
     std: Annotated[
         _Positive | Mapping[str, _Positive] | None,
         OptionInfo(
-            "noise standard deviation instead of the recorded one, by name if values differ, in the channel's unit",
-            "m, rad, N m, ...",
+            "noise standard deviation in place of the recorded one, by name if values differ", "m, rad, N m, ..."
         ),
     ] = None
     frame_by_recorded_name: Annotated[
         Mapping[str, str],
-        OptionInfo(
-            "model frame of a point, or T1:40%, or of a wrist sensor or IMU, if its name differs from the recorded name"
-        ),
+        OptionInfo("model frame of a point (or T1:40%), wrist sensor or IMU whose name differs from the recorded one"),
     ] = field(default_factory=dict)
     used_points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; default: all points of the model")] = None
     bias_std: Annotated[

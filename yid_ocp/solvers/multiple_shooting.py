@@ -87,9 +87,7 @@ class MultipleShooting(SolverWithCheckedSettings):
 
     condensing: Annotated[
         bool,
-        OptionInfo(
-            "whether node states are condensed onto the parameters, at the cost of single shooting, instead of IPOPT"
-        ),
+        OptionInfo("whether node states are condensed onto the parameters, at the cost of single shooting; else IPOPT"),
     ] = False
     node_interval: Annotated[
         int | None,

@@ -77,7 +77,7 @@ class ArmSensorNoise:
     point_std: float = 1e-3
     records_effort_std: bool = True
     position_resolution: float = 0.0  # step of the encoders, which count after the noise; none at zero [rad]
-    lost_sample_fraction: float = 0.0  # fraction of the joints' samples that are lost, never the first or last two
+    lost_sample_fraction: float = 0.0  # fraction of joint samples that are lost, never the first or last two
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,9 +98,7 @@ class VirtualArmOptions:
     period_jitter_std: Annotated[
         float, Ge(0), Le(2e-3), OptionInfo("standard deviation of the controller's and recorder's tick times", "s")
     ] = 5e-4
-    lost_sample_fraction: Annotated[
-        float, Ge(0), Le(0.2), OptionInfo("fraction of the joints' samples that are lost")
-    ] = 0.01
+    lost_sample_fraction: Annotated[float, Ge(0), Le(0.2), OptionInfo("fraction of joint samples that are lost")] = 0.01
 
 
 @dataclass(frozen=True)

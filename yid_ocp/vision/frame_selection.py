@@ -60,10 +60,7 @@ class TrackOptions:
     ] = ()
     max_mean_surface_distance_in_radii: Annotated[
         PositiveFloat,
-        OptionInfo(
-            "a frame is dropped if the mean distance of its points from the fitted shape, beyond noise, is larger; "
-            "in tube radii"
-        ),
+        OptionInfo("mean distance of points from the shape, beyond noise, that drops a frame; in tube radii"),
     ] = 0.5
     min_covered_visible_length_fraction: Annotated[
         UnitIntervalFloat,

@@ -61,9 +61,7 @@ class CableBranchProperties:
     twist_rigidity: float = 1.0e-3
     bend_damping: float = 5e-5
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
-    linear_density: Annotated[float, Gt(0), OptionInfo("mass per length; results are proportional to it", "kg/m")] = (
-        0.05
-    )
+    linear_density: Annotated[float, Gt(0), OptionInfo("mass per length; results scale with it", "kg/m")] = 0.05
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,7 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 class FlexibleSegmentSettings:
     """Settings of one segment of rigid links. Stiffness and damping are set in `parameters`."""
 
-    length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed if link_lengths is given", "m")] = (
-        None
-    )
+    length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed with link_lengths", "m")] = None
     mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]
     radius: Annotated[
         float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; alternative: cross_section_size", "m")
@@ -50,9 +48,7 @@ class FlexibleSegmentSettings:
     stiffness_given_as_rigidity: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
-    has_length_parameter_per_link: Annotated[bool, OptionInfo("whether every link has its own length parameter")] = (
-        False
-    )
+    has_length_parameter_per_link: Annotated[bool, OptionInfo("whether each link has its own length parameter")] = False
 
     def _build_segment(self, name: str, damping: float, link_division: int) -> FlexibleSegment:
         """Build the segment `name`. Links are divided into `link_division` links at equal segment stiffness."""
