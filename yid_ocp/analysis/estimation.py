@@ -324,9 +324,8 @@ def _predict_held_out_with_expected_errors(
                 white = errors.torque_std * samples[errors.sample_of_step]
                 bias = errors.torque_bias + errors.torque_bias_std * rng.standard_normal(len(errors.torque_std))
                 moved = replace(errors, torque_bias=bias, torque_noise=errors.torque_noise + white)
-                drawn.append(
-                    predict(replace(episode, input_errors=moved), theta, offset, False, outcome.equilibrium_guess)
-                )
+                other = replace(episode, input_errors=moved)
+                drawn.append(predict(other, theta, offset, False, outcome.equilibrium_guess))
         expected[episode.name] = _expected_errors(episode, outcome, drawn)
     return pairs, expected
 

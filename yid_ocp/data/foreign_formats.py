@@ -142,9 +142,7 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
             columns.setdefault(names[i], range(i, i + 3))
     table = _numbers(body, len(axes), where)
     unit = _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
-    notes = [
-        "Motive's y axis points up unless the export said otherwise: `pose` or model.frames turn it to the robot's z"
-    ]
+    notes = ["Motive's y axis is up unless the export said otherwise: `pose` or model.frames turn it to the robot's z"]
     if len({names[i] for i in range(2, min(len(names), len(axes)))} - {""}) > len(columns):
         notes.append("what has no position was left out")
     return _made(table[:, 1], columns, table, unit, "OptiTrack", notes, where)

@@ -486,9 +486,8 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
-        raise_data_error_unless(
-            np.isfinite(values).all(), "a value is not finite", f"{where}/{quantity}", "finite numbers"
-        )
+        is_finite = bool(np.isfinite(values).all())
+        raise_data_error_unless(is_finite, "a value is not finite", f"{where}/{quantity}", "finite numbers")
     for name, std in stds.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
@@ -510,9 +509,7 @@ def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str
     # a file lists its groups by name, so other orders are not stored
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    raise_data_error_unless(
-        first is groups[0], what, where, "groups of points sorted by name", "sort the groups by name"
-    )
+    raise_data_error_unless(first is groups[0], what, where, "groups of points sorted by name", "sort them by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
@@ -544,9 +541,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
     what = f"the time at index {next(iter(bad), 0)} is {group.t[next(iter(bad), 0)]}"
-    raise_data_error_unless(
-        bad.size == 0, what, f"{where}/t", "finite numbers [s]", "remove this sample from every channel"
-    )
+    raise_data_error_unless(bad.size == 0, what, f"{where}/t", "finite numbers [s]", "remove it from every channel")
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])

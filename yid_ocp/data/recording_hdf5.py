@@ -148,9 +148,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object", where, allowed)
     notes = _json(texts["notes"] or "[]", f"{origin}, attribute notes")
     good = isinstance(notes, list) and all(isinstance(note, str) for note in notes)
-    raise_data_error_unless(
-        good, "the JSON text is not a list of text", f"{origin}, attribute notes", '["sentence", ...]'
-    )
+    raise_data_error_unless(good, "the JSON is not a list of text", f"{origin}, attribute notes", '["sentence", ...]')
     said = texts["description"], texts["source"], path.stem, digest, truth, straight, tuple(notes)
     return Recording(joints, tuple(points), *said, tuple(channels))
 
@@ -268,9 +266,8 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
     else:
         what = answer[1:]
     if what:
-        allowed = (
-            f"an undamaged {noun} file of at most {files.MAX_INPUT_NUMBERS / 1e6:.0f} million numbers, without links"
-        )
+        most = f"{files.MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
+        allowed = f"an undamaged {noun} file of at most {most}, without links"
         hint = "copy it again from its source; if the copy fails as well, export or import the original data again"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
 

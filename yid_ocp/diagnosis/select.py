@@ -261,9 +261,8 @@ def select_effects(
             dearest_first = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
             fits = list({fit.effects[-1].label: fit for fit in dearest_first}.values())
         if len(base) == 1:
-            fits += refit_with_each_effect(
-                search, (), _pairs_to_refit(search, alone, base[0]), nominal.values, "together"
-            )
+            pairs = _pairs_to_refit(search, alone, base[0])
+            fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
         # an effect of implausible size would correct errors of earlier effects
         fits = [fit for fit in fits if not base or all(_is_plausible(e, fit, limits) for e in _beside(base, fit))]
         near = _near_best_models(nominal, fits, limits) if fits else []

@@ -268,9 +268,7 @@ def _largest_evidences(models: _Models, variance: _Variances, sources: _Groups) 
     """`_largest_evidence` of several groups, each on top of the same variances."""
     if not sources:
         return []
-    bases = map_in_threads(
-        lambda model: _forwards(model, model.smoothed_unknown_prior_variances(variance), True), models
-    )
+    bases = map_in_threads(lambda m: _forwards(m, m.smoothed_unknown_prior_variances(variance), True), models)
     return map_in_threads(lambda source: _largest_evidence(bases, source), sources)
 
 

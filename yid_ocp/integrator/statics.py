@@ -130,8 +130,8 @@ class EquilibriumSolver:
                 best = (False, 0.0, error, w)
                 break
             inner = w[count - nz : count]
-            q = ca.DM(self._configuration(w, given))
-            energy = float(self._energy(q, inner, hold, theta)) if converged else error
+            placed = ca.DM(self._configuration(w, given))
+            energy = float(self._energy(placed, inner, hold, theta)) if converged else error
             if best is None or (not converged, energy) < best[:2]:
                 best = (not converged, energy, error, w)
         assert best is not None

@@ -409,9 +409,7 @@ def solve_equilibrium_at_point_target(
         limits = f", with {names} at the joint's limit" if names else ""
         what = f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
         where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in target)} m in the world)"
-        hint = (
-            "choose a nearer target, a smaller plan.point_target_offset_from_start, or other plan.start_joint_positions"
-        )
+        hint = "use a nearer target, a smaller plan.point_target_offset_from_start, or other plan.start_joint_positions"
         raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest
 

@@ -241,9 +241,8 @@ class SplineMotionExperiment:
         for samples, rows in zip(problem.episodes[0].measurements, problem.residual_rows.measurements[0], strict=True):
             if not samples.sensor.effort_joints:
                 continue
-            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[
-                samples.positive_weight_mask
-            ]
+            columns = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)
+            joint = columns[samples.positive_weight_mask]
             for i, (name, size) in enumerate(std.items()):
                 own = np.where(joint == samples.sensor.effort_joints.index(name), size, 0.0)
                 found[rows, i] = samples.decorrelate(own * samples.weight[samples.positive_weight_mask])
@@ -320,9 +319,7 @@ def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:
-        what = (
-            f"a motion of {duration:g} s is too short for efforts that are low-pass filtered at {low_pass.cutoff:g} Hz"
-        )
+        what = f"a motion of {duration:g} s is too short for efforts low-pass filtered at {low_pass.cutoff:g} Hz"
         allowed = f"plan.duration + plan.hold_duration above {least:.2g} s"
         hint = "set a longer plan.duration, or raise problem.path_cutoff"
         raise ConfigError(what, where="plan.duration", allowed=allowed, hint=hint)

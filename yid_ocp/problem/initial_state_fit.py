@@ -82,9 +82,8 @@ class InitialStateFitter:
         )
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self.fitted_parameters))
         kinematics = forward_kinematics(system.mechanism, e.q1)
-        aligned = ca.vertcat(
-            ca.SX(0, 1), *(grasp.holder_minus_held_axis_directions(kinematics) for grasp in system.grasps)
-        )
+        apart = (grasp.holder_minus_held_axis_directions(kinematics) for grasp in system.grasps)
+        aligned = ca.vertcat(ca.SX(0, 1), *apart)
         internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
         held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]

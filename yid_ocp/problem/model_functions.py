@@ -246,9 +246,8 @@ class TimeGridStateValues:
         """Compute the values at all nodes of a trajectory (K, nx). Loads and constraint forces default to zero."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
-        v, a = (
-            rate(q, nodes, step.time_step) for rate in (central_difference_velocity, second_difference_acceleration)
-        )
+        rates, h = (central_difference_velocity, second_difference_acceleration), step.time_step
+        v, a = (rate(q, nodes, h) for rate in rates)
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
         return TimeGridStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
 

@@ -79,9 +79,8 @@ def _draw_rates(
         if known:
             values, low, high = ([own[key] for own in known.values()] for key in ("rate", "low", "high"))
             bars = asymmetric_error_bars(values, low, high)
-            axes.errorbar(
-                list(known), values, yerr=[bars["arrayminus"], bars["array"]], marker="o", capsize=3, label=label
-            )
+            spread = [bars["arrayminus"], bars["array"]]
+            axes.errorbar(list(known), values, yerr=spread, marker="o", capsize=3, label=label)
     axes.grid(alpha=0.3)
     if any(curves.values()):
         axes.legend(loc=legend_place)

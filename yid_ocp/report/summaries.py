@@ -319,9 +319,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield f"start {result['best'] + 1} of {len(starts)} is the most informative: {more}"
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     yield f"what limits it: {'; '.join(reached)}" if reached else "it reaches no limit"
-    yield from (
-        f"{name}: no motion, no sensor sees it to first order; {what}" for name, what in result["unseen"].items()
-    )
+    yield from (f"{n}: no motion, no sensor sees it to first order; {what}" for n, what in result["unseen"].items())
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"left open by this motion: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:

@@ -98,9 +98,8 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
     if arm:
-        what = (
-            f"the encoders and the points '{arm[0]}' on the arm are both used, but the points follow from the encoders"
-        )
+        both = f"the encoders and the points '{arm[0]}' on the arm are both used"
+        what = f"{both}, but the points follow from the encoders"
         allowed, hint = "one of the two", f"set sensors.{arm[0]}.use: false, or leave the encoders out"
         raise ConfigError(what, where="sensors.joints.position.use", allowed=allowed, hint=hint)
     where = around.recording.name

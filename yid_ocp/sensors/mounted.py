@@ -77,9 +77,8 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
         if not tree.has_frame(frame) or tree.frame(frame).joint_index < 0:
             is_known = tree.has_frame(frame)
             moving = [known for known, entry in tree.frames.items() if entry.joint_index >= 0]
-            what = (
-                f"sensor '{name}' is on the frame '{frame}', which {'does not move' if is_known else 'does not exist'}"
-            )
+            why = "does not move" if is_known else "does not exist"
+            what = f"sensor '{name}' is on the frame '{frame}', which {why}"
             hint = f"set sensors.{key}.frame_by_recorded_name: {{{name}: FRAME}}, or sensors.{key}.use: false"
             raise DataError(what, where=where, **(unknown_name_error_arguments(frame, moving) | {"hint": hint}))
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in channel.std_attribute_names]

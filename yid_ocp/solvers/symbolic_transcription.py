@@ -256,9 +256,8 @@ class _Maker:
         """The program, with a guess near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
         nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
-        found = guess_unknowns_and_node_states(
-            problem, nodes, x, partial(mean_square_residual_without_efforts, problem)
-        )
+        error = partial(mean_square_residual_without_efforts, problem)
+        found = guess_unknowns_and_node_states(problem, nodes, x, error)
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.append_values(x[:shared], low[:shared], high[:shared])
         self._w.name_indices("theta", theta[:, None], problem.shared_parameters)
@@ -266,9 +265,8 @@ class _Maker:
         residuals: list[ResidualTerm] = []
         at_ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
         for i, episode in enumerate(problem.episodes):
-            at = problem.unknowns.unknown_indices_affecting_recording(i)[
-                shared : shared + len(problem.local_parameters)
-            ]
+            last = shared + len(problem.local_parameters)
+            at = problem.unknowns.unknown_indices_affecting_recording(i)[shared:last]
             local = self._w.append_values(x[at], low[at], high[at])
             self._w.name_indices(f"local[{episode.name}]", local[:, None], problem.local_parameters)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}

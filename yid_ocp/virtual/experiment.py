@@ -39,9 +39,7 @@ from yid_ocp.vision.frames import look_at_pose
 _Generators = Mapping[str, np.random.Generator]
 
 # each sensor has its own random stream, so removing one changes no other; the order is part of the seed
-_RANDOM_STREAMS = (
-    *("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias", "clock"),
-)
+_RANDOM_STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias", "clock")
 _CAMERA_DIRECTION = np.array([0.93, 0.0, 0.37])  # direction from the object to the camera
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 

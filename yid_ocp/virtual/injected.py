@@ -463,9 +463,7 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
         (0.0, _WALL_DISTANCE, 0.0), lambda size, way: np.array([0.0, -size * max(-way[1], 0.0), 0.0])
     ),
     # springs that soften while the motion lasts, by this fraction in all
-    "stiffness_drift": _in_motion(
-        _spring_law(lambda size, angle, stiffness, t: size * t / _DRIFT_TIME * stiffness * angle)
-    ),
+    "stiffness_drift": _in_motion(_spring_law(lambda size, angle, k, t: size * t / _DRIFT_TIME * k * angle)),
     "one_way_damping": _one_way_damping,  # bends that are damped in one direction only [N m s/rad]
     "saturating_drive": _saturating_drive,  # limits the torque, whatever the command and the record [N m]
     # viscous friction that fades while the gear warms up [N m s/rad]

@@ -330,9 +330,8 @@ class _Calibrator:
         if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):
             return None
         at, towards = points[:, :2] / points[:, 2:], own[:, :2] / own[:, 2:]
-        kept = points[
-            ((at > towards.min(axis=0) - _VIEW_MARGIN) & (at < towards.max(axis=0) + _VIEW_MARGIN)).all(axis=1)
-        ]
+        low, high = towards.min(axis=0) - _VIEW_MARGIN, towards.max(axis=0) + _VIEW_MARGIN
+        kept = points[((at > low) & (at < high)).all(axis=1)]
         return CalibrationFrame(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
     def _start(self, glimpses: Sequence[CalibrationFrame]) -> CalibrationState:
@@ -340,9 +339,8 @@ class _Calibrator:
         few = []
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
-            few.append(
-                CalibrationFrame(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False))
-            )
+            drawn = self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)
+            few.append(CalibrationFrame(stamp, drawn))
         tried = candidate_calibration_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")

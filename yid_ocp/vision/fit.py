@@ -256,9 +256,8 @@ class ShapeFitter:
         keep = ~(evidence.is_contested | evidence.is_foreign)
         if on_points and keep.any():
             last = self._minimise(last, self._tasks(sight, left[0], keep)[1])
-            evidence = shape_evidence.fit_quality_and_point_classes(
-                self.tube_links_at_configuration(last.q), sight, near
-            )
+            tubes = self.tube_links_at_configuration(last.q)
+            evidence = shape_evidence.fit_quality_and_point_classes(tubes, sight, near)
         return last, evidence
 
     @property

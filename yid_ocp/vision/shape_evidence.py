@@ -175,9 +175,8 @@ def fit_quality_and_point_classes(
     for i, k in enumerate(tubes.free_end_links):
         ends[i], behind_tip = _end_offset(tubes, k, seen, gate)
         beyond |= behind_tip
-    part = _things(
-        tree, ~on_shape & ~beyond, _MAX_LINK_SPACINGS * spacing, 4 * float(tubes.radius.min()) ** 2 / spacing**2
-    )
+    least = 4 * float(tubes.radius.min()) ** 2 / spacing**2
+    part = _things(tree, ~on_shape & ~beyond, _MAX_LINK_SPACINGS * spacing, least)
     foreign = part >= 0
     contact = _contacts(tree, seen, on_shape | beyond, foreign, _MAX_LINK_SPACINGS * spacing)
     contested = np.zeros(len(on_shape), bool)
@@ -392,6 +391,5 @@ class FrameShapeFit(ShapeFitQuality):
     @property
     def visible_length_coverage(self) -> float:
         """Fraction of the shape's visible length with points."""
-        return self.covered_fraction_of_visible_links(
-            np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
-        )
+        lengths = np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
+        return self.covered_fraction_of_visible_links(lengths)

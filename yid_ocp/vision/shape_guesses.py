@@ -62,9 +62,8 @@ class _Centerline:
     def outward_direction(self, end: int) -> Array:
         """Unit vector (3,) along the object at one of its ends, away from it."""
         far, _ = self.path_lengths_from(end)
-        near = np.flatnonzero(
-            (far > 0) & (far <= max(_END_DIRECTION_SLICES * self.slice_width, float(far[far > 0].min())))
-        )
+        most = max(_END_DIRECTION_SLICES * self.slice_width, float(far[far > 0].min()))
+        near = np.flatnonzero((far > 0) & (far <= most))
         way = self.nodes[end] - self.nodes[near].mean(axis=0)
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 

@@ -400,9 +400,8 @@ def tube_link_lengths_and_radii(
     """Link lengths and radius [m] of every tube, by segment name."""
     segments, theta = system.segment_layouts, system.parameters.vector(values)
     sizes = [ca.densify(ca.vertcat(*segment.link_lengths, segment.radius)) for segment in segments]
-    numbers = [
-        np.array(entry).ravel() for entry in ca.Function("sizes", [system.parameters.symbols], sizes).call([theta])
-    ]
+    found = ca.Function("sizes", [system.parameters.symbols], sizes).call([theta])
+    numbers = [np.array(entry).ravel() for entry in found]
     return {s.name: (entry[:-1], float(entry[-1])) for s, entry in zip(segments, numbers, strict=True)}
 
 

@@ -178,9 +178,8 @@ def _clamped_system(run: RunSettings, item: ObjectBetweenClamps, kind: str) -> S
         what = f"the lengths of a {kind} are computed from recordings, but none is listed"
         raise run.config_error(what, "recordings", "estimate", allowed="one or more", hint="add a recording")
     with add_setting_location_to_errors(run, "model", "object"):
-        return item.build_system_with_clamps(
-            typical_point_pair_distances(item.topology().edge_vertex_names, recordings), run.model.gravity
-        )
+        lengths = typical_point_pair_distances(item.topology().edge_vertex_names, recordings)
+        return item.build_system_with_clamps(lengths, run.model.gravity)
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:

@@ -63,9 +63,8 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     chosen = build.settings_by_parameter_name(run, parameters)
     for name in run.problem.initial_state_fit_parameters:
         if name not in parameters:
-            raise unknown_name_error(
-                run, "parameter", name, parameters.names, "problem", "initial_state_fit_parameters"
-            )
+            where = ("problem", "initial_state_fit_parameters")
+            raise unknown_name_error(run, "parameter", name, parameters.names, *where)
     sensors = dict(run.sensors)
     groups = [group for recording in recordings for group in recording.points]
     if build.arms_are_estimated_states(run):
@@ -136,9 +135,7 @@ def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> No
         of_arm = i in driven or name in run.model.arms.passive_joints
         if not of_arm and driven.intersection(tree.ancestor_joint_indices(i)):
             what = f"{name} of the object moves on a driven arm, whose tracking filter needs the arm's own momentum"
-            hint = (
-                "set model.arms.mode: prescribed; or hold the object by `model.grasp` instead of `model.object.mount`"
-            )
+            hint = "set model.arms.mode: prescribed; or hold the object by `model.grasp`, not by `model.object.mount`"
             allowed = "a driven arm that holds its object by a grasp"
             raise run.config_error(what, "model", "object", "mount", allowed=allowed, hint=hint)
 

@@ -250,9 +250,8 @@ def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]
 
         class TimesAndStage(ProgressColumn):
             def render(self, task: rich.progress.Task) -> Text:
-                text = Text(
-                    f"{_format_duration(task.elapsed or 0.0)}{left.of_command()}: {task.description}", no_wrap=True
-                )
+                spent = _format_duration(task.elapsed or 0.0)
+                text = Text(f"{spent}{left.of_command()}: {task.description}", no_wrap=True)
                 text.truncate(max(console.width - _BAR_WIDTH - 2, 1), overflow="ellipsis")
                 return text
 

@@ -110,9 +110,8 @@ def run_diagnose(
             write_text(folder.path / "law.csv", torque_law_tables_csv(finding.law.tables))
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
-        moving = not last.problem.options.clamp_pose_definitions_from_points and bool(
-            system.driven or system.prescribed
-        )
+        follows_points = bool(last.problem.options.clamp_pose_definitions_from_points)
+        moving = not follows_points and bool(system.driven or system.prescribed)
         x = last.problem.unknown_vector(last.values)
         own = {
             "model": _final_model_to_dict(finding),

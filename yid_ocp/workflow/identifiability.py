@@ -109,9 +109,7 @@ def run_identifiability(
             told = {
                 "config": folder.path / "config.yaml",
                 # further inputs of the results
-                "inputs": sorted(
-                    {p.absolute() for name, p in input_files_by_name(run).items() if name != "configuration"}
-                ),
+                "inputs": sorted({p.absolute() for n, p in input_files_by_name(run).items() if n != "configuration"}),
                 "x": None if solution is None else fisher.unknowns_from_solution(problem, solution).tolist(),
                 "remembers": problem is whole,
                 "start": asked.start_knowledge,

@@ -147,9 +147,7 @@ def solution_to_result_dict(
         "seconds": solution.wall_time,
         "fit": asdict(solution.goodness_of_fit) | {"worse_than_guess": worse},
         "residuals": residuals,
-        "held_out": [
-            entry | {"expected": dict(expected.get(entry["recording"], {}))} for entry in errors[: len(held_out)]
-        ],
+        "held_out": [e | {"expected": dict(expected.get(e["recording"], {}))} for e in errors[: len(held_out)]],
     }
 
 

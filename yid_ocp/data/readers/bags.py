@@ -193,9 +193,8 @@ def read_bag(
     groups, notes = _joints(bag, options, str(path))
     seen = _named_places(bag, options.point_names, str(path))
     if not groups and not seen and not bag.mounted:
-        allowed = (
-            f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}, or fields of any: --field position=/TOPIC.FIELD"
-        )
+        kinds = ", ".join((*_KNOWN, _TREES[0]))
+        allowed = f"topics of the types {kinds}, or fields of any: --field position=/TOPIC.FIELD"
         raise bag.file.no_usable_topics_error("the bag has no joint states and no points", allowed)
     places = [message for entries in seen.values() for _, message in entries]
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]

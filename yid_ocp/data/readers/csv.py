@@ -381,15 +381,10 @@ def _given_meaning(column: str, given: str, where: str) -> _Meaning:
     known = (*JOINT_CHANNEL_UNITS, *_AXES, *_COMPONENTS)
     if not name or kind not in known:
         what = f"the meaning '{given}' of column '{column}' is unknown"
-        allowed = (
-            f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with the name of a joint, point or sensor and the kind "
-        )
-        allowed += ", ".join(known)
-        hint = (
-            f"{column}={kind}:NAME"
-            if kind in known
-            else nearest_name_question(kind, known) or f"{column}=position:JOINT"
-        )
+        allowed = f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with the name of a joint, point or sensor and the "
+        allowed += f"kind {', '.join(known)}"
+        hint = nearest_name_question(kind, known) or f"{column}=position:JOINT"
+        hint = f"{column}={kind}:NAME" if kind in known else hint
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
 

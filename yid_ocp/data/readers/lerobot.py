@@ -132,10 +132,8 @@ def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None
     what = f"the unit of the joint positions is unknown: they reach {widest:.3g}{of}"
     allowed, hint = "--units deg, or --units position=rad", "--units deg"
     if widest <= _MAX_NORMALISED:
-        hint = (
-            "--units deg if the robot was recorded with use_degrees=true. Otherwise the values are normalised to the "
-        )
-        hint += "calibrated range (-100 to 100) and cannot be converted: record again with use_degrees=true"
+        hint = "--units deg if the robot was recorded with use_degrees=true. Otherwise the values are normalised to "
+        hint += "the calibrated range (-100 to 100) and cannot be converted: record again with use_degrees=true"
     raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 

@@ -116,9 +116,8 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
         allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
         hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
         raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
-    length, mass, radius = base.required_object_numbers(
-        "each branch of a tree", numbers, base.SIZE_AND_MASS_DESCRIPTIONS
-    )
+    wanted = base.SIZE_AND_MASS_DESCRIPTIONS
+    length, mass, radius = base.required_object_numbers("each branch of a tree", numbers, wanted)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="a whole number from 1 to 16")

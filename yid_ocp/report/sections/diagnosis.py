@@ -289,9 +289,8 @@ def _library_curves(table: TorqueLawTable, at: Array) -> dict[str, Array]:
     for name, shape in shapes.items():
         columns = np.column_stack(shape(table.knots)) * weight[:, None]
         amplitudes = np.linalg.lstsq(columns, table.torque * weight, rcond=None)[0]
-        error = float(np.sum((columns @ amplitudes - table.torque * weight) ** 2)) / max(
-            len(weight) - len(amplitudes), 1
-        )
+        square = float(np.sum((columns @ amplitudes - table.torque * weight) ** 2))
+        error = square / max(len(weight) - len(amplitudes), 1)
         if error < best[0]:
             best = error, {f"nearest of the library: {name}": np.column_stack(shape(at)) @ amplitudes}
     return best[1]

@@ -13,7 +13,7 @@ import numpy as np
 
 from yid_ocp.analysis.compare import MethodsComparisonResult
 from yid_ocp.arrays import Array
-from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, Recording
 from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -41,13 +41,8 @@ _ESTIMATE_COLORS = {
     "estimate that cannot be trusted": figures.LINE_COLORS[1],
 }
 _ESTIMATED, _HELD_OUT = "estimated on", "held out"
-_JOINT_CHANNEL_UNITS = {
-    "position": ("rad", "m"),
-    "velocity": ("rad/s", "m/s"),
-    "effort": ("N m", "N"),
-    "position_command": ("rad", "m"),
-}
-"""Units of a revolute and of a prismatic joint."""
+_JOINT_CHANNELS = ("position", "velocity", "effort", "position_command")
+_PRISMATIC_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}  # by the unit of a revolute joint
 
 
 @register_report_section("verdict", 0, "What was found")
@@ -92,9 +87,8 @@ def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
     solution = findings.solution
     if solution is None or len(solution.history) < 2:
         return None
-    figure = figures.solution_cost_history_figure(
-        [h.cost for h in solution.history], [h.note for h in solution.history]
-    )
+    steps = solution.history
+    figure = figures.solution_cost_history_figure([h.cost for h in steps], [h.note for h in steps])
     return {"solution": solution, "finite": math.isfinite(solution.cost), "figure": figure}
 
 
@@ -199,7 +193,8 @@ def _joint_channel_unit(system: System | None, names: Sequence[str], channel: st
     """Unit of a joint channel, or both; joints unknown to the system count as revolute."""
     kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
     is_prismatic = {kinds.get(name) == "prismatic" for name in names} or {False}
-    return ", ".join(_JOINT_CHANNEL_UNITS[channel][kind] for kind in sorted(is_prismatic))
+    unit = JOINT_CHANNEL_UNITS[channel]
+    return ", ".join(_PRISMATIC_UNITS[unit] if kind else unit for kind in sorted(is_prismatic))
 
 
 class _PredictedEpisode(NamedTuple):
@@ -311,7 +306,7 @@ def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
     recordings: Sequence[Recording] = findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
     for recording, group in ((own, group) for own in recordings for group in own.joint_and_point_groups):
         if isinstance(group, JointGroup):
-            for channel in _JOINT_CHANNEL_UNITS:
+            for channel in _JOINT_CHANNELS:
                 values = group.values_by_channel.get(channel)
                 if values is not None:
                     words, unit = channel.replace("_", " "), _joint_channel_unit(system, group.names, channel)
