@@ -70,8 +70,8 @@ def run_plan(
             "planned", [ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)]
         )
         result = _motion_result(run, found, source) | told
-        known = {"animations": [scene], "section_data": {"plan": found}}
-        written = folder.write_result_and_report(run, progress, result, **known)
+        shown: dict[str, Any] = {"animations": [scene], "section_data": {"plan": found}}
+        written = folder.write_result_and_report(run, progress, result, **shown)
     return CommandOutcome(folder.path, written, found, found.is_successful)
 
 

@@ -58,8 +58,8 @@ def read_c3d(
     digest = file_sha256(path)
     found = _markers(path)
     own = {"points": found.unit} if found.unit else {}
-    own = found.names, found.t, found.position
-    group = PointGroup("points", *own, None, point_sensor_name, point_frame, None, "nominal")
+    marked = found.names, found.t, found.position
+    group = PointGroup("points", *marked, None, point_sensor_name, point_frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
     options = base.SelectionAndUnitOptions(point_names=point_names, units={**own, **(units or {})})
