@@ -151,7 +151,7 @@ def test_the_values_of_a_twin_are_found_from_its_vertices(real, twin_options, ca
     before = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)["twin"]
     solution = solve(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
-    problem = problem.with_free_parameters(free, dict(zip(free, solution.x, strict=True)))
+    problem = EstimationProblem(step, [recording], free, settings, dict(zip(free, solution.x, strict=True)))
     solution = solve(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
     after = real.point_rmse_by_recording(problem, solution.x, cable.unclamped_vertex_names)["twin"]

@@ -89,14 +89,8 @@ def add_intervals_and_checks(
     held_out, expected = _predict_held_out_with_expected_errors(problem, solution.x)
     problem = _with_equilibrium_guesses(problem, (), [outcome for _, outcome in held_out])
     solution, issues = _checked_solution_and_issues(problem, solution, held_out)
-    checks = replace(
-        checks,
-        data_std=data_std,
-        held_out_predictions=tuple(held_out),
-        expected_prediction_errors=expected,
-        data_issues=issues,
-        step_stability=stability,
-    )
+    checks = replace(checks, data_std=data_std, data_issues=issues, step_stability=stability)
+    checks = replace(checks, held_out_predictions=tuple(held_out), expected_prediction_errors=expected)
     return replace(solution, checks=checks, problem=problem)
 
 
@@ -241,15 +235,13 @@ def _moving(problem: EstimationProblem) -> list[int]:
 def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int]) -> float:
     """Root mean square of the whitened residuals of recordings, each predicted by parameters from the other ones."""
     guesses = None if solution.evaluation is None else solution.evaluation.equilibrium_guesses
-    evaluation = problem.evaluate(solution.x, equilibrium_guesses=guesses)
-    assert evaluation.jacobian is not None
+    fitted = problem.evaluate(solution.x, equilibrium_guesses=guesses)
+    assert fitted.jacobian is not None
     total, count = 0.0, 0
     for i in moving:
         own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.residual_rows.measurements[i]])
-        kept = np.setdiff1d(np.arange(len(evaluation.residual)), own)
-        step = size_limited_damped_step(
-            problem, solution.x, evaluation.jacobian[kept], evaluation.residual[kept], 1e-10
-        )
+        kept = np.setdiff1d(np.arange(len(fitted.residual)), own)
+        step = size_limited_damped_step(problem, solution.x, fitted.jacobian[kept], fitted.residual[kept], 1e-10)
         x = np.clip(solution.x + step, *problem.bounds)
         parts = problem.theta_and_initial_state_deviation(x, i)
         found = problem.predictor.predict_episode(problem.episodes[i], *parts, False)

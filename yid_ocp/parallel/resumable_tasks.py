@@ -368,15 +368,13 @@ def _dask_executor(
 
 def _client(distributed: Any, where: dict[str, str]) -> Any:
     """A Dask client; several attempts, because a busy machine may not start its event loop within ten seconds."""
-    for attempt in range(1, _MAX_CLIENT_STARTS + 1):
-        try:
-            return distributed.Client(**where, timeout=_CONNECT_TIMEOUT, set_as_default=False)
-        except AssertionError:
-            if attempt == _MAX_CLIENT_STARTS:
-                raise
-            log.info("Dask's event loop did not start; it is tried again")
+    settings = {**where, "timeout": _CONNECT_TIMEOUT, "set_as_default": False}
+    for _ in range(_MAX_CLIENT_STARTS - 1):
+        with contextlib.suppress(AssertionError):
+            return distributed.Client(**settings)
+        log.info("Dask's event loop did not start; it is tried again")
         gc.collect()
-    return None
+    return distributed.Client(**settings)
 
 
 def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | None) -> None:

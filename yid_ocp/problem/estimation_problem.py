@@ -445,18 +445,8 @@ class EstimationProblem(ReprMixin):
         """Problem with another multivariate prior. Filters are kept."""
         return self._changed(options=replace(self.options, multivariate_prior=prior))
 
-    def with_free_parameters(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
-        """Problem with other free parameters and, if given, other parameter values, prepared anew."""
-        options = replace(
-            self.options,
-            local_parameters=tuple(name for name in self.options.local_parameters if name in free),
-            prior_stds={name: std for name, std in self.options.prior_stds.items() if name in free},
-            multivariate_prior=self.options.multivariate_prior.restricted_to(free),
-        )
-        return self._prepared(values, free=free, options=options)
-
-    def _prepared(self, values: Mapping[str, float] | None = None, **changes: Any) -> EstimationProblem:
-        known = dict(zip(self.system.parameters.names, self.theta, strict=True)) | dict(values or {})
+    def _prepared(self, **changes: Any) -> EstimationProblem:
+        known = dict(zip(self.system.parameters.names, self.theta, strict=True))
         estimated, held_out = ([episode.recording for episode in group] for group in (self.episodes, self.held_out))
         same = {"recordings": estimated, "free": self.free, "options": self.options, "held_out": held_out}
         return EstimationProblem(self.step, values=known, **{**same, **changes})

@@ -159,12 +159,10 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         ("expected calibration error", _number(result["calibration"]["expected_calibration_error"], ".3f")),
         ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
     ]
-    sizes: TableRows = [
-        ("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")
-    ]
+    seen: TableRows = [("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
-        sizes.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
+        seen.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
     experiments: TableRows = [("experiment", "cases", "not judged", "false alarms", "right")]
     for name, own in result["experiments"].items():
         counts = (str(own["cases"]), str(own.get("not_judged", 0)))
@@ -180,7 +178,7 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         place = (", ".join(entry["confusable"]) or "-", "right" if entry["location_first"] else "-")
         shares = (_share(entry["closure"]), _share(entry["best"]))
         cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
-    tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Probabilities": sure_of}
+    tables = {"Score": marks, "Detection by size": seen, "Experiments": experiments, "Probabilities": sure_of}
     tables["Cases"] = cases
     if (rescored := result.get("rescored")) is not None:
         head = ("case", "truth", "then", "now")

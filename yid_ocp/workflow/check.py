@@ -99,10 +99,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
         except ValueError as error:
             warnings.append(f"{path.name} cannot be compared, Pinocchio does not read it: {error}")
     warnings += [entry.words for entry in found.values() if not entry.agrees_within_rounding]
-    return {
-        name: {**asdict(entry), "agrees": entry.agrees_within_rounding, "words": entry.words}
-        for name, entry in found.items()
-    }
+    return {n: {**asdict(e), "agrees": e.agrees_within_rounding, "words": e.words} for n, e in found.items()}
 
 
 def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings: list[str]) -> dict[str, Any]:
@@ -115,14 +112,9 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             "std": float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
-    entry: dict[str, Any] = {
-        "recording": episode.name,
-        "role": role,
-        "duration": recording.duration,
-        "steps": episode.grid.steps,
-        "groups": {group.name: _group(group) for group in recording.all_groups},
-        "noise": noise,
-    }
+    groups = {group.name: _group(group) for group in recording.all_groups}
+    entry: dict[str, Any] = {"recording": episode.name, "role": role, "duration": recording.duration}
+    entry |= {"steps": episode.grid.steps, "groups": groups, "noise": noise}
     rate = 1.0 / problem.step.time_step
     if arm is not None:
         recorded = 1.0 / float(np.median(np.diff(arm.t)))

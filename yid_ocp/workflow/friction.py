@@ -74,15 +74,10 @@ def _law_result(
 ) -> dict[str, Any]:
     mean, error = mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)
     difference, paired = friction_law_comparison.prediction_error_difference_and_std_error(fit, best, kinds)
-    return {
-        "mean_error": mean,
-        "standard_error": error,
-        "left_out_errors": dict(fit.left_out_errors),
-        "beyond_warranted": difference,
-        "beyond_warranted_standard_error": paired,
-        "converged": fit.is_converged,
-        "parameters": {name: asdict(entry) for name, entry in fit.parameters.items()},
-    }
+    result = {"mean_error": mean, "standard_error": error, "left_out_errors": dict(fit.left_out_errors)}
+    result |= {"beyond_warranted": difference, "beyond_warranted_standard_error": paired}
+    parameters = {name: asdict(entry) for name, entry in fit.parameters.items()}
+    return {**result, "converged": fit.is_converged, "parameters": parameters}
 
 
 run_from_arguments = make_settings_command(_run_friction)

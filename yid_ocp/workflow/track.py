@@ -230,11 +230,9 @@ def _camera_scene(run: RunSettings, system: System) -> SceneModel:
 
 
 def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames_path"]) -> FrameSequence:
-    said = run.track
+    own = run.track
     with add_setting_location_to_errors(run, "track", key):
-        return read_frames(
-            getattr(said, key), pose=said.camera_pose, unit=said.point_cloud_unit, topic=said.frame_topic
-        )
+        return read_frames(getattr(own, key), pose=own.camera_pose, unit=own.point_cloud_unit, topic=own.frame_topic)
 
 
 def _read_joints(run: RunSettings) -> Recording | None:
