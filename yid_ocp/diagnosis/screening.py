@@ -143,7 +143,9 @@ def _candidate_detectable_amplitudes(
         sizes = np.where(np.diag(information) > 1e-16, z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
         room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
         amplitudes = dict(zip(names, map(float, sizes), strict=True))
-        found.setdefault(effect.label, []).append(CandidateDetectability(effect, amplitudes, bool(np.any(sizes < room))))
+        found.setdefault(effect.label, []).append(
+            CandidateDetectability(effect, amplitudes, bool(np.any(sizes < room)))
+        )
     return tuple(
         min(own, key=lambda e: (not e.is_detectable, min(e.detectable_amplitudes.values()))) for own in found.values()
     )
@@ -177,9 +179,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 
 
 def _score_candidates(
-    point: AllCandidatesLinearization,
-    series: Sequence[ResidualChannel],
-    visible: Sequence[CandidateDetectability],
+    point: AllCandidatesLinearization, series: Sequence[ResidualChannel], visible: Sequence[CandidateDetectability]
 ) -> tuple[CandidateScore, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}

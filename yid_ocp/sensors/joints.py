@@ -131,14 +131,7 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
 
 
 def filtered_effort_measurements(
-    inputs: SensorDataInputs,
-    sensor: JointSensor,
-    t: Array,
-    values: Array,
-    std: Array,
-    bias: Array,
-    *,
-    is_sample: bool,
+    inputs: SensorDataInputs, sensor: JointSensor, t: Array, values: Array, std: Array, bias: Array, *, is_sample: bool
 ) -> SensorData:
     """Low-pass filter an effort sensor's measurements and thin them until their noise is nearly independent.
 
