@@ -37,7 +37,7 @@ def system(urdf_folder):
     return System.build(robot, prescribed=list(JOINTS), damping=dict.fromkeys(JOINTS, DAMPING))
 
 
-def moved(folder, torque, seed, seconds=6.0):
+def moved(folder, torque, seed, seconds=4.0):
     """A recording of a known motion whose efforts are Pinocchio's inverse dynamics less a torque at the elbow."""
     model = pin.buildModelFromUrdf(str(folder / "double_pendulum.urdf"))
     data, still, rng = model.createData(), pin.neutral(model), np.random.default_rng(seed)

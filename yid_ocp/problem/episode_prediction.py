@@ -109,12 +109,19 @@ class EpisodePredictor:
         return own
 
     def initial_state_of_episode(
-        self, episode: Episode, theta: Array, offset: Array, names: tuple[str, ...], guess: Array | None = None
+        self,
+        episode: Episode,
+        theta: Array,
+        offset: Array,
+        names: tuple[str, ...],
+        guess: Array | None = None,
+        inputs: CorrectedInputs | None = None,
     ) -> InitialStateWithSensitivity:
         """Initial state of an episode's rollout, with derivatives with respect to the parameters `names` and `offset`.
 
         `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `guess`
         (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy).
+        `inputs` are the corrected inputs of `theta` and `names`, if known.
         """
         nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
@@ -123,7 +130,7 @@ class EpisodePredictor:
         if episode.fixed_initial_state is not None:
             state, by_theta = episode.fixed_initial_state.state.copy(), np.zeros((nx, len(names)))
         else:
-            inputs = self.corrected_inputs(episode, theta, names)
+            inputs = inputs or self.corrected_inputs(episode, theta, names)
             first = inputs.first_torque if self.system.driven else None
             near = episode.equilibrium_guess if guess is None else guess
             known, statics = inputs.initial_known_coordinates, self.model_functions.equilibrium_solver
@@ -160,14 +167,20 @@ class EpisodePredictor:
         return bool(self.system.driven) and not self.system.servos and self.options.arm_tracking_feedback == "lqr"
 
     def corrected_inputs_with_effect_momentum(
-        self, episode: Episode, theta: Array, names: tuple[str, ...], state: Array, by_unknowns: Array | None = None
+        self,
+        episode: Episode,
+        theta: Array,
+        names: tuple[str, ...],
+        state: Array,
+        by_unknowns: Array | None = None,
+        inputs: CorrectedInputs | None = None,
     ) -> CorrectedInputs:
         """Corrected inputs of an episode, with the momentum that effects add to the tracking filter's reference.
 
         `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative with respect to `names` and the
-        offset.
+        offset. `inputs` are the corrected inputs of `theta` and `names`, if known.
         """
-        inputs = self.corrected_inputs(episode, theta, names)
+        inputs = inputs or self.corrected_inputs(episode, theta, names)
         if not self._follows_momenta:
             return inputs
         rows = slice(2 * self.system.n_coordinates, None)
@@ -250,11 +263,12 @@ class EpisodePredictor:
         """Initial state and inputs of an episode's rollout, or an error message."""
         wanted = self.unknowns.free_parameter_names if derivatives else ()
         theta = self.theta_with_episode_values(episode, theta)
-        start = self.initial_state_of_episode(episode, theta, offset, wanted, guess)
+        inputs = self.corrected_inputs(episode, theta, wanted)
+        start = self.initial_state_of_episode(episode, theta, offset, wanted, guess, inputs)
         if start.failure_message:
             return start.failure_message
         by_start = start.state_sensitivity
-        inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, start.state, by_start)
+        inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, start.state, by_start, inputs)
         feedback, driven = episode.tracking_feedback_about_smoothed_motion, self.system.actuated_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
@@ -429,10 +443,10 @@ class EpisodePredictor:
         by_lam = by_multipliers if np.any(by_multipliers) else None
         partials = (by_state, by_lam, by_effort)
         by_inputs = self.integrator_step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
-        start = self.initial_state_of_episode(episode, theta, offset, wanted, result.equilibrium_guess)
-        inputs = self.corrected_inputs_with_effect_momentum(
-            episode, theta, wanted, start.state, start.state_sensitivity
-        )
+        inputs = self.corrected_inputs(episode, theta, wanted)
+        start = self.initial_state_of_episode(episode, theta, offset, wanted, result.equilibrium_guess, inputs)
+        known = start.state, start.state_sensitivity, inputs
+        inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, *known)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
         by_torque = inputs.nominal_torque_derivatives(feedback, self.system.actuated_coordinate_indices, len(own))
         if by_torque is not None:
