@@ -61,7 +61,7 @@ description: A double pendulum, moved as measured.
 model:
   robot: {urdf}
   arms: {{mode: prescribed}}
-  springs:
+  joint_springs:
     shoulder: {{stiffness: 1.0, rest_position: 0.2}}
 recordings:
   estimate: [recording.h5]
@@ -90,7 +90,7 @@ PIECES = (
 SETTINGS = (
     "problem.time_step",
     "problem.path_cutoff",
-    "model.springs.shoulder.stiffness",
+    "model.joint_springs.shoulder.stiffness",
     "model.robot",
     "model.locked",
     "solver.max_iterations",

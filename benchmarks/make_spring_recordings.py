@@ -73,7 +73,7 @@ def recording(name: str, motor: str, points: tuple[str, ...], truth: dict[str, f
     made = f"Statics in closed form; white noise of {1e3 * NOISE:g} mm on every coordinate of a point, seed {seed}."
     return Recording(
         JointGroup((motor,), t, course(t)[:, None], position_std=0.0),
-        (PointGroup("points_camera", points, frames, seen, NOISE, sensor="camera", pose=np.eye(4)),),
+        (PointGroup("points_camera", points, frames, seen, NOISE, sensor_name="camera", camera_pose=np.eye(4)),),
         made,
         "yid_ocp closed-form statics",
         name,

@@ -267,8 +267,8 @@ def in_camera(recording: Recording) -> Recording:
     """Points in the frame of the camera that saw them."""
     made = []
     for group in recording.points:
-        if group.pose is not None:
-            back = np.linalg.inv(group.pose)
+        if group.camera_pose is not None:
+            back = np.linalg.inv(group.camera_pose)
             group = replace(group, position=group.position @ back[:3, :3].T + back[:3, 3])
         made.append(group)
     return replace(recording, points=tuple(made))

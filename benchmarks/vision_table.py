@@ -166,7 +166,7 @@ class Played:
         names = tuple(grasp.held_frame for grasp in self.system.grasps)
         seen = self.points[:, [self.system.point_frames.index(name) for name in names]]
         noise = 1e-3 * np.random.default_rng([seed, 6]).standard_normal(seen.shape)
-        return PointGroup("points_arm", names, self.t, seen + noise, 1e-3, sensor="arm")
+        return PointGroup("points_arm", names, self.t, seen + noise, 1e-3, sensor_name="arm")
 
 
 def played(

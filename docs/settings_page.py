@@ -142,9 +142,9 @@ model:
   grasp:
     right: {holder_frame: right_gripper, held_frame: w_T3, kind: axis, held_frame_rpy: [0.0, 1.5708, 0.0]}    # [rad]
 """,
-    "model.springs.NAME": """\
+    "model.joint_springs.NAME": """\
 model:
-  springs:
+  joint_springs:
     elbow: {stiffness: 12.0, rest_position: 0.3, damping: 0.1}    # [N m/rad], [rad], [N m s/rad]
 """,
     "model.effects": """\

@@ -24,7 +24,7 @@ description: A double pendulum, moved as measured.
 model:
   robot: {urdf}
   arms: {{mode: prescribed}}
-  springs:
+  joint_springs:
     shoulder: {{stiffness: 1.0, rest_position: 0.2}}
 recordings:
   estimate: [{estimate}]

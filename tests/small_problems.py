@@ -112,7 +112,7 @@ def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
         pose[:3, 3] = [0.0, 2.0, 0.5]
         shot = np.array([0.0, 0.1, 0.7]) + 0.05 * rng.standard_normal((7, 2, 3))
         shot[2, 1] = np.nan
-        more = {"std": np.full(shot.shape, 0.05), "sensor": "camera", "pose": pose}
+        more = {"std": np.full(shot.shape, 0.05), "sensor_name": "camera", "camera_pose": pose}
         groups.append(seen(["lower", "tip"], at, shot, "points_camera", **more))
     return Recording(group, tuple(groups), name=name or f"run_{seed}")
 

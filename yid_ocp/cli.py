@@ -195,7 +195,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--skip-bad-lines", action="store_const", const=True, help=text)
     group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: character between cells")
     group.add_argument("--episode", type=int, metavar="NUMBER", help="episode of a LeRobot dataset; 0 when absent")
-    group.add_argument("--clock-kind", choices=("recorded", "nominal"), help="of a table: whether times were measured")
+    group.add_argument("--recorded-or-nominal-times", choices=("recorded", "nominal"), help="of a table: kind of times")
     group.add_argument("--point-sensor-name", metavar="TEXT", help="name of the sensor of the points")
     group.add_argument("--point-frame", metavar="TEXT", help="reference frame of points, of a table or C3D file")
 

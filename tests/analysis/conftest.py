@@ -35,11 +35,15 @@ def golden_problem(request, golden, paper_systems):
         )
         held = [1] if name == "single" else [1, 2]
         free = [i for i in range(3) if i not in held]
-        groups = [PointGroup("points_arm", [f"w_T{i + 1}" for i in held], t[1:], trep.w[:, held], 1e-3, sensor="arm")]
+        groups = [
+            PointGroup("points_arm", [f"w_T{i + 1}" for i in held], t[1:], trep.w[:, held], 1e-3, sensor_name="arm")
+        ]
         if vision:
             at = np.arange(33, len(t), 33)
             names, seen = [f"w_T{i + 1}" for i in free], trep.w[at - 1][:, free]
-            groups.append(PointGroup("points_camera", names, t[at], seen, 5e-3, sensor="camera", pose=np.eye(4)))
+            groups.append(
+                PointGroup("points_camera", names, t[at], seen, 5e-3, sensor_name="camera", camera_pose=np.eye(4))
+            )
         start = np.concatenate([trep.q[0], trep.p[0]])
         options = ProblemOptions(
             arm_tracking_feedback="proportional", known_initial_states={"golden": start}, path_cutoff=math.inf
@@ -78,7 +82,9 @@ def pendulum(urdf_folder):
     step = compile_step(system, 0.01)
     t = 0.01 * np.arange(201)
     path = 0.6 * np.sin(2 * np.pi * 0.7 * t) * np.sin(np.pi * t / 2) ** 2
-    camera = PointGroup("points_camera", ["tip"], t[::4], np.zeros((51, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    camera = PointGroup(
+        "points_camera", ["tip"], t[::4], np.zeros((51, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
+    )
     empty = Recording(JointGroup(["shoulder"], t, path[:, None], position_std=0.0), (camera,), name="twin")
 
     def build(recording: Recording | None = None, values: dict[str, float] | None = None) -> EstimationProblem:
@@ -105,7 +111,7 @@ def held_tube(tmp_path_factory):
     t = 0.02 * np.arange(101)
     ramp = np.sin(np.pi * t / 4) ** 2
     path = np.stack([0.15 * ramp, 0.58 - 0.06 * ramp, 0.8 * np.sin(np.pi * t / 2) * ramp], axis=1)
-    how = {"sensor": "camera", "pose": np.eye(4)}
+    how = {"sensor_name": "camera", "camera_pose": np.eye(4)}
     camera = PointGroup("points_camera", ["T1_0_tip"], t[::5], np.zeros((21, 1, 3)), 2e-3, **how)
     recording = Recording(JointGroup(names, t, path, position_std=0.0), (camera,), name="tube")
     options = ProblemOptions(path_cutoff=math.inf, initial_state="equilibrium")

@@ -31,7 +31,7 @@ STEPS = 60
 
 def camera(t, points):
     seen = np.zeros((len(t), len(points), 3))
-    return PointGroup("points_camera", list(points), t, seen, STD, sensor="camera", pose=np.eye(4))
+    return PointGroup("points_camera", list(points), t, seen, STD, sensor_name="camera", camera_pose=np.eye(4))
 
 
 def judged(problem):

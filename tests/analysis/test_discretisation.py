@@ -220,7 +220,7 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     levels = {"effort_std": 0.05, "effort_bias_std": 0.1, "effort_kind": "command", "position_std": 1e-3}
     points = replace(drawn.points[0], std=np.full(drawn.points[0].position.shape, 1e-3))
     if encoders:  # no points that are made of them
-        points = replace(points, name="points_camera", sensor="camera", pose=np.eye(4))
+        points = replace(points, name="points_camera", sensor_name="camera", camera_pose=np.eye(4))
     drawn = replace(drawn, joints=replace(drawn.joints, **levels), points=(points,))
     free, gains = ("elbow.damping", "elbow.stiffness"), (9.0,)
     options = ProblemOptions(arm_tracking_feedback=feedback, arm_tracking_feedback_gains=gains)

@@ -46,8 +46,8 @@ MARKER_DISTANCE = 0.03
     [
         ([group()], "points_camera", None),
         ([group("points_arm"), group()], "points_camera", "points_arm"),
-        ([group("points_x", sensor="arm"), group("points_y", sensor="a camera")], "points_y", "points_x"),
-        ([group("points_z", pose=np.eye(4))], "points_z", None),
+        ([group("points_x", sensor_name="arm"), group("points_y", sensor_name="a camera")], "points_y", "points_x"),
+        ([group("points_z", camera_pose=np.eye(4))], "points_z", None),
         ([group("points_left_arm")], None, "points_left_arm"),
         ([group("points_mocap")], None, None),
     ],
@@ -201,7 +201,9 @@ def swung(urdf_folder):
     step = compile_step(system, 0.02, use_compiler=False)
     t = 0.02 * np.arange(41)
     path = 0.4 * np.sin(7.0 * t)
-    camera = PointGroup(CAMERA_GROUP, ["tip"], t[::4], np.zeros((11, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    camera = PointGroup(
+        CAMERA_GROUP, ["tip"], t[::4], np.zeros((11, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
+    )
 
     def build(effort_std=None, **options):
         joints = JointGroup(["shoulder"], t, path[:, None], position_std=0.0, effort_std=effort_std)
@@ -309,7 +311,9 @@ def driven(urdf_folder):
     group = JointGroup(
         ("shoulder", "elbow"), t, angles, effort=np.zeros((51, 2)), effort_kind="command", position_std=1e-3
     )
-    camera = PointGroup(CAMERA_GROUP, ["T1_1_tip"], t[::5], np.zeros((11, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    camera = PointGroup(
+        CAMERA_GROUP, ["T1_1_tip"], t[::5], np.zeros((11, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
+    )
     step = compile_step(system, 0.02, use_compiler=False)
     return EstimationProblem(step, [Recording(group, (camera,), name="run")], ("T1.bend",), ProblemOptions())
 
@@ -513,7 +517,7 @@ def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_fo
     step = pendulum_step(urdf_folder, driven=("shoulder",))
     made = taken(step, 3, camera=False)
     [tip] = made.points
-    made = replace(made, points=(replace(tip, std=np.ones(tip.position.shape), sensor="arm"),))
+    made = replace(made, points=(replace(tip, std=np.ones(tip.position.shape), sensor_name="arm"),))
     levels = {"effort_std": 0.3, "effort_bias_std": 0.2, "position_std": 0.0}
     made = replace(made, joints=replace(made.joints, **levels))
     options = ProblemOptions(

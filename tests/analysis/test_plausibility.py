@@ -417,7 +417,7 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
 
 def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
     (group,) = stamped(runs[1], 0.03).points[:1]
-    seen = replace(group, name="points_camera", sensor="camera")
+    seen = replace(group, name="points_camera", sensor_name="camera")
     (doubt,) = forward_kinematics_issues(arms[1], replace(runs[1], points=(seen,)), usual)
     assert re.search(r"kind: camera_latency, location: camera, values: {delay: 0.03\d*}", doubt.setting)
 
@@ -502,7 +502,9 @@ def hanging(seed: int = 0) -> Recording:
     swing = 0.02 * np.sin(3 * t)[:, None, None] * np.ones((1, 12, 3))
     noise = 2e-4 * np.random.default_rng(seed).standard_normal((200, 12, 3))
     names = (*(f"p{i}" for i in range(9)), "a1", "a2", "a3")
-    return Recording(None, (PointGroup("points", names, t, shape + swing + noise, sensor="motion capture"),), name="c")
+    return Recording(
+        None, (PointGroup("points", names, t, shape + swing + noise, sensor_name="motion capture"),), name="c"
+    )
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,9 @@ def told(sets):
 @pytest.mark.parametrize(("period", "rates"), [(0.2, ["rate:10", "rate:30"]), (0.09, ["rate:30"]), (0.03, [])])
 def test_faster_cameras_than_there_was(held_tube, period, rates):
     recording, t = held_tube.episodes[0].recording, period * np.arange(1, 10)
-    camera = PointGroup("points_camera", ["T1_0_tip"], t, np.zeros((9, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    camera = PointGroup(
+        "points_camera", ["T1_0_tip"], t, np.zeros((9, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
+    )
     recordings = [replace(recording, points=(camera,))]
     problem = EstimationProblem(held_tube.step, recordings, held_tube.free, held_tube.options)
     found = what_if(problem, considered_changes={"rate:10", "rate:30"}, evaluate_changes=lambda sets, _: told(sets))
@@ -165,7 +167,7 @@ def test_a_fit_that_is_worse_than_its_noise_informs_less(held_tube, tube_ranking
 def test_a_predicted_sensor_tells_what_it_tells_when_it_is_there(held_tube, tube_ranking, name, frames, times):
     ranking, _ = tube_ranking
     predicted = next(entry for entry in ranking.single_changes if entry.changes == (name,))
-    nothing, how = np.zeros((len(times), len(frames), 3)), {"sensor": "camera", "pose": np.eye(4)}
+    nothing, how = np.zeros((len(times), len(frames), 3)), {"sensor_name": "camera", "camera_pose": np.eye(4)}
     seen = PointGroup("points_camera", frames, times, nothing, 2e-3, **how)
     recording = replace(held_tube.episodes[0].recording, points=(seen,))
     info = identifiability(EstimationProblem(held_tube.step, [recording], held_tube.free, held_tube.options))

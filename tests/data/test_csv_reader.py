@@ -27,7 +27,11 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
         "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
     )
     recording = read_any(
-        path, clock_kind="nominal", point_sensor_name="camera", point_frame="base", description="two joints"
+        path,
+        recorded_or_nominal_times="nominal",
+        point_sensor_name="camera",
+        point_frame="base",
+        description="two joints",
     )
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
@@ -36,7 +40,7 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
     assert np.array_equal(joints.values_by_channel["effort"], [[1, 2], [3, 4]])
     assert np.array_equal(joints.values_by_channel["position_command"], [[0, 0], [0, 1]])
     (points,) = recording.points
-    assert (points.names, points.sensor, points.frame, points.clock) == (("tip",), "camera", "base", "nominal")
+    assert (points.names, points.sensor_name, points.frame, points.clock) == (("tip",), "camera", "base", "nominal")
     assert np.array_equal(points.position, [[[0.5, 0.6, 0.7]]])
     assert np.array_equal(points.t, [0.0])
     assert (recording.name, recording.source, recording.description) == ("run", "run.csv", "two joints")
@@ -348,7 +352,7 @@ def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are
     text, program, names = EXPORTS[name]
     (tmp_path / name).write_text(text)
     [group] = read_any(tmp_path / name).points
-    assert (group.names, group.sensor) == (names, program)
+    assert (group.names, group.sensor_name) == (names, program)
     assert group.t == pytest.approx([0, 0.01])
     np.testing.assert_allclose(group.position[0], [[1, 2, 3], [0.1, 0.2, 0.3]])
     np.testing.assert_array_equal(np.isnan(group.position[1]).all(axis=1), [False, True])

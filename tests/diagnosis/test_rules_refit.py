@@ -76,6 +76,8 @@ class Problem:
 class Memory(dict):
     """A store."""
 
+    stored_refit = dict.get
+
     def put(self, name, refitted):
         self[name] = refitted
 

@@ -197,7 +197,7 @@ def test_the_plugins_run_from_a_configuration(page, run_script, pendulum_data, t
     assert [(e["kind"], e["location"]) for e in said["model"]["effects"]] == [("pole", "w_rod")]
     effects = "[{kind: pole, location: tip, values: {strength: 0.02}}, {kind: thrust, location: tip}]"
     given = pendulum_data.text.replace("model:\n", f"plugins: {said['plugins']}\nmodel:\n  measured_points: [tip]\n", 1)
-    text = given.replace("  springs:", f"  effects: {effects}\n  springs:")
+    text = given.replace("  joint_springs:", f"  effects: {effects}\n  joint_springs:")
     (tmp_path / "drawn.yaml").write_text(text, encoding="utf-8")
     code = "from yid_ocp.cli import main; sys.exit(main())"
     run_script(code, tmp_path, "solve", "drawn.yaml", "--out", "run", "--set", "output.write_report=false")

@@ -56,7 +56,9 @@ def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
         seen = np.sort(rng.uniform(0.0, t[-1], 9))
         place = rng.normal(size=(9, 2, 3))
         pose = np.array(bench.pose)
-        groups.append(PointGroup("points_camera", ("w_T1", "w_T3"), seen, place, np.array(0.02), "camera", pose=pose))
+        groups.append(
+            PointGroup("points_camera", ("w_T1", "w_T3"), seen, place, np.array(0.02), "camera", camera_pose=pose)
+        )
     return Recording(joints, tuple(groups), name="made")
 
 
@@ -346,7 +348,7 @@ def test_at_neutral_parameters_they_change_nothing(mode, benches, all_effects, s
 def test_the_clock_of_any_group_of_points_may_be_late_or_early(driven):
     """Not that of points which the arm measures by its own encoders."""
     [camera] = [group for group in recording(driven).points if group.name.endswith("camera")]
-    mocap = replace(camera, name="points_mocap", sensor="mocap", pose=None)
+    mocap = replace(camera, name="points_mocap", sensor_name="mocap", camera_pose=None)
     made = replace(recording(driven, camera=False), points=(*recording(driven, camera=False).points, mocap))
     assert "points:points_mocap" in recorded_signal_kinds([made])
     found = candidate_kinds_and_locations(driven.system, recorded_signal_kinds([made]))

@@ -147,7 +147,7 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     with caplog.at_level(logging.WARNING):
         file.write_text(MODELS["rail with references"])
         read_urdf(file)
-    assert "springs of joints: 1 not taken over (model.springs)" in caplog.text
+    assert "springs of joints: 1 not taken over (model.joint_springs)" in caplog.text
 
 
 GRIPPER = """<body name="gripper" {at}>{free}<site name="palm" pos="0 0.02 0.01"/>

@@ -8,7 +8,7 @@ from yid_ocp.cli import main
 PENDULUM = """\
 model:
   robot: {urdf}
-  springs:
+  joint_springs:
     elbow: {{stiffness: 3.0, rest_position: 0.1}}
   arms: {{mode: prescribed, passive_joints: [elbow]}}
   damping: 0.2

@@ -228,7 +228,7 @@ def sprung(step, recording, **options):
 )
 def test_encoders_are_measurements_where_no_point_of_the_arm_is(driven, arm, use, expected):
     step, made = driven()
-    group = replace(made.points[0], sensor="arm")
+    group = replace(made.points[0], sensor_name="arm")
     made = replace(made, points=(group, made.points[1]) if arm else made.points[1:])
     problem = sprung(step, made, sensors={} if use is None else {"joints.position": SensorOptions(use=use)})
     found = [s for s in problem.episodes[0].measurements if s.sensor.group_name == "joints.position"]
@@ -242,7 +242,7 @@ def test_encoders_are_measurements_where_no_point_of_the_arm_is(driven, arm, use
 
 def test_encoders_beside_points_of_the_arm_are_refused(driven):
     step, made = driven()
-    made = replace(made, points=(replace(made.points[0], sensor="arm"),))
+    made = replace(made, points=(replace(made.points[0], sensor_name="arm"),))
     with pytest.raises(ConfigError, match=r"points_arm.*both") as caught:
         sprung(step, made, sensors={"joints.position": SensorOptions(use=True)})
     assert "sensors.points_arm.use: false" in caught.value.hint
@@ -279,7 +279,7 @@ def test_a_late_or_early_group_of_points_is_found_by_its_name(urdf_folder, late)
     step = pendulum_step(urdf_folder, [("camera_latency", "points_mocap", {})], prescribed=("shoulder",))
     source = taken(step, 1, camera=False, steps=150)
     [group] = source.points
-    source = replace(source, points=(replace(group, name="points_mocap", sensor="mocap", std=1e-3),))
+    source = replace(source, points=(replace(group, name="points_mocap", sensor_name="mocap", std=1e-3),))
     options = ProblemOptions(path_cutoff=np.inf)
     free = ("elbow.damping", f"{latency}.delay")
     true = EstimationProblem(step, [source], free, options).simulate_synthetic_recording(seed=3)

@@ -148,8 +148,8 @@ RECORDED = {
     "efforts": (recording(driven([1.0, 2.0])), {"joints.position", "joints.effort"}),
     "no efforts": (recording(joints(["a"], [0.0, 0.1], np.zeros((2, 1)))), {"joints.position"}),
     "points": (pointed(), set()),
-    "camera by its pose": (pointed(pose=np.eye(4)), {"camera"}),
-    "camera by its name": (pointed(sensor="camera"), {"camera"}),
+    "camera by its pose": (pointed(camera_pose=np.eye(4)), {"camera"}),
+    "camera by its name": (pointed(sensor_name="camera"), {"camera"}),
     "nominal clock": (pointed(clock="nominal"), {"nominal_clock"}),
 }
 

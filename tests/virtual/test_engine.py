@@ -222,16 +222,16 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     assert np.std(joints.position - run.q[:, :7]) == pytest.approx(2e-4, rel=0.1)
     assert np.std(joints.velocity - run.v[:, :7]) == pytest.approx(5e-3, rel=0.1)
     arm, camera = recording.points
-    assert (arm.name, arm.names, arm.sensor) == ("points_arm", ("w_T2",), "arm")
+    assert (arm.name, arm.names, arm.sensor_name) == ("points_arm", ("w_T2",), "arm")
     assert np.std(arm.position[:, 0] - run.point_positions[:, 1]) == pytest.approx(1e-3, rel=0.1)
-    assert (camera.name, camera.names, camera.sensor) == ("points_camera", ("w_T1", "w_T3"), "camera")
+    assert (camera.name, camera.names, camera.sensor_name) == ("points_camera", ("w_T1", "w_T3"), "camera")
     assert np.diff(camera.t).max() > 1.0
     assert 0.2 < np.diff(camera.t).min() < 0.45
     for column, point in enumerate(camera.names):
         truth = run.point_positions[:, system.point_frames.index(point)]
         path = np.column_stack([np.interp(camera.t, run.t, truth[:, axis]) for axis in range(3)])
         assert np.nanmax(np.abs(camera.position[:, column] - path)) < 5 * 5e-3
-    assert np.linalg.norm(camera.pose[:3, 3] - run.point_positions[0].mean(0)) == pytest.approx(2.0)
+    assert np.linalg.norm(camera.camera_pose[:3, 3] - run.point_positions[0].mean(0)) == pytest.approx(2.0)
     assert TRUTH.items() <= recording.true_parameters.items()
     assert all(name.rpartition(".")[2] in ("bend", "twist", "damping", "mass") for name in recording.true_parameters)
 

@@ -100,7 +100,7 @@ def reading(duration=1.0) -> Recording:
     pose = np.eye(4)
     pose[:3, 3] = [2.0, 0.0, 0.0]
     points = np.tile([0.5, 0.1, 0.2], (101, 1, 1))
-    camera = PointGroup("points_camera", ("w_T1",), t, points, sensor="camera", pose=pose)
+    camera = PointGroup("points_camera", ("w_T1",), t, points, sensor_name="camera", camera_pose=pose)
     return Recording(JointGroup(names, t, position, effort=effort), (camera,), name="r")
 
 

@@ -90,7 +90,7 @@ def test_a_displaced_camera_is_put_right(system, recording, clean):
     errors = found.position - np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])
     assert np.nanmean((errors / found.std) ** 2) < 1.5
     assert np.nanmax(np.linalg.norm(errors, axis=2)) < 15 * MILLIMETRE
-    assert np.allclose(found.to_point_group().pose, sequence.camera_pose, atol=0.02)
+    assert np.allclose(found.to_point_group().camera_pose, sequence.camera_pose, atol=0.02)
     assert "one error of all frames" in found.to_point_group().sensor
 
 
@@ -107,7 +107,7 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     assert np.array_equal(group.t, clean.track.t)
     assert np.array_equal(group.position, clean.track.position)
     assert (group.std >= TrackOptions().min_point_std).all()
-    assert np.array_equal(group.pose, clean.track.camera_calibration.camera_state.pose)
+    assert np.array_equal(group.camera_pose, clean.track.camera_calibration.camera_state.pose)
     assert again.description.startswith("Before.")
     assert "clock offset" in again.description
 

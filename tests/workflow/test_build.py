@@ -97,7 +97,7 @@ def test_a_branch_stays_at_its_place_of_a_finer_parent(built, finer):
 def test_springs_on_joints(built, urdf_folder):
     system = built(
         f"model:\n  robot: {urdf_folder / 'mixed_joints.urdf'}\n  arms: {{mode: passive}}\n"
-        "  springs:\n    hinge: {stiffness: 2.0, rest_position: 0.1, damping: 0.3}\n    slide: {stiffness: 50.0}\n"
+        "  joint_springs:\n    hinge: {stiffness: 2.0, rest_position: 0.1, damping: 0.3}\n    slide: {stiffness: 50}\n"
         "  damping: {spin: 0.2}\n"
     )
     parameters = system.parameters

@@ -166,8 +166,8 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
         elif spoil == "other text":
             first.file.write_text("[1, 2]")
         second = _SingleJsonFileRefitStore(folder, *made_from)
-        assert second.get("joint_coulomb@elbow") == (refitted if spoil == "nothing" else None)
-        assert second.get("joint_viscous@elbow") is None
+        assert second.stored_refit("joint_coulomb@elbow") == (refitted if spoil == "nothing" else None)
+        assert second.stored_refit("joint_viscous@elbow") is None
         assert len(caplog.records) == (0 if spoil == "nothing" else 1)
         second.delete_file()
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

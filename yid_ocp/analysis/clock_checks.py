@@ -151,7 +151,7 @@ def robot_held_point_clock_issues(
     elif abs(late) > _MIN_Z * found.delay_std and abs(late) > limit:
         words = f"{group.name} is stamped {1e3 * late:+.3g} ± {1e3 * found.delay_std:.2g} ms from the joints"
         words = f"{words}; {1e3 * limit:.3g} ms cannot be resolved (sample period)"
-        camera = "camera" in f"{group.name} {group.sensor}".lower() or group.pose is not None
+        camera = "camera" in f"{group.name} {group.sensor_name}".lower() or group.camera_pose is not None
         setting = f"sensors.{group.name}.use: false"
         if camera and late > 0:
             setting = known_effect_config_line("camera_latency", "camera", "delay", late)

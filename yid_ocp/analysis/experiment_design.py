@@ -81,8 +81,8 @@ class UnchangedExperiment:
 
     def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group, sample times [s] and typical std [m] of points measured by arms; None and defaults if none."""
-        times = episode.grid.node_times - episode.grid.start_time
-        return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
+        t = episode.grid.node_times - episode.grid.start_time
+        return self._sampling(episode, lambda g: "arm" in g.name or g.sensor_name == "arm", t, _DEFAULT_ARM_POINT_STD)
 
     def _sampling(
         self, episode: Episode, fits: Callable[[PointGroup], bool], times: Array, std: float
@@ -424,7 +424,7 @@ class MechanicalVariantSensitivityBuilder:
         poses: dict[str, Array | None] = {CAMERA_GROUP: np.eye(4), ARM_GROUP: None}
         sensors = {CAMERA_GROUP: "camera", ARM_GROUP: "arm"}
         for group in _used_point_groups(base, episode):
-            poses[group.name], sensors[group.name] = group.pose, group.sensor
+            poses[group.name], sensors[group.name] = group.camera_pose, group.sensor_name
         wanted: dict[str, dict[str, None]] = {}
         for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
@@ -440,7 +440,7 @@ class MechanicalVariantSensitivityBuilder:
             shape = (len(times), len(frames), 3)
             if frames:
                 blank = (np.zeros(shape), np.ones(shape))
-                groups.append(PointGroup(name, tuple(frames), times, *blank, sensors[name], pose=poses[name]))
+                groups.append(PointGroup(name, tuple(frames), times, *blank, sensors[name], camera_pose=poses[name]))
         if torque and joints is not None and joints.effort is None:
             joints = replace(joints, effort=np.zeros_like(joints.position))
         return replace(recording, joints=joints, points=tuple(groups))

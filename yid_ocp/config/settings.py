@@ -16,7 +16,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
-from yid_ocp.data.recording import ClockKind
+from yid_ocp.data.recording import RecordedOrNominalTimes
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.effects.law import TorqueLawQuantitiesName
@@ -173,7 +173,7 @@ class _ModelSettings:
     grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("grasps by name: left, right, gripper")] = field(
         default_factory=dict
     )
-    springs: Annotated[Mapping[str, _JointSpringSettings], OptionInfo("springs by joint of the robot")] = field(
+    joint_springs: Annotated[Mapping[str, _JointSpringSettings], OptionInfo("springs by joint of the robot")] = field(
         default_factory=dict
     )
     damping: Annotated[
@@ -248,7 +248,7 @@ class ImportSettings:
     gear_ratios: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
     clock_offsets: Annotated[_Numbers, OptionInfo("several files: added to times of each, by file stem", "s")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
-    clock_kind: Annotated[ClockKind | None, OptionInfo("table: whether its times were measured")] = None
+    recorded_or_nominal_times: Annotated[RecordedOrNominalTimes | None, OptionInfo("table: kind of its times")] = None
     point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None
     point_frame: Annotated[str | None, OptionInfo("table or C3D file: frame of the points")] = None
 

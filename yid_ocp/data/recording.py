@@ -17,7 +17,7 @@ from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.sensors.base import EffortSamplingKind, additional_sensor_channel_kinds
 
-ClockKind = Literal["recorded", "nominal"]
+RecordedOrNominalTimes = Literal["recorded", "nominal"]
 
 JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position": "rad",
@@ -90,7 +90,7 @@ class JointGroup(ReprMixin):
     position_resolution: float | Array | None = None
     proportional_gain: float | Array | None = None
     effort_kind: EffortSamplingKind | None = None
-    clock: ClockKind = "recorded"
+    clock: RecordedOrNominalTimes = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -133,9 +133,9 @@ class PointGroup(ReprMixin):
         Position in `frame` [m]; three NaN if a point was not seen.
     std : ndarray, shape (M, np, 3), or None
         Standard deviation of the noise [m]; a single number is broadcast.
-    sensor, frame : str
-        Sensor of the points, and their reference frame.
-    pose : ndarray, shape (4, 4), or None
+    sensor_name, frame : str
+        Name of the sensor that measured the points, such as `arm`, and their reference frame.
+    camera_pose : ndarray, shape (4, 4), or None
         For a camera: the transform from camera to world coordinates [m].
     clock : {'recorded', 'nominal'}
         As in `JointGroup`.
@@ -146,14 +146,14 @@ class PointGroup(ReprMixin):
     t: Array
     position: Array
     std: Array | None = None
-    sensor: str = "unknown"
+    sensor_name: str = "unknown"
     frame: str = "world"
-    pose: Array | None = None
-    clock: ClockKind = "recorded"
+    camera_pose: Array | None = None
+    clock: RecordedOrNominalTimes = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
-        _freeze_arrays(self, ("t", "position", "std", "pose"))
+        _freeze_arrays(self, ("t", "position", "std", "camera_pose"))
         if self.std is not None and self.std.ndim == 0:
             object.__setattr__(self, "std", np.full(self.position.shape, float(self.std)))
             _freeze_arrays(self, ("std",))
@@ -194,7 +194,7 @@ class SensorChannelGroup(ReprMixin):
     t: Array
     values_by_quantity: Mapping[str, Array]
     noise_and_bias_stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
-    clock: ClockKind = "recorded"
+    clock: RecordedOrNominalTimes = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -439,7 +439,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
 
 def _validate_points(group: PointGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    _check_text(where, ("sensor", group.sensor), ("frame", group.frame))
+    _check_text(where, ("sensor", group.sensor_name), ("frame", group.frame))
     _check_shape(group.position, (len(group.t), len(group.names), 3), f"{where}/position", "(M, np, 3)")
     unseen = np.isnan(group.position).all(axis=2)
     bad = ~np.isfinite(group.position).all(axis=2) & ~unseen
@@ -456,8 +456,8 @@ def _validate_points(group: PointGroup, where: str) -> None:
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
         what = f"the standard deviation of a point that was seen is {next(iter(wrong), 0.0):g} m"
         raise_data_error_unless(wrong.size == 0, what, f"{where}/std", f"0 to {_LARGEST_SPREAD:g} m")
-    if group.pose is not None:
-        _check_pose(group.pose, f"{where}, attribute pose")
+    if group.camera_pose is not None:
+        _check_pose(group.camera_pose, f"{where}, attribute pose")
 
 
 def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
@@ -536,7 +536,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         raise_data_error_unless(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
         raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
-    clocks, place = get_args(ClockKind), f"{where}, attribute clock"
+    clocks, place = get_args(RecordedOrNominalTimes), f"{where}, attribute clock"
     raise_data_error_unless(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))

@@ -81,7 +81,8 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
             _write_group(file.create_group("joints"), vars(recording.joints), _JOINT_UNITS, _JOINT_ATTRIBUTES)
         for group in recording.points:
             attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
-            _write_group(file.create_group(group.name), vars(group), _POINT_UNITS, attributes)
+            content = {**vars(group), "sensor": group.sensor_name, "pose": group.camera_pose}
+            _write_group(file.create_group(group.name), content, _POINT_UNITS, attributes)
         for channels in recording.channel_groups:
             units = {"t": "s"} | {c.quantity: c.unit for c in additional_sensor_channel_kinds(channels.name)}
             content, stds = {**vars(channels), **channels.values_by_quantity}, channels.noise_and_bias_stds_by_attribute
@@ -142,7 +143,8 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             channels.append(SensorChannelGroup(name, found["names"], found["t"], values, stds, **clock))
         else:
             required = ("names", "sensor", "frame")
-            points.append(PointGroup(name, **_read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)))
+            own = _read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
+            points.append(PointGroup(name, sensor_name=own.pop("sensor"), camera_pose=own.pop("pose", None), **own))
     truth = _json(texts["truth"] or "{}", f"{origin}, attribute truth")
     where, allowed = f"{origin}, attribute truth", '{"name": number, ...}'
     raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object", where, allowed)

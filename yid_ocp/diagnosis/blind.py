@@ -235,7 +235,7 @@ class BlindCaseGenerator:
         self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
         self.initial_configuration = first_recorded_driven_joint_positions(self.simulated_system, recording)
-        seen = any(group.pose is not None for group in recording.points)
+        seen = any(group.camera_pose is not None for group in recording.points)
         self.conditions = replace(conditions or SyntheticMeasurementConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):

@@ -274,7 +274,7 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
         quantities: list[tuple[str, ...]] = [(q,) for q in law.quantities]
         quantities += [("angle", "speed")] if {"angle", "speed"} <= set(law.quantities) else []
         for own_quantities in quantities:
-            part = law.restricted_to(own_quantities)
+            part = law.restricted_to_quantities(own_quantities)
             at = [names.index(name) for name in part.parameters.names]
             slopes = jacobian[:, at] - basis @ (basis.T @ jacobian[:, at])
             families.append(_family(part, residual, slopes))

@@ -115,7 +115,7 @@ class RefittedModel(RefitStatistics):
 class RefitStore(Protocol):
     """Interface of a store of finished refits, from which an interrupted diagnosis resumes; called by two threads."""
 
-    def get(self, name: str) -> StoredFit | None:
+    def stored_refit(self, name: str) -> StoredFit | None:
         """The refit stored under a name, or None."""
 
     def put(self, name: str, refitted: StoredFit) -> None:
@@ -241,7 +241,7 @@ def refit_with_effects(
     """
     problem = problem.restricted_to_effect_location(effects)
     name = f"{name or join_effect_labels(effects)} at {problem.problem.step.time_step:g} s"
-    if store is not None and (stored := store.get(name)):
+    if store is not None and (stored := store.stored_refit(name)):
         placed, at_stored = _evaluated(problem, effects, stored.values)
         if at_stored.ok:
             return _model(stored, effects, placed, at_stored)

@@ -80,7 +80,7 @@ class TorqueLaw(EffectBase):
         """Quantities on which the torque depends."""
         return tuple(self.knots or ())
 
-    def restricted_to(self, quantities: Sequence[str]) -> TorqueLaw:
+    def restricted_to_quantities(self, quantities: Sequence[str]) -> TorqueLaw:
         """Return a copy of the law for some of its quantities, without the parameters of the other quantities."""
         kept = {name: own for name, own in (self.knots or {}).items() if name in quantities}
         definitions = [d for d in self.definitions if d.name.rstrip("0123456789") in kept]

@@ -60,9 +60,7 @@ class SmootherThresholds:
         float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")
     ] = 5.0
     max_smoother_unknown_groups: Annotated[int, Ge(1), OptionInfo("largest number of selected groups of unknowns")] = 4
-    detectable_unknown_chi2_rise: Annotated[
-        float, Gt(0), OptionInfo("rise of r'r at which a smoother's unknowns are detectable")
-    ] = 10.0
+    detectable_unknown_chi2_rise: Annotated[float, Gt(0), OptionInfo("rise of r'r that shows an unknown")] = 10.0
     force_prior_std_over_load: Annotated[float, Gt(0), OptionInfo("unknown force over the load at its place")] = 0.1
     grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
     bias_prior_std_over_noise: Annotated[float, Gt(0), OptionInfo("unknown bias over its sensor's noise")] = 3.0

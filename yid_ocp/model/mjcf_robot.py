@@ -202,7 +202,7 @@ def _left_out(model: Any) -> Iterator[str]:
         "motors": (motors, "but for their limits: recorded or driving efforts are torques at the joint"),
         "actuators other than motors and position servos": (len(others_than_servos) - motors, ""),
         "equalities": (model.neq - taken, "welds and connects that close loops: model.grasp"),
-        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "model.springs"),
+        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "model.joint_springs"),
         "tendons": (model.ntendon, ""),
         "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), ""),
     }

@@ -173,7 +173,7 @@ def _criterion(
     for effect in rivals:
         own = tuple(columns.index(name) for name in effect.amplitude_parameter_names)
         places.append(own)
-        sizes.append(_size(effect) / experiment.unknown_scales[list(own)][:, None])
+        sizes.append(_size(effect) / experiment.estimated_unknown_scales[list(own)][:, None])
     return EffectDiscriminationCriterion(tuple(places), tuple(sizes), parameters)
 
 

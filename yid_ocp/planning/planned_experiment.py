@@ -136,7 +136,7 @@ class SplineMotionExperiment:
         std = np.broadcast_to(np.where(np.isfinite(std), std, 1.0).reshape(-1, 3), places.shape)
         group = next(g for g in base.recording.points if g.name == sensor.group_name)
         points, times = (sensor.group_name, sensor.point_names), mover.node_times[at]
-        return PointGroup(*points, times, places, std.copy(), group.sensor, pose=group.pose)
+        return PointGroup(*points, times, places, std.copy(), group.sensor_name, camera_pose=group.camera_pose)
 
     @cached_property
     def _points(self) -> list[tuple[SensorMeasurements, FramePositionEvaluator]]:
@@ -216,7 +216,7 @@ class SplineMotionExperiment:
         return self._problem(self.simulator.step, replace(recording, joints=joints), options)
 
     @cached_property
-    def unknown_scales(self) -> Array:
+    def estimated_unknown_scales(self) -> Array:
         """Size of each unknown of the search problem, in column order, to which relative changes refer."""
         return _sizes(self._known)
 

@@ -185,7 +185,7 @@ def recording_from_prediction(
             std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
             position = np.where(samples.weight > 0, predicted, np.nan).reshape(shape)
             original = next(group for group in source.points if group.name == samples.sensor.group_name)
-            where = (original.sensor, original.frame, original.pose)
+            where = (original.sensor_name, original.frame, original.camera_pose)
             noisy = _noisy(position, std, rng)
             groups.append(PointGroup(original.name, samples.sensor.point_names, t, noisy, std, *where))
     groups = [_with_clamps(group, predictor, source) for group in groups]

@@ -85,7 +85,7 @@ class EffortSensor(JointSensor):
 
 def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
     """Whether the arm itself measured a point group, usually by its encoders and forward kinematics."""
-    return "arm" in (group.sensor, group.name.rpartition("_")[2])
+    return "arm" in (group.sensor_name, group.name.rpartition("_")[2])
 
 
 @SENSOR_READERS.register(JOINT_POSITION_GROUP_NAME)

@@ -124,8 +124,8 @@ def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], 
     A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Without a pose, the camera is
     assumed at the world origin.
     """
-    if group.pose is not None:
-        return tuple(tuple(float(x) for x in row) for row in group.pose)
-    if "camera" in group.name.lower() or "camera" in group.sensor.lower():
+    if group.camera_pose is not None:
+        return tuple(tuple(float(x) for x in row) for row in group.camera_pose)
+    if "camera" in group.name.lower() or "camera" in group.sensor_name.lower():
         return tuple(tuple(row) for row in np.eye(4).tolist())
     return None

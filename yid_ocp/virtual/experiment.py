@@ -223,7 +223,7 @@ def _arm_points(
 ) -> PointGroup:
     clean = run.point_positions[:, [system.point_frames.index(point) for point in held]]
     position = _noisy(clean, noise.point_std, streams["arm_points"])
-    return PointGroup("points_arm", held, run.t, position, np.full(clean.shape, noise.point_std), sensor="arm")
+    return PointGroup("points_arm", held, run.t, position, np.full(clean.shape, noise.point_std), sensor_name="arm")
 
 
 def _camera_points(
@@ -237,7 +237,7 @@ def _camera_points(
     beside = target + 2.0 * _CAMERA_DIRECTION / np.linalg.norm(_CAMERA_DIRECTION)
     pose = look_at_pose(beside, target) if camera.pose is None else np.asarray(camera.pose, float)
     std = np.full(clean.shape, camera.point_std)
-    return PointGroup("points_camera", visible, run.frame_times, position, std, "camera", pose=pose)
+    return PointGroup("points_camera", visible, run.frame_times, position, std, "camera", camera_pose=pose)
 
 
 def _how_it_was_made(experiment: VirtualExperimentSettings, system: System) -> str:
@@ -284,8 +284,8 @@ def recording_with_sensor_error(
     """Copy of a recording with one sensor error: the sensor effect `kind` at `location` with parameters `values`."""
     if kind.startswith("camera") or kind == "surface_offset":
         last = recording.duration
-        points = (g if g.pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)
-        return replace(recording, points=tuple(points))
+        seen = (g if g.camera_pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)
+        return replace(recording, points=tuple(seen))
     joints = recording.joints
     assert joints is not None
     if joints.effort is None:
@@ -307,8 +307,8 @@ def recording_with_sensor_error(
 def _camera_error(
     group: PointGroup, system: System, kind: str, size: Mapping[str, float], duration: float
 ) -> PointGroup:
-    assert group.pose is not None
-    position, centre = group.position, np.asarray(group.pose)[:3, 3]
+    assert group.camera_pose is not None
+    position, centre = group.position, np.asarray(group.camera_pose)[:3, 3]
     if kind == "camera_translation":
         return replace(group, position=position + np.array([size["x"], size["y"], size["z"]]))
     if kind == "camera_rotation":

@@ -104,7 +104,7 @@ class TrackResult:
         pose, words = self.camera_calibration.camera_state.pose, "depth camera, fitted shape"
         if np.nanmax(self.shared_std) > 0:
             words += f"; of std, {1e3 * np.nanmedian(self.shared_std):.1f} mm (median) are one error of all frames"
-        return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
+        return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, "world", pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
         """Copy of a recording (None: an empty one) with these points as `points_camera`, see `validated_recording`."""

@@ -415,7 +415,7 @@ class _BlindExperiment:
             what, allowed = "there is no recording with the start of the arms", "one recording or more"
             raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
         system = build_system(self.simulation_settings())
-        vision = not varied.is_without_object and any(group.pose is not None for group in first[0].points)
+        vision = not varied.is_without_object and any(group.camera_pose is not None for group in first[0].points)
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
         conditions = replace(self._recording_conditions(), has_camera=vision)
         posture = blind.first_recorded_driven_joint_positions(system, first[0])

@@ -90,7 +90,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             damping=damping,
             gravity=model.gravity,
             point_frames=model.measured_points,
-            springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.springs.items()},
+            springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.joint_springs.items()},
             servos=arms.servo if mode == "servo" else None,
         )
     if any(said.position_from_recordings for said in model.frames.values()) and run.recordings.estimate:
@@ -160,16 +160,16 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
         damping = {name: said.get(name, of_file.get(name, _DEFAULT_JOINT_DAMPING)) for name in joints}
     else:
         damping, of_object = {name: of_file.get(name, said) for name in joints}, said
-    for name, spring in run.model.springs.items():
+    for name, spring in run.model.joint_springs.items():
         if name not in joints:
-            raise unknown_name_error(run, "joint", name, joints, "model", "springs", name)
+            raise unknown_name_error(run, "joint", name, joints, "model", "joint_springs", name)
         if spring.damping is not None:
             damping[name] = spring.damping
     return damping, of_object
 
 
 def _clamped_system(run: RunSettings, item: ObjectBetweenClamps, kind: str) -> System:
-    for key in ("robot", "grasp", "springs", "frames"):
+    for key in ("robot", "grasp", "joint_springs", "frames"):
         if getattr(run.model, key):
             what, allowed = f"model.{key} is not possible with object.kind: {kind}, which clamps hold", f"no {key}"
             raise run.config_error(what, "model", key, allowed=allowed, hint=f"remove model.{key}")

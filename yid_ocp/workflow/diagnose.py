@@ -293,7 +293,7 @@ class _SingleJsonFileRefitStore:
     def __len__(self) -> int:
         return len(self._known)
 
-    def get(self, name: str) -> StoredFit | None:
+    def stored_refit(self, name: str) -> StoredFit | None:
         """The stored refit of that name, or None. Reuse is logged."""
         found = self._known.get(name)
         if found is not None:

@@ -133,7 +133,7 @@ def _plan_as_recording(run: RunSettings, found: _Plan) -> Recording:
     if names := tuple(found.point_trajectories):
         position = np.stack([found.point_trajectories[name] for name in names], axis=1)
         std = np.full(position.shape, _POINT_STD)
-        points = (PointGroup("points_planned", names, found.t, position, std, sensor="plan"),)
+        points = (PointGroup("points_planned", names, found.t, position, std, sensor_name="plan"),)
     truth = dict(zip(found.simulator.step.system.parameters.names, map(float, found.simulator.theta), strict=True))
     text = f"{run.description} Planned motion, goal {run.plan.goal}.".strip()
     return validated_recording(Recording(joints, points, text, "yid_ocp plan", "recording", true_parameters=truth))

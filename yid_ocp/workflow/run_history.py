@@ -42,7 +42,7 @@ ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"
 """Format identifiers of result.json by command, for commands that estimate parameters."""
 _OLD_FORMATS = ("yid-diagnosis/1",)  # formats of earlier versions, with other keys
 _RENAMED_KEYS_HINT = "CHANGELOG.md has the table old -> new under Unreleased"
-_COMPARED_MODEL_SECTIONS = ("robot", "arms", "object", "grasp", "springs", "gravity")
+_COMPARED_MODEL_SECTIONS = ("robot", "arms", "object", "grasp", "joint_springs", "gravity")
 """Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
 _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 

@@ -20,7 +20,14 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import mean_sample_rate
 from yid_ocp.data.foreign_formats import column_meanings, select_mocap_table_reader
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, ClockKind, JointGroup, PointGroup, Recording, SensorChannelGroup
+from yid_ocp.data.recording import (
+    JOINT_CHANNEL_UNITS,
+    JointGroup,
+    PointGroup,
+    RecordedOrNominalTimes,
+    Recording,
+    SensorChannelGroup,
+)
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
 from yid_ocp.sensors import CHANNEL_KINDS
@@ -50,7 +57,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     has_header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # omit lines that are not rows of numbers, and count them in `notes`
     delimiter: str = ""  # one character between cells; found in the first line where empty
-    clock_kind: ClockKind = "recorded"  # whether the times were measured
+    recorded_or_nominal_times: RecordedOrNominalTimes = "recorded"  # whether the times were measured
     point_sensor_name: str = "unknown"  # sensor of the points
     point_frame: str = "world"  # reference frame of the points
     description: str = ""  # what was recorded
@@ -84,8 +91,8 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
             allowed, hint = "motion capture exports without --columns", "choose markers with --points MARKER=POINT"
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         seen, unit, remarks = capture
-        sensor = seen.sensor if options.point_sensor_name == "unknown" else options.point_sensor_name
-        group = replace(seen, sensor=sensor, frame=options.point_frame)
+        sensor = seen.sensor_name if options.point_sensor_name == "unknown" else options.point_sensor_name
+        group = replace(seen, sensor_name=sensor, frame=options.point_frame)
         made, units = Recording(None, (group,), *said, notes=remarks), {"points": unit}
     else:
         meanings, units, table, notes = _read_table(path, options)
@@ -128,14 +135,15 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     if joint_names:
         rows = measured(list(channels.values()))
         own: dict[str, Any] = {name: values[rows] for name, values in channels.items()}
-        joints = JointGroup(joint_names, t[rows], clock=options.clock_kind, **own)
+        joints = JointGroup(joint_names, t[rows], clock=options.recorded_or_nominal_times, **own)
     if point_names:
-        rows, said = measured([position]), (options.point_sensor_name, options.point_frame, None, options.clock_kind)
+        rows = measured([position])
+        said = options.point_sensor_name, options.point_frame, None, options.recorded_or_nominal_times
         points.append(PointGroup("points", point_names, t[rows], position[rows], None, *said))
     for name, (names, parts) in mounted.items():
         rows = measured(list(parts.values()))
         kept = {quantity: values[rows] for quantity, values in parts.items()}
-        sensors.append(SensorChannelGroup(name, names, t[rows], kept, clock=options.clock_kind))
+        sensors.append(SensorChannelGroup(name, names, t[rows], kept, clock=options.recorded_or_nominal_times))
     return Recording(joints, tuple(points), channel_groups=tuple(sensors))
 
 
