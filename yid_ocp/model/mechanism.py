@@ -237,11 +237,19 @@ class Mechanism(ReprMixin):
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """Return a copy with numbers, from `values` or nominal, in place of all parameters."""
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)
+        symbolic = list[ca.SX]()
+
+        def gathered(expression: ca.SX) -> ca.SX:
+            if not expression.is_constant():
+                symbolic.append(ca.densify(expression))
+            return expression
+
+        map_expressions(self, gathered)
+        # one function of all expressions: each is quick to evaluate but slow to set up
+        numbers = iter(ca.Function("numbers", [symbols], symbolic).call([theta]))
 
         def number(expression: ca.SX) -> ca.SX:
-            if expression.is_constant():
-                return ca.densify(expression)
-            return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(theta)))
+            return ca.densify(expression) if expression.is_constant() else ca.SX(next(numbers))
 
         mapped: Mechanism = map_expressions(self, number)
         return replace(mapped, parameters=Parameters())

@@ -397,7 +397,18 @@ class System(ReprMixin):
 
     def numeric_mechanism(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """Mechanism with numbers, from `values` or nominal, in place of all parameters."""
-        return replace(self.mechanism, parameters=self.parameters).with_numeric_values(values)
+        key = tuple(self.parameters.vector(values).tolist())
+        found = self._last_numeric_mechanism.get(key)
+        if found is None:
+            found = replace(self.mechanism, parameters=self.parameters).with_numeric_values(values)
+            self._last_numeric_mechanism.clear()
+            self._last_numeric_mechanism[key] = found
+        return found
+
+    @cached_property
+    def _last_numeric_mechanism(self) -> dict[tuple[float, ...], Mechanism]:
+        """The last one made, by its parameter values: what handles one set of values asks for it several times."""
+        return {}
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
         """Elastic energy of all elastic joints [J]: the sum of 1/2 stiffness (q - rest)^2."""

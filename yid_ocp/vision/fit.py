@@ -11,7 +11,8 @@ move its centre line and stay at zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Annotated, NamedTuple
@@ -24,7 +25,6 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
-from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision import shape_evidence
@@ -103,60 +103,53 @@ class ShapeFitter:
         if not system.segment_layouts:
             what, hint = "the model has no object whose shape could be fitted", "set model.object with segments"
             raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
-        tree = self._tree = system.numeric_mechanism(values)
-        symbols, theta = system.parameters.symbols, system.parameters.vector(values)
-
-        def number(expression: ca.SX) -> float:
-            return float(np.array(ca.densify(ca.Function("number", [symbols], [expression])(theta))).ravel()[0])
-
         bends = [entry for entry in system.elastic_joints if entry.deformation == "bend" and entry.axis]
-        self.bend_joints = tuple(tree.joint_index(entry.joint_name) for entry in bends)
-        self.free_joints = (*self.bend_joints, *(tree.joint_index(name) for name in loose))
+        self.bend_joints = tuple(system.mechanism.joint_index(entry.joint_name) for entry in bends)
+        self.free_joints = (*self.bend_joints, *(system.mechanism.joint_index(name) for name in loose))
         owner = {joint: s.name for s in system.segment_layouts for names in s.link_joints for joint in names}
         self._free_joint_segments = (*(owner.get(entry.joint_name, "") for entry in bends), *[""] * len(loose))
+        sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
+        self.recorded_joint_names = tuple(name for name in system.mechanism.joint_names if name not in sought)
+        self._symbolic = _symbolic_functions(system, self.options, self.free_joints)
+        self._set_values(values)
+
+    def with_parameter_values(self, values: Mapping[str, float] | None) -> ShapeFitter:
+        """Make a fitter with other parameter values. It is quicker than a new one: the equations are known."""
+        other = copy(self)
+        other._set_values(values)
+        return other
+
+    def _set_values(self, values: Mapping[str, float] | None) -> None:
+        system, index = self.system, self.system.mechanism.joint_index
+        self._values = values
+        theta = system.parameters.vector(values)
+        springs = [ca.vertcat(entry.rest_angle, entry.stiffness) for entry in system.elastic_joints]
+        numbers = ca.Function("springs", [system.parameters.symbols], [ca.densify(ca.horzcat(*springs))])(theta)
+        rest, stiff = np.array(numbers)
         self.rest_configuration = np.zeros(system.n_coordinates)
-        for entry in system.elastic_joints:
-            self.rest_configuration[tree.joint_index(entry.joint_name)] = number(entry.rest_angle)
-        stiffness = np.array([number(entry.stiffness) for entry in bends])
+        self.rest_configuration[[index(entry.joint_name) for entry in system.elastic_joints]] = rest
+        stiffness = stiff[[entry.deformation == "bend" and bool(entry.axis) for entry in system.elastic_joints]]
         typical = stiffness.mean() if stiffness.max() > 0 else 1.0
         held_by = np.sqrt(np.maximum(stiffness / typical, _MIN_STIFFNESS_FRACTION)) / _BEND_PRIOR_STD
-        self._prior = np.concatenate([held_by, np.full(len(loose), _WEAK_REGULARISATION)])
-        sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
-        self.recorded_joint_names = tuple(name for name in tree.joint_names if name not in sought)
+        n_loose = len(self.free_joints) - len(self.bend_joints)
+        self._prior = np.concatenate([held_by, np.full(n_loose, _WEAK_REGULARISATION)])
 
         sizes = tube_link_lengths_and_radii(system, values)
         self.link_radii = np.concatenate([np.full(len(lengths), radius) for lengths, radius in sizes.values()])
         self.link_segments = tuple(name for name, (lengths, _) in sizes.items() for _ in lengths)
-        q, numbers = ca.SX.sym("q", system.n_coordinates), ca.SX(ca.DM(theta))
-        kinematics = forward_kinematics(tree, q)
-        corners, seen, held, gap = _expressions(system, kinematics, self.options)
-        held, gap = (ca.substitute(entry, symbols, numbers) for entry in (held, gap))
+        q = ca.SX.sym("q", system.n_coordinates)
 
-        def with_slope(entry: ca.SX) -> Callable[[Array], list[Array]]:
-            outputs = [entry, ca.jacobian(entry, q)[:, list(self.free_joints)]]
-            return dense_function_evaluator(ca.Function("places", [q], list(map(ca.densify, ca.cse(outputs)))))
+        def at_values(function: ca.Function) -> ca.Function:
+            return ca.Function(function.name(), [q], function.call([q, ca.SX(ca.DM(theta))]))
 
-        self._corners, self._seen, self._held = with_slope(corners), with_slope(seen), with_slope(held)
-        ends = [
-            [kinematics.frame_position(getattr(g, name)) for g in system.grasps]
-            for name in ("holder_frame", "held_frame")
-        ]
-        grippers, taken = (ca.densify(ca.vertcat(ca.SX(0, 1), *places)) for places in ends)
-        self._holders, self._gap = ca.Function("holders", [q], [grippers]), ca.Function("gap", [q], [ca.densify(gap)])
-        # how all this moves as the tubes grow
-        full = _expressions(system, forward_kinematics(system.mechanism, q), self.options)[:3]
-        growth = np.zeros((len(theta), len(system.segment_layouts)))
-        for k, segment in enumerate(system.segment_layouts):
-            for symbol in ca.symvar(ca.vertcat(*segment.link_lengths)):
-                index = system.parameters.names.index(symbol.name())
-                growth[index, k] = theta[index]
-        grown = [ca.densify(ca.mtimes(ca.jacobian(entry, symbols), ca.DM(growth))) for entry in full]
-        self._grown = ca.Function("grown", [q], ca.cse(ca.substitute(grown, [symbols], [numbers])))
+        own = {name: at_values(function) for name, function in self._symbolic.items()}
+        self._corners, self._seen, self._held = (dense_function_evaluator(own[k]) for k in ("corners", "seen", "held"))
+        self._holders, self._gap, self._grown = own["holders"], own["gap"], own["grown"]
         at_rest = self._links_at(self.rest_configuration)
         self._lengths = np.linalg.norm(at_rest[:, 1] - at_rest[:, 0], axis=1)
         self._tube_lengths = np.array([self._lengths[self._links_of({name})].sum() for name in self.link_segments])
         # links without successors
-        places = np.array(ca.Function("held", [q], [taken])(self.rest_configuration)).reshape(-1, 3)
+        places = np.array(own["taken"](self.rest_configuration)).reshape(-1, 3)
         apart = np.linalg.norm(at_rest[:, 1][:, None] - np.concatenate([at_rest[:, 0], places]), axis=2).min(axis=1)
         self.free_end_links = tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING_DISTANCE))
 
@@ -384,7 +377,8 @@ class ShapeFitter:
     def make_shape_guess_finder(self) -> ShapeGuessFinder:
         """Make a finder of initial shapes for a system with a free root (`shape_guesses.system_with_free_root`)."""
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
-        return ShapeGuessFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
+        tree = self.system.numeric_mechanism(self._values)
+        return ShapeGuessFinder(self.system, tree, self.rest_configuration, self.bend_joints, lengths)
 
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
@@ -463,9 +457,14 @@ class _Task(NamedTuple):
     anchors: Sequence[ObservedObjectEnd]
 
 
-def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOptions) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Corners of the links, points of the system, grasp errors in standard deviations, and grasp gaps."""
-    tree = kinematics.mechanism
+def _symbolic_functions(system: System, options: ShapeFitOptions, free_joints: Sequence[int]) -> dict[str, ca.Function]:
+    """Functions of the configuration and of all parameters, by name.
+
+    `corners` of the links, `seen` points of the system and errors of `held` frames in standard deviations have
+    derivatives by the free joints as a second output. `gap` of the grasps, `holders` and places `taken` by them.
+    `grown` are derivatives of the first three by the logarithm of each tube's length.
+    """
+    symbols, tree, (q, kinematics) = system.parameters.symbols, system.mechanism, system.symbolic_kinematics
     corners = []
     for segment in system.segment_layouts:
         for i, names in enumerate(segment.link_joints):
@@ -479,4 +478,16 @@ def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOption
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
             rows.append(alignment[-3:] / _GRASP_DIRECTION_STD)
     seen = ca.vertcat(*(kinematics.frame_position(name) for name in system.point_frames))
-    return ca.vertcat(*corners), seen, ca.vertcat(*rows), ca.vertcat(*gaps)
+    full = {"corners": ca.vertcat(*corners), "seen": seen, "held": ca.vertcat(*rows)}
+    outputs = {name: [entry, ca.jacobian(entry, q)[:, list(free_joints)]] for name, entry in full.items()}
+    growth = ca.SX(symbols.numel(), len(system.segment_layouts))
+    for k, segment in enumerate(system.segment_layouts):
+        for symbol in ca.symvar(ca.vertcat(*segment.link_lengths)):
+            index = system.parameters.names.index(symbol.name())
+            growth[index, k] = symbols[index]
+    outputs["grown"] = [ca.mtimes(ca.jacobian(entry, symbols), growth) for entry in full.values()]
+    outputs["gap"] = [ca.vertcat(*gaps)]
+    for name, frames in (("holders", "holder_frame"), ("taken", "held_frame")):
+        places = (kinematics.frame_position(getattr(grasp, frames)) for grasp in system.grasps)
+        outputs[name] = [ca.vertcat(ca.SX(0, 1), *places)]
+    return {name: ca.Function(name, [q, symbols], [ca.densify(e) for e in ca.cse(of)]) for name, of in outputs.items()}

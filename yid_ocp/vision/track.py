@@ -111,17 +111,17 @@ class FrameTracker:
         empty: FrameSequence | None = None,
     ) -> None:
         system, values = scene.system, scene.parameter_values
-        self._loose: tuple[str, ...] = ()
+        loose: tuple[str, ...] = ()
         anywhere = options.root_placement != "model"
         if anywhere and scene.robot_urdf is not None:
             hint = "set track.options.root_placement to model, or model.robot to null"
             what, where = "a robot holds the object, so the model determines its root", "track.options.root_placement"
             raise ConfigError(what, where=where, allowed="model", hint=hint)
         if anywhere:
-            system, self._loose = system_with_free_root(system, values)
+            system, loose = system_with_free_root(system, values)
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
-        self.shape_fitter = self._shape_of(values)
+        self.shape_fitter = ShapeFitter(system, options.shape_fit, values, loose)
         self.make_shape_guess_finder = self.shape_fitter.make_shape_guess_finder() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
         self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
@@ -175,7 +175,7 @@ class FrameTracker:
         last: list[tuple[ShapeFitter, FrameShapeFit]] = []
 
         def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[FrameShapeFit]:
-            shape = self._shape_of(values)
+            shape = self.shape_fitter.with_parameter_values(values)
             begun = [(q,) for q in starts] if len(starts) == len(looks) else [look.starts[0] for look in looks]
             fits = [shape.fit_frame(look.sights[0], look.q, q) for look, q in zip(looks, begun, strict=True)]
             last[:] = [(shape, fit) for fit in fits]
@@ -230,11 +230,9 @@ class FrameTracker:
         used = sizes.estimated_dimension_mask
         key = tuple(np.where(used, sizes.log_ratio, 0.0).tolist()) if any(used) else ()
         if key not in self._shapes:
-            self._shapes[key] = self._shape_of(sizes.parameter_values(self.system, self.parameter_values))
+            values = sizes.parameter_values(self.system, self.parameter_values)
+            self._shapes[key] = self.shape_fitter.with_parameter_values(values)
         return self._shapes[key]
-
-    def _shape_of(self, values: Mapping[str, float] | None) -> ShapeFitter:
-        return ShapeFitter(self.system, self.options.shape_fit, values, self._loose)
 
     def _removed(
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
