@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import SimpleNamespace
 
 import casadi as ca
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import InsufficientMemoryError
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_step, compile_step_like
 from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutInputs, TrackingFeedback
 from yid_ocp.model import (
     EffectStepTerms,
@@ -226,6 +227,10 @@ class Case:
     torque: np.ndarray
     path: np.ndarray
     feedback: TrackingFeedback
+
+    @cached_property
+    def interpreted_step(self) -> Step:
+        return compile_step_like(self.step, self.step.system, use_compiler=False)
 
     def rollout(self, theta=None, start=None, torque=None, path=None, feedback=None, directions=None, step=None):
         chosen = [self.theta, self.start, self.torque, self.path]

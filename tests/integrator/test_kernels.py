@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import compile_step_like, step_derivatives_along_rollout
+from yid_ocp.integrator.step import step_derivatives_along_rollout
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 
@@ -71,7 +71,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
 
 
 def test_interpreter_equals_compiled(parts, case):
-    plain = compile_step_like(case.step, case.step.system, use_compiler=False)
+    plain = case.interpreted_step
     if not case.step.is_compiled:
         pytest.skip("this machine has no C compiler to compare with")
     names = tuple(case.step.system.parameters.names[::2])
@@ -104,10 +104,9 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     rng = np.random.default_rng(8)
     state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
     lam = rollout.multipliers + 0.01 * rng.normal(size=rollout.multipliers.shape)
-    plain = compile_step_like(step, step.system, use_compiler=False)
     one, two = (
-        k.linearize_step_equations(case.theta, state, lam, case.torque, names, True)
-        for k in (step.kernel, plain.kernel)
+        s.kernel.linearize_step_equations(case.theta, state, lam, case.torque, names, True)
+        for s in (step, case.interpreted_step)
     )
     for key in vars(one):
         actual, expected = getattr(one, key), getattr(two, key)
@@ -140,7 +139,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
 
 def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
     """By state, torque and loads that act on every step alike."""
-    sizes, slow = case.step.sizes, compile_step_like(case.step, case.step.system, use_compiler=False)
+    sizes, slow = case.step.sizes, case.interpreted_step
     rollout, rng = case.rollout(), np.random.default_rng(3)
     assert rollout.status.is_converged, rollout.status.message
     rows, momentum = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2)), rng.normal(size=(sizes["n"], 2))

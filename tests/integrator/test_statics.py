@@ -13,7 +13,7 @@ from yid_ocp.integrator.statics import (
     EquilibriumSolver,
     steady_effect_internal_coordinates,
 )
-from yid_ocp.integrator.step import compile_step, compile_step_like, simulate
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -80,7 +80,7 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
     torque = 0.3 * case.torque[0] if len(system.driven) else None
     guess = case.start[: system.n_coordinates].copy()
     guess[fixed] = case.path[0]
-    steps = case.step, compile_step_like(case.step, system, use_compiler=False)
+    steps = case.step, case.interpreted_step
     fast, slow = (EquilibriumSolver(step).solve(given, case.theta, torque, guess, names) for step in steps)
     assert fast.is_converged == slow.is_converged == bool(system.elastic_joints), fast.message
     for name in ("state", "holding_torque", "constraint_reactions"):

@@ -20,7 +20,7 @@ KINDS = ("equilibrium", "estimated", "fitted_to_points")
 def pendulum(urdf_folder):
     """Makes problems on three swings of a double pendulum with springs, whose start depends on what is asked."""
     step, record = swinging_pendulum(urdf_folder)
-    taken = {seed: record(seed, 40, bend=0.3) for seed in (1, 2, 3)}
+    taken = {seed: record(seed, 15, bend=0.3) for seed in (1, 2, 3)}
 
     def make(kind):
         options = ProblemOptions(initial_state=kind, initial_state_fit_window=0.02)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import casadi as ca
@@ -16,7 +17,7 @@ from yid_ocp.data import JointGroup, Recording, SensorChannelGroup, read_recordi
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
@@ -149,15 +150,20 @@ def recorded(urdf: Path) -> Recording:
     return Recording(JointGroup(ARM, t, np.array(q)), name="held", channel_groups=tuple(groups))
 
 
-def problem(system: System, recording: Recording, *free: str, step: float = 0.01, **more) -> EstimationProblem:
+@cache
+def step_of(urdf: Path, kind: str = "point", time_step: float = 0.01) -> Step:
+    return compile_step(holding(urdf, kind, prescribed=ARM), time_step, use_compiler=False)
+
+
+def problem(step: Step, recording: Recording, *free: str, **more) -> EstimationProblem:
     options = ProblemOptions(**{"path_cutoff": np.inf, "weak_prior_geometric_std": 0.0, **more})
-    return EstimationProblem(compile_step(system, step, use_compiler=False), [recording], free, options)
+    return EstimationProblem(step, [recording], free, options)
 
 
 def test_predictions_converge_to_what_mujoco_recorded(urdf: Path, recorded: Recording) -> None:
     errors = []
     for step in (0.01, 0.005):
-        made = problem(holding(urdf, prescribed=ARM), recorded, "T1.bend", step=step)
+        made = problem(step_of(urdf, time_step=step), recorded, "T1.bend")
         evaluation = made.evaluate(made.initial_unknowns)
         pairs = zip(made.episodes[0].measurements, evaluation.episode_predictions[0].predicted_outputs, strict=True)
         errors.append([np.std(y - s.value) / np.std(s.value) for s, y in pairs])
@@ -170,7 +176,7 @@ def test_predictions_converge_to_what_mujoco_recorded(urdf: Path, recorded: Reco
 @pytest.mark.parametrize("kind", ["point", "axis", "weld"])
 def test_the_elbow_bears_what_the_wrist_reads(urdf: Path, recorded: Recording, kind: str) -> None:
     """Effort of the joint before the sensor: the torque about its axis and its damper, however the rod is held."""
-    made = problem(holding(urdf, kind, prescribed=ARM), recorded, "T1.bend", step=0.005)
+    made = problem(step_of(urdf, kind, 0.005), recorded, "T1.bend")
     [found] = made.evaluate(made.initial_unknowns).episode_predictions
     where = next(i for i, s in enumerate(made.episodes[0].measurements) if s.sensor.group_name == "wrist.torque")
     inner, effort = found.predicted_outputs[where][:, 0], found.rollout.effort[2:-1:2, 1]
@@ -189,7 +195,8 @@ def test_slopes_with_effects_are_those_of_differences(urdf: Path, recorded: Reco
     }
     system = holding(urdf, effects=errors | bodies | forces, prescribed=ARM)
     tried = [effect.parameters.names[0] for effect in system.effects]
-    made = problem(system, recorded, "T1.bend", "elbow.mass", "sensor_bias@wrist:lower.torque_z", *tried)
+    step = compile_step(system, 0.01, use_compiler=False)
+    made = problem(step, recorded, "T1.bend", "elbow.mass", "sensor_bias@wrist:lower.torque_z", *tried, duration=0.6)
     x, rows = made.initial_unknowns, made.residual_rows.data
     evaluation = made.evaluate(x)
     for i, size in enumerate(1e-5 * np.maximum(np.abs(x), 0.1)):
@@ -211,7 +218,7 @@ def test_unknown_forces_of_the_smoother_move_these_readings_as_an_effect_does(
     """A curvature at rest is a constant moment at every joint: the chained intervals give the problem's own slopes."""
     seen = replace(recorded, channel_groups=tuple(g for g in recorded.channel_groups if g.name == name))
     curved = holding(urdf, effects={"rest_curvature@T1": {}}, prescribed=ARM)
-    made = problem(curved, seen, "rest_curvature@T1.qx")
+    made = problem(compile_step(curved, 0.01, use_compiler=False), seen, "rest_curvature@T1.qx")
     [model] = residual_models_with_unknown_forces(
         made, made.initial_unknowns, made.evaluate(made.initial_unknowns), interval=0.2
     )
@@ -234,14 +241,14 @@ def test_stiffness_is_found_from_a_wrist_in_mujoco_and_from_a_synthetic_one(
     noise, rng = {"force": 0.1, "torque": 0.01}, np.random.default_rng(0)
     noisy = {q: v + noise[q] * rng.standard_normal(v.shape) for q, v in wrist.values_by_quantity.items()}
     one = replace(recorded, channel_groups=(replace(wrist, values_by_quantity=noisy),))
-    made = problem(holding(urdf, prescribed=ARM), one, "T1.bend", step=0.005)
+    made = problem(step_of(urdf, time_step=0.005), one, "T1.bend")
     write_recording(made.simulate_synthetic_recording({"T1.bend": 4.5}, seed=1), tmp_path / "made.h5")
     again = read_recording(tmp_path / "made.h5")
     assert again.channel_groups[0].names == ("lower",)
     assert again.sensor_setting_keys[2:] == ("wrist.force", "wrist.torque")
     for recording, truth in ((one, 4.0), (again, 4.5)):
         wrist_alone = {"joints.effort": SensorOptions(use=False)}
-        asked = problem(made.system, recording, "T1.bend", step=0.005, sensors=wrist_alone)
+        asked = problem(step_of(urdf, time_step=0.005), recording, "T1.bend", sensors=wrist_alone)
         found = solve(asked, GaussNewton()).parameters["T1.bend"]
         assert abs(found.value - truth) < 4 * found.std < 0.2
 
@@ -250,8 +257,7 @@ def test_noise_of_encoders_is_noise_of_what_the_sensor_weighs(urdf: Path, record
     """The acceleration of the tool is worked out from angles; of the filter's gains the covariance is made."""
     loud = replace(recorded, joints=replace(recorded.joints, position_std=1e-3))
     samples = [
-        problem(holding(urdf, prescribed=ARM), r, "T1.bend", path_cutoff=10.0).episodes[0].measurements
-        for r in (recorded, loud)
+        problem(step_of(urdf), r, "T1.bend", path_cutoff=10.0).episodes[0].measurements for r in (recorded, loud)
     ]
     quiet, noisy = ({s.sensor.group_name: s for s in of} for of in samples)
     assert quiet["wrist.force"].noise_correlation is None
@@ -275,7 +281,7 @@ def test_sensors_that_cannot_be_compared_are_refused(
     wrist = replace(recorded.channel_groups[-1], **changes)
     sensors = {"wrist.force": SensorOptions(**options), "wrist.torque": SensorOptions(use=False)}
     with pytest.raises(DataError, match=message):
-        problem(holding(urdf, prescribed=ARM), replace(recorded, channel_groups=(wrist,)), "T1.bend", sensors=sensors)
+        problem(step_of(urdf), replace(recorded, channel_groups=(wrist,)), "T1.bend", sensors=sensors)
 
 
 def test_a_configuration_names_them_and_keeps_prescribed_arms_prescribed(

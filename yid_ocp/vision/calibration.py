@@ -8,7 +8,7 @@ stamp minus joint time.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, NamedTuple
@@ -294,7 +294,7 @@ class _Calibrator:
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
             state = self._rounds(state, chosen, _STAGE_REACHES[-1], True, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
-            state, found, used = self._rounds(
+            state, cost, used = self._rounds(
                 state, chosen, _RAY_REACH, True, _LAST_STAGE_POINTS, _LAST_STAGE_ITERATIONS
             )
             placed = [(g.stamp, state.measured_to_world_points(g.points)) for g in used]
@@ -309,7 +309,7 @@ class _Calibrator:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
             hint = "check the specified pose, the robot's description and which recording belongs to the frames"
             raise _UntoldError(f"{seen}, for every camera pose and clock offset tried", hint)
-        covariance = found.state_covariance(self.precision)
+        covariance = cost(state).state_covariance(self.precision)
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < _MAX_CLOCK_OFFSET_STD:
             told = f"it moves too little to determine the clock offset: its std is {1e3 * std:.0f} ms"
@@ -357,8 +357,8 @@ class _Calibrator:
 
     def _rounds(
         self, state: CalibrationState, frames: list[CalibrationFrame], reach: float, along: bool, cap: int, rounds: int
-    ) -> tuple[CalibrationState, RobustCostDerivatives, list[CalibrationFrame]]:
-        """The state after some steps on a limited number of points per frame, its cost, and these points."""
+    ) -> tuple[CalibrationState, Callable[[CalibrationState], RobustCostDerivatives], list[CalibrationFrame]]:
+        """The state after some steps on a limited number of points per frame, the cost of states, and these points."""
         chosen = []
         for glimpse in frames:
             points = state.measured_to_world_points(glimpse.points)
@@ -383,7 +383,7 @@ class _Calibrator:
             state = state.with_state_increment(step)
             if np.abs(step).max() < _STEP_TOLERANCE:
                 break
-        return state, cost(state), chosen
+        return state, cost, chosen
 
     def _message(self, state: CalibrationState, covariance: Array, stamp: float) -> str:
         stds = np.sqrt(np.diag(covariance))

@@ -143,8 +143,9 @@ class ShapeFitter:
             return ca.Function(function.name(), [q], function.call([q, ca.SX(ca.DM(theta))]))
 
         own = {name: at_values(function) for name, function in self._symbolic.items()}
-        self._corners, self._seen, self._held = (dense_function_evaluator(own[k]) for k in ("corners", "seen", "held"))
-        self._holders, self._gap, self._grown = own["holders"], own["gap"], own["grown"]
+        quick = (dense_function_evaluator(own[name]) for name in ("corners", "seen", "held", "holders"))
+        self._corners, self._seen, self._held, self._holders = quick
+        self._gap, self._grown = own["gap"], own["grown"]
         at_rest = self._links_at(self.rest_configuration)
         self._lengths = np.linalg.norm(at_rest[:, 1] - at_rest[:, 0], axis=1)
         self._tube_lengths = np.array([self._lengths[self._links_of({name})].sum() for name in self.link_segments])
@@ -431,7 +432,7 @@ class ShapeFitter:
 
     def gripper_positions_at_configuration(self, q: ArrayLike) -> Array:
         """Gripper positions (grasps, 3) [m] at a configuration."""
-        return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
+        return self._holders(np.asarray(q, float))[0].reshape(-1, 3)
 
     def points_at_configuration(self, q: ArrayLike) -> Array:
         """Positions (np, 3) [m] of the system's points at a configuration."""

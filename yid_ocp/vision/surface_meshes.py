@@ -28,6 +28,7 @@ from scipy.interpolate import CubicSpline
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import ConfigError, DataError, ModelError, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, is_file, json_sha256, read_input_text
+from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
@@ -150,11 +151,11 @@ class ArticulatedSurfaces:
         for joint, pose in zip(self.part_joints, poses, strict=True):
             if joint >= 0:
                 pose[:3, :] = ca.horzcat(kinematics.joint_rotations[joint], kinematics.joint_origins[joint])
-        self._poses = ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))])
+        self._poses = dense_function_evaluator(ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))]))
 
     def part_poses_at_configuration(self, q: ArrayLike) -> Array:
         """World poses (parts, 4, 4) of all parts at a configuration."""
-        stacked = np.array(self._poses(np.asarray(q, float)))
+        [stacked] = self._poses(np.asarray(q, float))
         return np.asarray(stacked.reshape(4, len(self.part_joints), 4).transpose(1, 0, 2))
 
     def _near(self, points: Array, part: int, pose: Array, margin: float) -> tuple[IntArray, Array]:
