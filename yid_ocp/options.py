@@ -62,7 +62,7 @@ class Option:
 
 @functools.cache
 def options_by_key(kind: type) -> Mapping[str, Option]:
-    """Options of a dataclass by key. A key is the field name without a trailing `_`."""
+    """Options of a dataclass (fields with an `OptionInfo`), by key. A key is the field name without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
     found = {}
     for entry in dataclasses.fields(kind):

@@ -77,7 +77,7 @@ def solve(
 def add_intervals_and_checks(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
-    """Complete a fit with profile intervals, the error of the discretisation and `checks`. See `solve`."""
+    """Add profile intervals, discretisation errors, held-out predictions and data checks to a fit. See `solve`."""
     start, problem = problem, solution.problem or problem
     if solution.evaluation is not None:
         problem = _with_equilibrium_guesses(problem, solution.evaluation.episode_predictions, ())
@@ -177,7 +177,7 @@ _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 @dataclass(frozen=True)
 class ChosenCableMemoryFit:
-    """Problem and solution with or without cable memory. `message` is the reason, empty if there was no choice."""
+    """Chosen fit, with or without cable memory (`*.memory`). `message` is the reason, empty if there was no choice."""
 
     problem: EstimationProblem
     solution: Solution
@@ -216,7 +216,7 @@ def choose_cable_memory_fit(
 
 
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
-    """Return the problem with the cable's memory parameters fixed at zero."""
+    """Return the problem with the cable's shape memory fractions (`SEGMENT.memory`) fixed at zero."""
     memory = _memory_parameters(problem)
     free = tuple(name for name in problem.free if name not in (*memory, SHAPE_MEMORY_HALVING_SPEED_PARAMETER))
     return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))

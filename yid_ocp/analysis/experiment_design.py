@@ -75,12 +75,12 @@ class UnchangedExperiment:
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group, frame times [s] and typical std [m] of the camera; None and defaults without a camera."""
+        """Points seen by a camera (None without), frame times [s] and typical std [m], or their defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group, sample times [s] and typical std [m] of points measured by arms; None and defaults if none."""
+        """Points measured by arms (None without), sample times [s] and typical std [m], or their defaults."""
         t = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor_name == "arm", t, _DEFAULT_ARM_POINT_STD)
 
@@ -134,7 +134,7 @@ class _MeasurablePoint(NamedTuple):
 
 
 def measurable_points(system: System) -> list[_MeasurablePoint]:
-    """Measurable frames: segment tips, midpoints and markers near the tips; without segments, links and markers."""
+    """List points that could be measured: on segments, or on moving frames and springs if there are none."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[_MeasurablePoint] = []
@@ -229,7 +229,7 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 
 
 class MechanicalVariantSensitivityBuilder:
-    """Builds and caches experiment variants for sets of mechanical changes."""
+    """Computes and caches sensitivities of an experiment with mechanical changes, such as a second arm."""
 
     def __init__(self, setting: UnchangedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting

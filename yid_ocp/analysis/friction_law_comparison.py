@@ -39,7 +39,7 @@ class CrossValidatedFrictionLawFit:
 
 
 def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Recording names by kind (name without number), or singly if kinds are few. Those with motors off are omitted."""
+    """Group recordings by name without final number, or singly if groups are few. Those with motors off are omitted."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
@@ -88,7 +88,7 @@ def mean_and_std_error_over_motion_kinds(
 def prediction_error_difference_and_std_error(
     fit: CrossValidatedFrictionLawFit, other: CrossValidatedFrictionLawFit, kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
-    """Mean over kinds of motion by which one fit's errors exceed another's, and its standard error."""
+    """Mean, over kinds of motion, of one fit's prediction error minus another's, and its standard error."""
     beyond = {name: own - other.left_out_errors[name] for name, own in fit.left_out_errors.items()}
     return mean_and_std_error_over_motion_kinds(beyond, kinds)
 

@@ -135,7 +135,7 @@ def apply_to_each_parameter_at_optimum(
     names: Sequence[str],
     progress: Progress,
 ) -> dict[str, _Found]:
-    """Evaluate `judged(name, unknowns, evaluation)` at the optimum near `x` for each name, in parallel."""
+    """Call `judged` in parallel for each name, with the minimum of the cost near `x` and its evaluation."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 

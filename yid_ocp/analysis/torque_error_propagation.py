@@ -37,7 +37,7 @@ def sensitivities_and_information_with_input_errors(
     finest: Mapping[str, float],
     encoders: EstimationProblem | None = None,
 ) -> tuple[dict[tuple[str, str], Array], Array]:
-    """Sensitivities of the points of episode `i` at every node, and Fisher information of its joint measurements.
+    """Differentiate point positions by unknowns and input errors, and compute joint sensors' information.
 
     In `problem` every point is seen at every node with unit standard deviation. `evaluation` is the evaluation at the
     unknowns `x` (nx,). `finest` is the smallest standard deviation of each group [m]. `encoders` is the problem with

@@ -97,7 +97,7 @@ def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
 
 
 def white_noise_std(t: Array, values: Array) -> float:
-    """Robust standard deviation of a channel's white noise; zero if the clock `t` is uneven or it rests long."""
+    """Robust standard deviation of white noise; zero if times `t` are uneven or most values repeat."""
     if len(t) < NOISE_ESTIMATE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2

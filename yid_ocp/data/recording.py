@@ -106,7 +106,7 @@ class JointGroup(ReprMixin):
 
     @property
     def effort_sampling_kind_or_default(self) -> EffortSamplingKind:
-        """Recorded `effort_kind`. The default is `sample`, which is what robot drivers publish."""
+        """Meaning of effort samples (`effort_kind`). The default is `sample`, which is what robot drivers publish."""
         return self.effort_kind or "sample"
 
     def _summary(self) -> ReprLineAndTableRows:

@@ -66,7 +66,7 @@ class EarlierRunsComparison:
 
 
 def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
-    """Return the problem with a baseline's estimates as a joint prior, in which the baseline's parameters are free.
+    """Return the problem with a baseline's parameters free and its estimates as their joint Gaussian prior.
 
     Raises `ConfigError` if the model lacks a parameter or effect of the baseline, or if a parameter differs between
     recordings.

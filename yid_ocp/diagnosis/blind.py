@@ -69,7 +69,7 @@ def plan_blind_cases(
     chains: frozenset[str] = frozenset(),
     purpose: str = BLIND_ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
-    """Plan `count` blind cases of several experiments, in an order drawn by the seed.
+    """Plan `count` blind test cases in random order, each with an experiment, effect category and size.
 
     `weights` holds the share of cases of each experiment. An experiment with less than `_MIN_CASES_PER_EXPERIMENT`
     cases gets none; if all have less, the largest gets all. Objects of the experiments in `chains` can be simulated
@@ -442,7 +442,7 @@ def record_random_motion(
     rng: np.random.Generator,
     conditions: SyntheticMeasurementConditions,
 ) -> Recording:
-    """Simulate `simulated` at `values` along a random motion planned with the nominal system at `truth`."""
+    """Record a simulation of `simulated` along a random multisine motion planned with the nominal system."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
     if conditions.is_brisk:

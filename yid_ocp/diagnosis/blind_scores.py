@@ -275,7 +275,7 @@ _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
 def permissive_thresholds(limits: Thresholds) -> Thresholds:
-    """Thresholds that call any residual a gap and accept the best candidate, to calibrate the rates of chance."""
+    """Return thresholds with which every residual is a gap and the best candidate is always accepted."""
     sure = 1.0 + 1e-9
     return replace(
         limits,
@@ -373,7 +373,7 @@ def calibrate_thresholds(
     limits: Thresholds = DEFAULT_THRESHOLDS,
     coverage: float = _TARGET_COVERAGE,
 ) -> dict[str, Any]:
-    """Compute thresholds as conformal quantiles, and their effect on the ensemble (`yid-calibration/1`).
+    """Compute diagnosis thresholds as conformal quantiles of blind-test statistics (`yid-calibration/1`).
 
     `labels`, `marks` and `answers` belong to the same cases. An answer holds the `result` with its `statistics` and, if
     no gap was detected, `open`: the statistics with permissive thresholds. `limits` are the thresholds of the answers.
@@ -526,7 +526,7 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
 
 
 def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Judge a recorded case again, from the output of `diagnosis_evidence_to_dict`, and return the part that is scored.
+    """Recompute a diagnosis' verdict from `diagnosis_evidence_to_dict` data with changed thresholds.
 
     The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
     `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,

@@ -115,7 +115,7 @@ class EventSet:
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
     def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
-        """Split into force events, and all other events with the overspeeds."""
+        """Return one set of the force events, and one of the sensor faults and overspeeds."""
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 

@@ -56,7 +56,7 @@ class HeldOutLoss:
 
     @property
     def total_chi2(self) -> float:
-        """Sum of whitened squares over all blocks, plus the chi2 of the deviation from a baseline."""
+        """Sum of chi2 over the held-out time blocks, plus chi2 of the deviation from earlier runs."""
         return float(self.block_chi2.sum()) + self.baseline_chi2
 
     @property
@@ -82,7 +82,7 @@ class StoredFit:
 
 @dataclass(frozen=True)
 class RefitStatistics(StoredFit):
-    """Statistics of a refit used by rules: estimates, and predictions of estimation and held-out recordings."""
+    """Result of a refit without its problem: effects, estimates, cost and held-out prediction errors."""
 
     effects: tuple[EffectBase, ...]
     cost: float
@@ -108,7 +108,7 @@ class RefittedModel(RefitStatistics):
     evaluation: Evaluation
 
     def statistics(self) -> RefitStatistics:
-        """The fit without its problem and evaluation."""
+        """Copy the refit's statistics, without its estimation problem and evaluation, to save memory."""
         return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
 
 

@@ -66,7 +66,7 @@ class CandidateDetectability:
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """Result of a candidate's score test: predicted values, predicted decrease of chi2, and p-value."""
+    """Score test of one candidate effect: predicted parameter values, predicted decrease of chi2, p-value."""
 
     effect: EffectBase
     predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values

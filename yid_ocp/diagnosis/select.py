@@ -43,7 +43,7 @@ UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """An effect added by forward selection: its refitted model, cumulative closure and equivalent effects."""
+    """Effect added by forward selection, with refitted model, closed fraction of the gap and equivalents."""
 
     effect: EffectBase
     refitted_model: RefitStatistics  # refit with all effects up to this one
@@ -74,7 +74,7 @@ def _closed_fraction(before: HeldOutLoss, after: HeldOutLoss) -> float:
 
 
 def leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether a model leaves little but noise, so that squares are log likelihoods; else they are model errors."""
+    """Whether a fit's held-out chi2 per sample is near 1, so that its residual is mainly noise."""
     return fit.held_out_loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
 
 

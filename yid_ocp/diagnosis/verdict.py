@@ -89,14 +89,14 @@ class NominalModelGapEvidence:
         return residuals_exceed_noise(tests, whole) or min(along, default=1.0) * max(len(ranked), 1) < level
 
     def has_enough_samples(self, limits: Thresholds) -> bool:
-        """Whether the effective samples suffice for the unknowns."""
+        """Whether the degrees of freedom of the residual suffice for the nominal model's unknowns."""
         enough = limits.min_samples_per_unknown * len(self.nominal_model.values)
         return self.nominal_test.degrees_of_freedom >= enough
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict and effects that follow from the numbers of a diagnosis, with the statistics behind them."""
+    """Verdict of a diagnosis and the effects that it selects, with the statistics that support them."""
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
     unknown_reason: UnknownVerdictReason
@@ -120,7 +120,7 @@ class Judgement:
 
     @property
     def failed_transfer_checks(self) -> tuple[EffectAmplitudeTransferCheck, ...]:
-        """The checks whose two estimates disagree."""
+        """Checks of effect parameters whose estimation and held-out recordings give different estimates."""
         return tuple(entry for entry in self.transfer_checks if not entry.is_consistent)
 
     @property
@@ -136,7 +136,7 @@ class Judgement:
 
     @property
     def candidate_probabilities(self) -> dict[str, float]:
-        """By label, the probability that a candidate is a cause; without the candidates that others exclude."""
+        """Probability that an effect is a cause, by label, for the selected effects and their equivalents."""
         return {
             effect.label: self.probability * share
             for entry in self.selected_effects
@@ -145,12 +145,12 @@ class Judgement:
 
     @property
     def fitted_or_held_out_explained_fraction(self) -> float:
-        """Fraction of the gap that effects explain: fitted or, for one independent effect, surely held out."""
+        """Explained fraction of the gap: fitted, or if larger the held-out 95 % lower limit of one effect."""
         held_out = self.gap_closure.ci_low if self.independent_effect_count == 1 else 0.0
         return max(self.explained_fraction, held_out)
 
     def required_explained_fraction(self, limits: Thresholds) -> float:
-        """Fraction of the smoother's explanation that the effects are required to explain.
+        """Smallest explained fraction of the gap at which the selected effects are accepted.
 
         For k independent effects it is 1 - (1 - `min_explained_fraction`)^k: each must explain that part of the
         remainder.

@@ -350,7 +350,7 @@ def effort_limit_scaled_parameter_definition(
 def compliance_parameter_definition(
     unit: str, upper: float, prior: tuple[float, float], part: str, reported: str
 ) -> ParameterDefinition:
-    """Define the compliance of `part`, from zero (neutral) to `upper`. `reported` is the unit of its reciprocal."""
+    """Define the compliance parameter of `part`, 0 (rigid) to `upper`. `reported` is the unit of its reciprocal."""
     text, said = f"compliance of the {part}", f"stiffness {reported}"
     return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 

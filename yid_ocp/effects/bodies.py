@@ -90,7 +90,7 @@ class _LinkMass(_ScaledBodies):
 
 
 def system_with_link_mass_factors(system: System, name: str) -> System:
-    """The system with a factor `JOINT.name` on mass and inertia of every arm link, besides the effect `link_mass`."""
+    """Return a copy with a parameter `JOINT.name` per arm link that scales the link's mass and inertia."""
     tree, text = system.mechanism, "mass and inertia of the link on {} over those of the URDF"
     factors = {j: Parameter(f"{j}.{name}", 1.0, "1", 0.2, 3.0, text.format(j)) for j in _joints_with_mass(system)}
     joints = tuple(

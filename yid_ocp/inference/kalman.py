@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 @dataclass(frozen=True)
 class FilterStateTransition:
-    """Linear state transition of a filter from (s, p) to (M (s, p1 + ... + pg), f p), for parameter groups p1 to pg."""
+    """Linear state transition of a filter: s' = M (s, sum of the parameter groups p_i), p' = f p."""
 
     state_rows: Array  # M, shape (ns, ns + m)
     decay: Array  # f, shape (nx - ns,), nx - ns = g m
@@ -217,7 +217,7 @@ def kalman_steps_and_covariance(
     decay: Array,
     variance: Array,
 ) -> tuple[KalmanSteps, Array]:
-    """Prepare successive filter steps. Returns them and the state covariance (nx, nx) after the last step.
+    """Compute k successive Kalman filter steps. Returns them and the state covariance (nx, nx) after the last step.
 
     The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states.
     `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`.

@@ -144,7 +144,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
 def encoder_noise_residual_factor(
     problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
 ) -> Array:
-    """Spread F (nr, K) of the points' residuals by the noise of encoders that move prescribed arms, a draw a column.
+    """Factor F (nr, K) of the covariance F F' that encoder noise of prescribed arms adds to residuals.
 
     F F' is the covariance that this noise adds. A lightly damped object rings with it, which is neither white nor an
     error of the model. `predicted` returns the residual of a problem with redrawn episodes, None where it fails; by

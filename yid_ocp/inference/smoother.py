@@ -329,7 +329,7 @@ def select_and_smooth_unknowns(
     evaluation: Evaluation,
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
 ) -> SmoothedUnknownsResult:
-    """Choose and estimate the groups of unknowns with the largest evidence at a whitened fit `x`."""
+    """Select groups of unknown forces, offsets and biases by log evidence at a fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
         models = residual_models_with_unknown_forces(problem, x, evaluation, limits)
@@ -445,7 +445,7 @@ class GapLocation:
 
 
 def main_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
-    """Choose at most three locations to report: those with a share above `_MIN_NAMED_SHARE`, else the first."""
+    """Select the first three locations of `where` with over 10 % of the gap, or only the first if none has."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
 
@@ -512,7 +512,7 @@ def gap_locations_from_effect_closures(
     rest: Sequence[GapLocation],
     windows: tuple[tuple[float, float], ...],
 ) -> tuple[GapLocation, ...]:
-    """Divide the gap among locations: closed parts belong to the effects' locations, the smoother divides the rest.
+    """Assign the gap parts that effects close to the effects' locations, and the rest by smoother shares.
 
     `before` holds the locations found for the nominal model, `rest` those for the model with the effects. `closed` is
     the part of the gap that the effects at each location close. `windows` are the time windows of locations at which

@@ -256,7 +256,7 @@ class LinearResidualModel:
     torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
 
     def smoothed_unknown_prior_variances(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
-        """Prior variances of all unknowns, group variance plus torque noise, (nd,) [squared reference]."""
+        """Prior variances (nd,) of the unknowns in `reference_std`^2: group variance plus torque noise."""
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 

@@ -376,7 +376,7 @@ def problem_with_held_out_kalman_whitening(
 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """Relinearize filters at the torque offsets of `x` instead of those of `frozen`. Weights are unchanged."""
+    """Relinearize the estimation recordings' whitening filters at the torque offsets of `x`. Weights are unchanged."""
     parts = problem.theta_and_initial_state_deviation
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
@@ -386,7 +386,7 @@ def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, fr
 def problem_with_relinearized_held_out_whitening(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
-    """Relinearize held-out filters at the torque offsets of `x` instead of those of `frozen`."""
+    """Re-estimate the torque offsets in held-out whitening filters at the unknowns `x`; gains stay fixed."""
     before = problem.held_out_theta(frozen)
     at = [(*own, before) for own in problem.held_out_prediction_inputs(x)]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)

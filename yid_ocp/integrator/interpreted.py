@@ -285,7 +285,7 @@ class InterpretedKernel:
 
 
 def dense_function_evaluator(function: Any) -> Callable[[Array], list[Array]]:
-    """Make an evaluator of a CasADi function of one column with dense outputs, for one thread.
+    """Make a fast evaluator of a CasADi function of one vector with dense outputs, for use in one thread.
 
     Without CasADi's conversions between its matrices and arrays it takes a third of the time.
     """

@@ -211,7 +211,7 @@ def step_with_time_step(step: Step, time_step: float) -> Step:
 
 
 def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
-    """Build the step of another system with the time step, rules and (by default) kernel type of `step`."""
+    """Build a step of another system with the time step and integration scheme of `step`."""
     compiled = step.is_compiled if use_compiler is None else use_compiler
     rules = (step.force_split, step.equations.constraint_force_at)
     return compile_step(system, step.time_step, *rules, use_compiler=compiled)

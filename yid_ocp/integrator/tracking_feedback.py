@@ -281,7 +281,7 @@ class RecordedMomentumCorrection:
         return plain
 
     def is_active(self, theta: Array, names: Sequence[str]) -> bool:
-        """Whether an effect shifts the momentum: one of its parameters is in `names`, or is not neutral at `theta`."""
+        """Whether effects can shift the momentum: a parameter is in `names`, or `theta` is not neutral."""
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 

@@ -159,7 +159,7 @@ def _answer(requests: Sequence[_Request]) -> None:
 def call_merged_with_other_threads(
     function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
 ) -> list[_Answer]:
-    """Call `function` on `questions`, merged into one call with those of concurrent `map_with_merged_calls` items."""
+    """Evaluate `questions` in one batch with those of other items of `map_with_merged_calls`."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)

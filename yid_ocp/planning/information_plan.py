@@ -48,7 +48,7 @@ class _ParameterPrecision:
 
 @dataclass(frozen=True, eq=False)
 class InformativeMotionPlan(PlannedMotion):
-    """The best of the informative motions found, with predicted parameter precisions and distances between effects."""
+    """Best informative motion found, with predicted standard deviations and distances between effects."""
 
     parameter_precisions: Mapping[str, _ParameterPrecision]
     # for each pair of effects: distance of the first effect's change from its best imitation by the second effect and

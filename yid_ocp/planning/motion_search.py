@@ -201,7 +201,7 @@ class TargetMotionSearchResult:
 
 
 class TargetMotionSearch:
-    """Shooting problem for a motion. Goal residuals cover several parameter cases, limits only the first."""
+    """Shooting search for a motion to a target. Goal residuals cover several parameter cases, limits only the first."""
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
@@ -288,7 +288,7 @@ class DOptimalityCriterion:
     parameter_columns: tuple[int, ...]
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] and its gradient by the sensitivities `rows` (nr, columns), empty without `slope`."""
+        """Criterion [nat] and, if `slope`, its gradient with respect to sensitivities `rows` (nr, columns)."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
@@ -322,7 +322,7 @@ class EffectDiscriminationCriterion:
         return found
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] and its gradient by the sensitivities `rows` (nr, columns), empty without `slope`."""
+        """Compute the criterion [nat] and its gradient (nr, columns) by the sensitivity matrix `rows`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)

@@ -98,7 +98,7 @@ class EpisodePredictor:
         return replace(episode, fixed_initial_state=start)
 
     def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
-        """Copy of `theta` with the episode's known parameters and the parameters fitted with its initial state."""
+        """Copy parameters `theta`; insert an episode's known ones and those fitted with its initial state."""
         start = episode.fixed_initial_state
         return self._with(theta, {**episode.known_parameters, **({} if start is None else start.fitted_parameters)})
 
@@ -175,7 +175,7 @@ class EpisodePredictor:
         by_unknowns: Array | None = None,
         inputs: CorrectedInputs | None = None,
     ) -> CorrectedInputs:
-        """Corrected inputs of an episode, with the momentum that effects add to the tracking filter's reference.
+        """Correct an episode's inputs, and compute the momentum that effects add to the tracking reference.
 
         `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative with respect to `names` and the
         offset. `inputs` are the corrected inputs of `theta` and `names`, if known.

@@ -195,7 +195,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def positive_unknowns_mask(self) -> BoolArray:
-        """Mask (nx,) of unknowns that stay positive: with bound zero, a positive start, and no effect that may vanish.
+        """Mask (nx,) of nonnegative unknowns with positive start, without amplitudes that may become zero.
 
         An amplitude of zero is a common result. Where an effect has shape parameters, these would lose their influence.
         """
@@ -337,7 +337,7 @@ class EstimationProblem(ReprMixin):
         return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """Episode (with a fitted initial state, if any), theta and initial state deviation per held-out prediction."""
+        """Inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
         x = np.asarray(x, float)
         theta, found = self.held_out_theta(x), []
         for held in self.held_out:

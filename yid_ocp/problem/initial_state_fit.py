@@ -110,7 +110,7 @@ class InitialStateFitter:
         *,
         roughly: bool = False,
     ) -> PrecomputedInitialState:
-        """Fit configuration and momentum to the first frame's points and their change within the window.
+        """Fit the initial configuration and momentum to the points measured in the first `window` seconds.
 
         `configuration` (nk,) holds the driven, then the prescribed coordinates at node 0. Only points of `samples` are
         used, in the first `window` [s]. `path` (N + 1, nc) holds the prescribed coordinates at all nodes. `roughly`

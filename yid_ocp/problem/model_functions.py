@@ -54,7 +54,7 @@ class CorrectedInputs:
     def feedback_with_corrected_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
-        """Tracking filter whose reference is corrected to true angles and by the effects' momentum shift."""
+        """Correct a feedback's reference from measured to true angles, and add the momentum due to effects."""
         turned = None if self.driven_angles_sensitivity is None else self.driven_angles - measured
         if feedback is None or (turned is None and self.momentum_shift is None):
             return feedback
@@ -351,7 +351,7 @@ class ModelFunctions:
 
     @property
     def recorded_momentum_correction(self) -> RecordedMomentumCorrection:
-        """Calculator of the momentum that effects add to the tracking filter's reference in each step."""
+        """Correction of the tracking feedback's reference momentum for the effects in the model."""
         return self._momentum(None)
 
     def compiled_sensor_function(

@@ -38,7 +38,7 @@ class MultivariateGaussianPrior:
         return MultivariateGaussianPrior(self.parameter_names, self.covariance * np.outer(by, by))
 
     def restricted_to(self, names: Sequence[str]) -> MultivariateGaussianPrior:
-        """Marginal prior of those of the named parameters that it covers, in the given order."""
+        """Return the marginal prior of those named parameters that have this prior, in the given order."""
         at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
         return MultivariateGaussianPrior(tuple(self.parameter_names[i] for i in at), self.covariance[np.ix_(at, at)])
 

@@ -129,7 +129,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
 def misfit_summary_blocks(
     fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
 ) -> SummaryBlockOrTextIterator:
-    """Conclusions on a poor fit: baselines that predict better, the misfit, and values that are still meaningful.
+    """Summarise a poor fit: channels worse than a naive baseline, misfit, and still meaningful parameters.
 
     A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 %.
     """

@@ -251,7 +251,7 @@ class Sensor(ABC):
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """Names of the joints whose effort the sensor reads; efforts are filtered like the prescribed path."""
+        """Names of the joints whose measured efforts the sensor predicts; empty if it measures no efforts."""
         return ()
 
     @property

@@ -74,7 +74,7 @@ class GaussNewton(SolverWithCheckedSettings):
 
     @property
     def with_coarse_tolerances(self) -> GaussNewton:
-        """The same method for a search whose result is only a start, to a small part of the standard deviations."""
+        """Return this solver with looser step and cost tolerances, for preliminary searches."""
         steps, costs = max(self.step_tolerance, 1e-3), max(self.cost_tolerance, 1e-5)
         return replace(self, step_tolerance=steps, cost_tolerance=costs)
 

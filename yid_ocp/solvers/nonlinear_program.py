@@ -47,7 +47,7 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function y(v; d, s) with its derivatives, such as the equations of one step.
+    """Symbolic function y(v; d, s) of local variables v, data d and shared data s, with derivatives by v.
 
     v are local variables, d data and s data shared by all calls. `jacobian` dy/dv (ny, nv) is derived from the value by
     default. Derivatives can be compiled. The value stays a CasADi expression, so that terms built on it can be

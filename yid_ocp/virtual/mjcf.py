@@ -87,7 +87,7 @@ class ExpressionEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Keys of `FORMAT_ELEMENTS` whose part of the system's description depends on `symbols`."""
+    """Find the model aspects (keys of `FORMAT_ELEMENTS`) whose expressions depend on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -118,7 +118,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ExpressionEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
-    """Terms by joint that an effect adds, and the `FORMAT_ELEMENTS` keys that it changes."""
+    """Find the joint terms that an effect adds, by joint, and the keys of the model aspects it changes."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:

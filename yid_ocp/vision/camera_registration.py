@@ -239,7 +239,7 @@ class RobustCostDerivatives:
     score_covariance: Array
 
     def data_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
-        """Weighted Hessian and gradient of the data, and the weight. `precision` is the prior's inverse covariance."""
+        """Return weight * Hessian, weight * gradient, and the weight. `precision` is the prior's inverse covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
         excess = np.linalg.solve(whole, self.score_covariance * np.outer(scale, scale))

@@ -160,7 +160,7 @@ def tracked_states_and_points(
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Arrays of `TrackResult`: times, configurations, positions, standard deviations and their shared part.
+    """Collect the good frames' times, configurations, point positions and stds, and the calibration's stds.
 
     Only good frames and the system's points with the indices `columns` are included. Raises `DataError` if no frame is
     good, or if no point is known well enough in any frame.

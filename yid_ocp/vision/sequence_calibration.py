@@ -102,7 +102,7 @@ def foreign_objects_from_clusters(
     coloured: bool,
     background: bool = False,
 ) -> tuple[ForeignObject, ...]:
-    """Foreign objects, with advice, from the clusters of all frames, each with its time [s]; rare ones are left out.
+    """Group foreign point clusters over frames into objects; objects seen in too few frames are omitted.
 
     `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
     `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already

@@ -108,7 +108,7 @@ class ShapeFitQuality:
     foreign_clusters: tuple[ForeignCluster, ...]  # foreign clusters near the shape, the largest first
 
     def covered_fraction_of_visible_links(self, lengths: Array) -> float:
-        """Fraction of the visible length of links (`lengths` (K,) [m]) with own points; 0 if none is visible."""
+        """Fraction of the links' visible length on which measured points lie; 0 if no link is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 

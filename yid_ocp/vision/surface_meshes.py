@@ -72,7 +72,7 @@ class ExtraMesh:
 
 @dataclass(frozen=True)
 class SceneModel:
-    """Robot and object in a camera's view."""
+    """Contents of a camera's scene: system, robot URDF, parameter values and extra meshes."""
 
     system: System
     robot_urdf: str | Path | None = None  # URDF with the robot's meshes (`package:baxter`); None for the object alone
@@ -308,7 +308,7 @@ def load_robot_meshes_by_joint(
 
 
 def mesh_sources_sha256(urdf: str | Path, mechanism: Mechanism) -> str:
-    """SHA-256 of all from which `load_robot_meshes_by_joint` makes visual meshes: files and where joints carry them."""
+    """Hash (SHA-256) of the files and link poses from which a robot's visual meshes are built."""
     path = resolve_urdf_path(urdf)
     robot = ElementTree.fromstring(read_input_text(path))
     links = [name for entry in robot.iter("link") if (name := entry.get("name", "")) in mechanism.frames]

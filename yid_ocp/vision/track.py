@@ -301,7 +301,7 @@ class FrameTracker:
         return work.report
 
     def frame_processing_stages(self, frame: FrameReport, common: SharedFrameEstimates) -> FrameProcessingStages | None:
-        """Processing stages of a frame, for figures. None if its cloud cannot be read."""
+        """Return a frame's raw cloud, filtered cloud and skeleton for figures. None if its cloud cannot be read."""
         calibration = common.camera_calibration
         try:
             cloud = calibration.camera_state.measured_to_world_points(self.sequence.load_cloud(frame.index))

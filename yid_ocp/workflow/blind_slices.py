@@ -27,7 +27,7 @@ _SLICE_FORMAT = "yid-blind-slice/1"
 
 
 def write_slice(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write `slice.json`, with labels, answers and the hash of their ensemble. Returns its contents."""
+    """Write part of a blind validation (labels, answers and settings hash) to `slice.json`. Returns its contents."""
     written: dict[str, Any] = to_json_types({"format": _SLICE_FORMAT, **found})
     written["ensemble_sha256"] = _ensemble_sha256(written)
     write_strict_json(folder / "slice.json", written)
@@ -44,7 +44,7 @@ def _ensemble_sha256(part: Mapping[str, Any]) -> str:
 def score_joined_slices(
     files: Sequence[str | Path], out: str | Path, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[None]:
-    """Score slices of one ensemble together, from their files `slice.json` or the folders of these files.
+    """Join slices (separately computed parts) of a blind validation, and score all their cases.
 
     `out` receives the files of a whole ensemble without recordings, so that the ensemble can be judged again. Raises
     `DataError` if a slice belongs to another ensemble or is given twice, or if labels were changed.
@@ -92,7 +92,7 @@ def _labels(part: Mapping[str, Any]) -> list[blind.CaseGroundTruth]:
 def score_slices(
     parts: Sequence[Mapping[str, Any]], folder: Path, runs: Sequence[RunSettings], progress: Progress
 ) -> CommandOutcome[None]:
-    """Score the answers of slices of one ensemble against their labels, and write the result."""
+    """Score the diagnoses of blind validation cases against their true labels, and write the result."""
     first, pairs = parts[0], [pair for part in parts for pair in zip(_labels(part), part["answers"], strict=True)]
     best = {case: value for part in parts for case, value in part["best"].items()}
     pairs.sort(key=lambda pair: pair[0].case)

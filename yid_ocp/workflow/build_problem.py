@@ -143,7 +143,7 @@ def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> No
 def build_problem(
     run: RunSettings, step: Step | None = None, reference_recordings: Sequence[Recording] = ()
 ) -> EstimationProblem:
-    """Build the estimation problem of a run, with the marker positions of `reference_recordings`.
+    """Build the estimation problem that a run's settings and recordings define.
 
     Raises `ConfigError`, `DataError` or `ModelError` if settings, recordings or names are inconsistent, a grasp cannot
     be closed, or a recording is unusable. With `recordings.stop_on_any_issue`, any issue raises an error.

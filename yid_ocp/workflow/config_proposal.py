@@ -107,7 +107,7 @@ class ProposedConfigChoices:
 
     @property
     def is_identified_from_efforts(self) -> bool:
-        """Whether only joint efforts depend on the object, or prescribed arms have no object."""
+        """Whether efforts alone identify the model, as arms are prescribed and no object is observed."""
         seen = any(not group.startswith("imu") for group in self.point_placements)
         return self.arm_mode == "prescribed" and not (self.has_object and seen)
 

@@ -41,7 +41,7 @@ _Plan = TargetMotionPlan | InformativeMotionPlan
 def run_plan(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[_Plan]:
-    """Plan the motion of a run's goal, and write recording, CSV tables, `trajectory.json`, result.json and report.
+    """Plan a motion for the goal `plan.goal`; write it as recording, CSV and JSON, with result and report.
 
     The command is successful if the goal is reached within all limits; otherwise the run folder holds the reason.
     """

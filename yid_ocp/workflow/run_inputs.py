@@ -54,7 +54,7 @@ def load_plugins(run: RunSettings) -> None:
 
 
 def plugin_versions() -> dict[str, str]:
-    """Package and version of every entry point of `_ENTRY_POINT_GROUP`."""
+    """Return the package and version of each installed plugin (entry point group `yid_ocp.effects`)."""
     return {f"entry point {entry.name}": _distribution(entry) for entry in _installed()}
 
 

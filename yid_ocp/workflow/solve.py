@@ -76,7 +76,7 @@ run_from_arguments = make_settings_command(run_solve, "live")
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> ChosenCableMemoryFit:
-    """Solve with the run's solver, log every iterate, and decide whether a cable keeps its memory."""
+    """Estimate with the run's solver, and choose between the fits with and without a cable's shape memory."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.solve(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
@@ -154,5 +154,5 @@ def solution_to_result_dict(
 def discretisation_shifts_to_dict(
     shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Convert the shifts of estimates with more links or shorter steps for result.json, beside the `std` of noise."""
+    """Convert discretisation shifts of estimates, with their `std` from noise, to a dictionary."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}

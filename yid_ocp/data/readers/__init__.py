@@ -55,7 +55,7 @@ def reader_option_names(path: str | os.PathLike[str]) -> list[str]:
 
 
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:
-    """Preview the data sources of a file in any known format, with options for `read_any`, and its errors."""
+    """List the data sources of a file in any known format, and suggest options of `read_any` to import it."""
     path = Path(path)
     known_as = _format_of(path)
     if known_as in FILE_PREVIEWERS:

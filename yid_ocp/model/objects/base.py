@@ -139,7 +139,7 @@ class InitCommandObject:
 
 @dataclass(frozen=True)
 class InitCommandObjectFactory:
-    """Template of an object for one value of `init --object`.
+    """Default link number and builder of an object that `init --object` can name.
 
     `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
     Raises `ConfigError` if an input is missing.
@@ -288,5 +288,5 @@ OBJECT_KINDS: Registry[type[ObjectBuilder]] = Registry("kind")
 
 
 def init_command_object_factories() -> dict[str, InitCommandObjectFactory]:
-    """Templates of all object kinds, by their word for `init --object`."""
+    """Templates of flexible objects by the value of `init --object` that selects them."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_factories.items()}
