@@ -250,20 +250,17 @@ def estimate_shifts_by_discretisation(
 
 
 def _refined_problem(problem: EstimationProblem, what: RefinementKind) -> _FinerDiscretisationProblem:
-    options = problem.options
-    if what == "time_step" or options.divided_links_model is None:
+    options, fine = problem.options, problem.options.divided_links_model
+    if what == "time_step" or fine is None:
         return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
     recordings = [episode.recording for episode in problem.episodes]
-    steps, factors = sum(e.grid.steps for e in problem.episodes), options.divided_links_model.parameter_factors
-    step = step_with_time_step(
-        options.divided_links_model.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE),
-        problem.step.time_step,
-    )
+    steps, factors = sum(e.grid.steps for e in problem.episodes), fine.parameter_factors
+    built = fine.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE)
+    step = step_with_time_step(built, problem.step.time_step)
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
-    made = EstimationProblem(
-        step, recordings, problem.free, replace(options, prior_stds=priors, multivariate_prior=joint)
-    )
+    options = replace(options, prior_stds=priors, multivariate_prior=joint)
+    made = EstimationProblem(step, recordings, problem.free, options)
     joints = _fine_joints_by_coarse_joint(problem.system, step.system)
     return _FinerDiscretisationProblem(made, factors, joints)
 

@@ -190,10 +190,8 @@ def _read_group(
 
 
 def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
-    is_real = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    raise_data_error_unless(
-        is_real, "this is not a dataset of real numbers", where, "floating point or integer numbers"
-    )
+    good = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
+    raise_data_error_unless(good, "this is not a dataset of real numbers", where, "floating point or integer numbers")
     found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
     hint = f"convert the values to {unit}, and change the attribute: recordings are never converted silently"
     raise_data_error_unless(found == unit, f"the unit is '{found}'", where, unit, hint)

@@ -142,10 +142,8 @@ def _candidate_detectable_amplitudes(
         variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
         sizes = np.where(np.diag(information) > 1e-16, z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
         room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
-        amplitudes = dict(zip(names, map(float, sizes), strict=True))
-        found.setdefault(effect.label, []).append(
-            CandidateDetectability(effect, amplitudes, bool(np.any(sizes < room)))
-        )
+        least = dict(zip(names, map(float, sizes), strict=True))
+        found.setdefault(effect.label, []).append(CandidateDetectability(effect, least, bool(np.any(sizes < room))))
     return tuple(
         min(own, key=lambda e: (not e.is_detectable, min(e.detectable_amplitudes.values()))) for own in found.values()
     )

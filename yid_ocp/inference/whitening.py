@@ -209,7 +209,7 @@ def _filter_steps(
     (before, after), by_effort = ordered.by_state, ordered.by_effort.sum(axis=0)
     ends = np.cumsum([0, *map(len, rows_of_node)])
     # stepwise matrices of all steps stand together, so that a column is filtered in one call
-    moves, whitening = np.empty((count, ns, len(columns))), list[Array]()
+    moves, blocks = np.empty((count, ns, len(columns))), list[Array]()
     observe, by_torque, projected = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu)), np.empty((ends[-1], na))
     for state, effort in step_derivatives_along_rollout(
         course.model_functions.step, course.theta, course.rollout, inputs, feedback
@@ -227,12 +227,10 @@ def _filter_steps(
         observe[own, :ns] += before[own]
         starts, noise = (ends[span.start : span.stop + 1] - own.start).tolist(), (inputs.shape[2] - nu, decay[span])
         steps, covariance = kalman_steps_and_covariance(covariance, observe[own], starts, move, *noise, variance[span])
-        whitening.append(steps.whitening)
+        blocks.append(steps.whitening)
         projected[own] = steps.projected_covariance
         begun = span.stop
-    kalman = KalmanSteps(
-        ends.tolist(), moves, inputs.shape[2] - nu, decay, observe, np.concatenate(whitening), projected
-    )
+    kalman = KalmanSteps(ends.tolist(), moves, inputs.shape[2] - nu, decay, observe, np.concatenate(blocks), projected)
     return _FilterPart(0, order, step_of_row, kalman, by_torque), covariance
 
 

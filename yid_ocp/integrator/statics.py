@@ -314,9 +314,8 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     """Sum of 1/2 gain (u - q)^2 over all servos [J]; limits and damping do not change the lowest equilibrium."""
     at = zip(system.driven, system.actuated_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
     known = ((system.servos[name], part, q[i]) for name, i, part in at)
-    return sum(
-        (0.5 * servo.gain * servo.position_error(command, angle) ** 2 for servo, command, angle in known), ca.SX(0)
-    )
+    energies = [0.5 * servo.gain * servo.position_error(command, angle) ** 2 for servo, command, angle in known]
+    return sum(energies, ca.SX(0))
 
 
 def measured_angle_hold_stiffness(system: System, known: bool) -> float:

@@ -197,9 +197,7 @@ def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
 def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array) -> bool:
     """Whether the final position of the point and its standstill are the same with half the time step."""
     pairs = ((rows.simulator, 1), (finer, 2))
-    own, other = (
-        mover.frame_positions_along_states(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs
-    )
+    own, other = (arm.frame_positions_along_states(rows.point, arm.simulate_path(w).state[::n]) for arm, n in pairs)
     change = (other - own)[rows.simulator.standstill_node_indices]
     place = np.linalg.norm(change[:, 0], axis=1).max()
     speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step

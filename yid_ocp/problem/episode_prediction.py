@@ -240,16 +240,15 @@ class EpisodePredictor:
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
-            rollouts = iter(
-                simulate_rollouts(self.integrator_step, [p.member for p in prepared if not isinstance(p, str)])
-            )
+            members = [p.member for p in prepared if not isinstance(p, str)]
+            rollouts = iter(simulate_rollouts(self.integrator_step, members))
             pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 
-        width = (
-            len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices) if derivatives else 0
-        )
-        each = [8 * (e.grid.steps + 1) * self.integrator_step.sizes["nx"] * (width + 1) for e, *_ in queries]
+        width = len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices)
+        each = [
+            8 * (e.grid.steps + 1) * self.integrator_step.sizes["nx"] * (derivatives * width + 1) for e, *_ in queries
+        ]
         found: list[EpisodePrediction | str] = []
         while len(found) < len(queries):
             held = np.cumsum(each[len(found) :][:_MAX_PARALLEL_ROLLOUTS])
@@ -555,12 +554,10 @@ def _error(
     """Root mean square error of the first points at an initial state [stds]; infinite if it is no equilibrium."""
     if start.failure_message:
         return math.inf
-    state = start.state[None]
+    state, names = start.state[None], predictor.unknowns.free_parameter_names
     squares: list[Array] = []
     for samples in seen:
-        read = predictor.model_functions.compiled_sensor_function(
-            samples.sensor, predictor.unknowns.free_parameter_names
-        )
+        read = predictor.model_functions.compiled_sensor_function(samples.sensor, names)
         predicted = read(TimeGridStateValues.from_trajectory(predictor.integrator_step, state), theta).output
         squares.append(samples.whitened_residual(predicted)[samples.positive_weight_mask] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))

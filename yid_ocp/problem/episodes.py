@@ -225,18 +225,15 @@ def prepare_episode(
     gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level.
     """
     step, system = functions.step, functions.step.system
-    recording = recording.with_effort_sampling_kind(
-        options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_sampling_kind
-    )
+    efforts = options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
+    recording = recording.with_effort_sampling_kind(efforts.effort_sampling_kind)
     grid = recording_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         what = "the arms of the model are driven, but the recording has no joints"
         where, hint = f"recording '{recording.name}'", "import the joints too, or set model.arms.mode: prescribed"
         raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
-    low_pass = LowPassFilter(options.path_cutoff)
-    path = prescribed_coordinates_at_nodes(
-        recording, system, grid, low_pass, options.clamp_pose_definitions_from_points
-    )
+    low_pass, clamps = LowPassFilter(options.path_cutoff), options.clamp_pose_definitions_from_points
+    path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, clamps)
     arm = smooth = np.zeros((grid.steps + 1, 0))
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
@@ -319,10 +316,8 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
     velocity = np.zeros((len(places), *q.shape))
     velocity[range(len(places)), :, places] = 1.0
     still = np.broadcast_to(q, velocity.shape).reshape(-1, q.shape[1])
-    momentum = generalized_momentum_from_velocity(step, still, velocity.reshape(still.shape), theta).reshape(
-        velocity.shape
-    )
-    return momentum[:, :, places].transpose(1, 2, 0)
+    momentum = generalized_momentum_from_velocity(step, still, velocity.reshape(still.shape), theta)
+    return momentum.reshape(velocity.shape)[:, :, places].transpose(1, 2, 0)
 
 
 def _samples(

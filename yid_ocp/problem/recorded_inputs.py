@@ -148,10 +148,8 @@ def _courses(
 def _with_lost_samples(t: Array, values: Array) -> tuple[Array, Array]:
     """Times and rows of a channel (N, k), with lost samples of an even clock added by linear interpolation."""
     lost = np.rint(np.diff(t) / median_sample_period(t)).astype(int) - 1
-    between = [
-        t[i] + (t[i + 1] - t[i]) * np.arange(1, n + 1) / (n + 1) for i, n in enumerate(lost) if 0 < n <= _MAX_LOST
-    ]
-    times = np.sort(np.concatenate([t, *between]))
+    added = [t[i] + (t[i + 1] - t[i]) * np.arange(1, n + 1) / (n + 1) for i, n in enumerate(lost) if 0 < n <= _MAX_LOST]
+    times = np.sort(np.concatenate([t, *added]))
     return times, np.stack([np.interp(times, t, column) for column in values.T], axis=1)
 
 

@@ -151,9 +151,8 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
             names = parse_renamings(options.joints, "joint", where)
             _check_known(names, group.names, "joint", where)
         at = [group.names.index(name) for name in names]
-        channels: dict[str, Any] = {
-            name: factors[name] * values[:, at] for name, values in group.values_by_channel.items()
-        }
+        recorded = group.values_by_channel.items()
+        channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in recorded}
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)

@@ -68,10 +68,8 @@ model:
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
         """Build the three tubes of the foam Y. Nominal joint stiffnesses are those for four links with any `links`."""
         n = link_division
-        links = self.links * n
-        return [
-            replace(s, links=links, bend=s.bend * n, twist=s.twist * n, damping=damping * n) for s in foam_y_segments()
-        ]
+        links, damping = self.links * n, damping * n
+        return [replace(s, links=links, bend=s.bend * n, twist=s.twist * n, damping=damping) for s in foam_y_segments()]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         root = _FOOT_POSE if self.mount is None else None
