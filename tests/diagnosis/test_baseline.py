@@ -33,7 +33,7 @@ recordings: {estimate: [bare.h5]}
 parameters:
   beam.bend: {free: true, initial: 0.015}
   beam.damping: {free: true, initial: 8.0e-5}
-problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, initial_configuration_prior_std: 0.2,
+problem: {time_step: 0.01, initial_state: estimated, initial_configuration_prior_std: 0.2,
           initial_velocity_prior_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
 output: {write_report: false, discretisation_check: none}

@@ -45,7 +45,7 @@ recordings:
   estimate: [{recording}]
 parameters:
 {parameters}
-problem: {{path_cutoff: .inf, use_compiler: false}}
+problem: {{path_cutoff: .inf}}
 output: {{write_report: false}}
 """
 
