@@ -141,7 +141,6 @@ def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothi
     done = cli(
         "solve", repository / "configs" / "single_arm_no_vision.yaml",
         "--set", "model.object={kind: foam_y, links: 1, mount: {xyz: [2.5, 0, -0.93]}}",
-        "--set", "problem.use_compiler=false",
     )  # fmt: skip
     assert_refused(done, "grasp 'left' cannot be closed", "mm are missing", "model.grasp.left")
     left_nothing()

@@ -30,7 +30,7 @@ def robot(side: str):
     system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
     model = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
-    step = compile_step(system, TIME_STEP, use_compiler=False)
+    step = compile_step(system, TIME_STEP)
     return names, step, pin.buildReducedModel(model, locked, pin.neutral(model))
 
 
