@@ -97,6 +97,8 @@ class InterpretedKernel:
             return float(np.abs(change[: self._coordinates]).max(initial=0.0))
 
         tolerance, error = self._model.tolerance, 0.0
+        if not len(self._unknown):  # all coordinates are prescribed
+            return NewtonStatusCode.OK, error, 1
         for iteration in range(1, NEWTON_ITERATION_LIMIT + 1):
             residual = value(point)[self._residual, 0]
             if not np.isfinite(residual).all():
