@@ -6,9 +6,8 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from small_problems import swinging_pendulum
+from small_problems import pendulum_step, swinging_pendulum, taken
 
-from yid_ocp.data import read_recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
@@ -31,14 +30,16 @@ def pendulum(urdf_folder):
 
 
 @pytest.fixture(scope="module")
-def arm(single_arm, clean):
-    """Makes problems on one arm under its tracking filter, at rest in a shape that depends on the stiffness."""
-    step = compile_step(single_arm, H)
-    recordings = [read_recording(clean / f"single_arm_vision_{name}.h5") for name in ("estimate", "held_out")]
+def arm(urdf_folder):
+    """Makes problems on a driven pendulum under its tracking filter, at rest where its spring and weight let it."""
+    step = compile_step(pendulum_step(urdf_folder, driven=("shoulder",)).system, H)
+    recordings = [taken(step, seed) for seed in (1, 2)]
 
     def make(kind):
         options = ProblemOptions(initial_state=kind, duration=0.15)
-        return EstimationProblem(step, recordings[:1], ("T1.bend", "T2.bend"), options, held_out=recordings[1:])
+        return EstimationProblem(
+            step, recordings[:1], ("elbow.stiffness", "elbow.damping"), options, held_out=recordings[1:]
+        )
 
     return make
 

@@ -79,7 +79,7 @@ COARSE = vision.DepthSensorModel(
 def tracked(system, run, recording, shape):
     """tracked(**camera and timing): frames, their track, the errors of all points in the good ones [m].
 
-    Stamps are 60 ms late, those of some frames 0.15 s more, and five frames are compared with the arm.
+    Stamps are 60 ms late, those of some frames 0.15 s more, and four frames are compared with the arm.
     """
 
     def make(outliers=0.0, seed=0, late=(), **timing):
@@ -88,7 +88,7 @@ def tracked(system, run, recording, shape):
         camera = vision.VirtualCameraSetup(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = vision.render_virtual_frames(scene, run.t, run.q, camera)
         options = vision.TrackOptions(
-            calibration=vision.ArmBasedCameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames
+            calibration=vision.ArmBasedCameraCalibrationOptions(n_frames=4), tracked_points=system.point_frames
         )
         made.sequence.stamps[list(late)] += 0.15
         found = track_object(scene, recording, made.sequence, options)

@@ -91,7 +91,7 @@ def told_pose(turn, shift, rng):
     return pose
 
 
-def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=0.0, duration=4.0, frames=8, **options):
+def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=0.0, duration=4.0, frames=6, **options):
     """A calibration, and the true state."""
     rng = np.random.default_rng(seed)
     motion = options.pop("motion", lively)
@@ -162,7 +162,7 @@ def test_slopes_of_the_rows_are_derivatives(robot):
 
 @pytest.mark.parametrize("wrong", [{}, {"turn": 4.0, "shift": 0.04, "latency": -0.3}, {"scale": 0.96, "latency": 0.4}])
 def test_pose_depth_and_clock_are_found(robot, clean, wrong):
-    found, true = found_of(robot, 3, frames=6, **wrong) if wrong else clean
+    found, true = found_of(robot, 3, frames=5, **wrong) if wrong else clean
     error, relative = displaced(found, true)
     assert np.abs(error).max() < 0.01
     assert np.abs(relative).max() < 4
@@ -225,7 +225,7 @@ def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
 
 
 def test_drift_is_found_where_the_recording_is_long(robot, clean):
-    found, _ = found_of(robot, 5, drift=1e-3, duration=60.0, frames=8, latency=0.05)
+    found, _ = found_of(robot, 5, drift=1e-3, duration=60.0, frames=5, latency=0.05)
     std = std_of(found, CLOCK_DRIFT_INDEX)
     assert std < 2.5e-4
     assert abs(found.camera_state.clock_drift - 1e-3) < 4 * std
@@ -237,8 +237,8 @@ def test_drift_is_found_where_the_recording_is_long(robot, clean):
 
 
 def test_frames_stamped_late_do_not_pull(robot):
-    late = np.zeros(8)
-    late[[2, 5]] = 0.15
+    late = np.zeros(6)
+    late[[2, 4]] = 0.15
     found, true = found_of(robot, 6, late=late)
     assert abs(found.camera_state.clock_offset - true.clock_offset) < max(4 * std_of(found), 0.004)
     rng = np.random.default_rng(0)
@@ -256,7 +256,7 @@ def test_frames_stamped_late_do_not_pull(robot):
 def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
     before = np.zeros(3)
     for shift, turn in ((0.0, 0.0), (0.03, 2.0)):
-        found, true = found_of(robot, 7, shift=shift, turn=turn, fix_pose=True, frames=5)
+        found, true = found_of(robot, 7, shift=shift, turn=turn, fix_pose=True, frames=4)
         assert np.array_equal(found.camera_state.pose, found.prior_state.pose)
         assert found.camera_state.depth_scale == 1.0
         assert ("contradicts" in found.message) == (shift > 0)
@@ -281,10 +281,10 @@ def test_speed_and_time_enter_the_standard_deviation(clean):
 
 def test_refused_where_the_arm_does_not_tell(robot):
     with pytest.raises(DataError, match="moves too little") as caught:
-        found_of(robot, 9, motion=still, frames=4)
+        found_of(robot, 9, motion=still, frames=3)
     assert "search_half_width: 0" in caught.value.hint
     known = CameraClockOptions(search_half_width=0.0)
-    found, true = found_of(robot, 9, motion=still, clock=known, turn=2.0, shift=0.02, frames=5)
+    found, true = found_of(robot, 9, motion=still, clock=known, turn=2.0, shift=0.02, frames=4)
     assert np.abs(displaced(found, true)[1]).max() < 4
     assert "as given" in found.message
     away = look_at_pose([1.9, 0.6, 0.8], [4.0, 0.6, 0.8])

@@ -13,7 +13,7 @@ from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CalibrationSt
 from yid_ocp.vision.track import FrameTracker, track_object
 
 MILLIMETRE = 1e-3
-LATENCY, CALIBRATION_FRAMES = 0.06, 5
+LATENCY, CALIBRATION_FRAMES = 0.06, 4
 
 
 @pytest.fixture(scope="module")
