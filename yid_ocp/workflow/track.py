@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,6 +70,8 @@ def _run_track(
         try:
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.settings, system)
+                config = tasks.work_folder / _CONFIG_FILE
+                _LAST_TRACKER[:] = [((read_input_text(config), config), tracker)]
                 doubts = [] if recording is None else all_recording_quality_issues(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_shared_values()
@@ -347,9 +349,13 @@ def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[s
     return dict(to_lossless_plain_data(found))
 
 
-@lru_cache(maxsize=1)
 def _tracker(text: str, config: Path) -> FrameTracker:
     """The tracker for all frames of a process; a changed file (`text`) makes a new tracker."""
-    del text
-    run = load_config(config)
-    return _frame_tracker(run, build_system(run))[0]
+    if not _LAST_TRACKER or _LAST_TRACKER[0][0] != (text, config):
+        run = load_config(config)
+        _LAST_TRACKER[:] = [((text, config), _frame_tracker(run, build_system(run))[0])]
+    return _LAST_TRACKER[0][1]
+
+
+_LAST_TRACKER: list[tuple[tuple[str, Path], FrameTracker]] = []
+"""The last tracker of this process, with the text and the path of its configuration."""
