@@ -115,14 +115,14 @@ def result_of(folder):
 def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
     cli, carried_out, config, whole, tmp_path, monkeypatch
 ):
-    """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
+    """Killed after the second frame: the next run does the other alone, with the same result to the last bit."""
     worked, work = [], FrameTracker.process_frame
 
     def interrupted(self, index, common):
-        if worked:
+        if len(worked) == 2:
             raise KeyboardInterrupt
         worked.append(work(self, index, common))
-        return worked[0]
+        return worked[-1]
 
     monkeypatch.setattr(FrameTracker, "process_frame", interrupted)
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
@@ -130,7 +130,7 @@ def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
     assert (tmp_path / "run.partial").is_dir()
     monkeypatch.setattr(FrameTracker, "estimate_shared_values", None)  # it is known
     again = carried_out("track", config, "--workers", "2", settings=(PLAIN, UNDRAWN))
-    assert again.result["frames"][0]["seconds"] == worked[0].cpu_seconds
+    assert [frame["seconds"] for frame in again.result["frames"][:2]] == [report.cpu_seconds for report in worked]
     assert not (tmp_path / "run.partial").exists()
     assert result_of(again.folder) == result_of(whole.folder)
     one, other = (read_recording(folder / "recording.h5").points[-1] for folder in (again.folder, whole.folder))
