@@ -176,7 +176,7 @@ def test_standard_deviations_are_honest(robot):
     """Normalised errors of many clocks and places are of size one: neither three times as large nor a third."""
     z = []
     for seed in range(4):
-        found, true = found_of(robot, 10 + seed, turn=1.0, shift=0.01, latency=0.05, frames=4)
+        found, true = found_of(robot, 10 + seed, turn=1.0, shift=0.01, latency=0.05, frames=3)
         error = found.camera_state.difference_from(true) / np.sqrt(np.diag(found.state_covariance))
         z.append([error[CLOCK_OFFSET_INDEX], *displaced(found, true)[1].ravel()])
     size = np.sqrt(np.mean(np.square(z), axis=0))

@@ -103,7 +103,7 @@ def test_a_rope_on_a_table(rope):
 
 @pytest.mark.parametrize(("root", "word"), [("fixed", "stays in its place"), ("free", "higher")])
 def test_the_root_of_a_hanging_rope_is_found(rope, root, word):
-    lines = [swing(k) for k in range(4)]
+    lines = [swing(k) for k in range(3)]
     found = track_object(SceneModel(rope), None, film(lines, WALL), replace(OPTIONS, root_placement=root))
     assert errors(found, lines)[0].max() < 5 * MILLIMETRE
     assert word in found.root_note
