@@ -116,14 +116,18 @@ def test_residuals_are_those_of_the_result(problem):
     assert np.allclose(tip.measured, group.position[:, group.names.index("tip")], equal_nan=True)
 
 
-def test_the_method_that_is_not_named_is_gauss_newton(problem):
-    assert yid.solve(problem).solver_name == "gauss_newton"
-    assert np.array_equal(yid.solve(problem).x, yid.solve(problem, yid.GaussNewton()).x)
+@pytest.fixture(scope="module")
+def solution(problem):
+    return yid.solve(problem)
 
 
-def test_a_frame_has_every_parameter_and_its_interval(problem, monkeypatch):
+def test_the_method_that_is_not_named_is_gauss_newton(problem, solution):
+    assert solution.solver_name == "gauss_newton"
+    assert np.array_equal(solution.x, yid.solve(problem, yid.GaussNewton()).x)
+
+
+def test_a_frame_has_every_parameter_and_its_interval(solution, monkeypatch):
     pytest.importorskip("pandas")
-    solution = yid.solve(problem)
     frame = solution.to_dataframe()
     assert set(frame.index[:2]) == set(FREE)
     assert set(frame.index) == set(solution.parameters)
