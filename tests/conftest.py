@@ -42,9 +42,8 @@ hypothesis.settings.load_profile("tests")
 
 # each of several processes that share the processors takes one: their libraries would start a thread for every one
 if "PYTEST_XDIST_WORKER" in os.environ:
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
-    os.environ.setdefault("YID_OCP_THREADS", "1")
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "YID_OCP_THREADS"):
+        os.environ.setdefault(name, "1")
     threadpoolctl.threadpool_limits(1)
 
 

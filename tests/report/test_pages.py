@@ -307,12 +307,8 @@ def test_a_page_says_what_the_terminal_says(solved_page):
 
 
 @needs_browser
-def test_a_browser_draws_a_page_without_a_complaint(solved_page, tmp_path):
+def test_a_browser_draws_pages_with_their_script_in_them_or_beside_them(solved_page, tmp_path):
     check_in_browser(solved_page, 1400, "light", tmp_path)
-
-
-@needs_browser
-def test_a_page_finds_the_script_that_its_folder_shares_and_is_drawn_narrow_and_dark(solved_page, tmp_path):
     page = tmp_path / "runs" / "one" / "report.html"
     page.parent.mkdir(parents=True)
     write_shared_plotly_script(tmp_path)

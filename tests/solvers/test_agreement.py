@@ -32,8 +32,8 @@ def pendulum(urdf_folder):
 
 @pytest.fixture(scope="module")
 def short(make_problem):
-    """The first two seconds, three parameters that they determine."""
-    return make_problem(free=SEEN, duration=2.0)
+    """The first second, three parameters that it determines."""
+    return make_problem(free=SEEN, duration=1.0)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from made_cross import TRUTH, configuration, record
 
 import yid_ocp as yid
 from yid_ocp.config.reader import load_config
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.solve import run_solve
 
 pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
@@ -32,25 +33,31 @@ def judged(result, links):
     return found
 
 
-def test_too_few_links_are_told_and_counted(folder, carried_out):
-    """A branch of twelve links estimated with four: a quarter too stiff, known from the data to half a percent."""
-    done = carried_out("solve", configuration(folder, 4, ["north"], 1.5))
-    error, alone, counted, entry = judged(done.result, 4)["north.bend"]
+@pytest.fixture(scope="module")
+def coarse(folder):
+    """A branch of twelve links estimated with four: the file, and the result of `solve`."""
+    file = configuration(folder, 4, ["north"], 1.5)
+    return file, run_solve(load_config(file), folder / "run").result
+
+
+def test_too_few_links_are_told_and_counted(coarse):
+    """A quarter too stiff, known from the data to half a percent."""
+    error, alone, counted, entry = judged(coarse[1], 4)["north.bend"]
     assert error > 0.15
     assert alone < 0.02
     assert error < 2 * counted
     # the data show it as well: the model does not explain them
     assert entry["verdict"] == "not_trusted"
     # with twice the links it is nearer to the truth by what is said
-    moved = done.result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
+    moved = coarse[1]["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
     assert -error < moved < -0.4 * error
-    assert "with twice the links these move by more than the data's" in done.out
+    said = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[coarse[1]["format"]](coarse[1])))
+    assert "with twice the links these move by more than the data's" in said
 
 
-def test_python_and_shell_say_the_same(folder, tmp_path):
+def test_python_and_shell_say_the_same(coarse):
     """The ± of four links for twelve is that of the links, not of the data, whoever asks."""
-    file = configuration(folder, 4, ["north"], 1.5)
-    shell = run_solve(load_config(file), tmp_path / "run").result
+    file, shell = coarse
     problem = yid.load_problem(file)
     solution = yid.solve(problem)
     for name, entry in solution.parameters.items():
