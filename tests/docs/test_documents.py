@@ -133,7 +133,11 @@ plain = nlp.make_solver("ipopt", hessian="exact", ipopt={"print_level": 0, "sb":
 free = plain(**nlp.solver_arguments)
 assert abs(float(free["x"][0]) - 199.459) < 0.01
 assert float(found["f"]) > float(free["f"])
-assert local.jacobian.size_out(0) == (len(step.residual_names), v.numel())
+assert planner.stats()["success"]
+angle, *lengths = np.array(ca.Function("end", [w], [q[:, -1]])(motion["x"])).ravel()
+pull = np.array([0.505, 0.5]) * 9.81 * np.sin(0.3)  # weight along the rail, beyond each spring
+assert abs(angle - 0.3) < 1e-9
+assert np.allclose(lengths, pull / [199.459, 299.75], rtol=1e-3)
 """
 
 
