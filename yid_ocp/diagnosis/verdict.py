@@ -213,7 +213,7 @@ def judge(
 def _probability(said: Judgement, limits: Thresholds) -> float:
     """Probability that the selected effects are the cause, from how much they explain of what is required.
 
-    A logistic curve fitted to simulated recordings of known cause; see `docs/design/verdicts.md`.
+    A logistic curve with constants set by hand on recordings of known cause; see `docs/design/verdicts.md`.
     """
     if not said.selected_effects:
         return 0.0
