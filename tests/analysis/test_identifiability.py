@@ -290,6 +290,8 @@ def unseen(function, start=None, **more):
         (lambda a, b: a * b * b, ("N/m", "kg"), None),
         (lambda a, b: ca.log(a * b) + 0.1 * (a - 2.0) ** 2, ("N/m", "kg"), None),
         (lambda a, b: ca.log(a * b) + 0.05 * (a - 2.0) ** 2, ("N/m", "kg"), "the product a x b"),
+        # equal again at the finite change alone
+        (lambda a, b: a + b + 0.5 * ca.sin(2 * math.pi * (a - 2.0) / 0.6), ("N/m", "N/m"), None),
     ],
     ids=[
         "series",
@@ -303,6 +305,7 @@ def unseen(function, start=None, **more):
         "another",
         "at first",
         "within a tenth",
+        "at the finite change",
     ],
 )
 def test_a_plain_combination_has_its_direction_and_holds_at_a_finite_change(function, units, words):

@@ -190,7 +190,7 @@ EXPRESSIONS = {
     "functions": ca.sin(A) * ca.cos(A + B) + ca.exp(-D) * ca.log(C) + ca.tan(D) + ca.tanh(B) + ca.atan2(A, B),
     "shared": ca.sin(A + B) * (A + B) + ca.sin(A + B) ** 2,
     "cases": ca.if_else(A < B, C, D) + ca.if_else(ca.logic_and(A > 0, C >= D), A * B, ca.fmax(C, ca.fabs(B))),
-    "limits": ca.fmin(A, B) - ca.sign(B) * ca.fabs(B - C),
+    "limits": ca.fmin(A, B) - ca.sign(B) * ca.fabs(B - C) + ca.log1p(C),
     "tiny numbers": 3.25e-9 * A - 1.5e12 * B,
     "a constant": ca.SX(-4.25) + 0 * A,
     "a variable": C,
@@ -200,7 +200,7 @@ EXPRESSIONS = {
 FUNCTIONS = {
     "sin": math.sin, "cos": math.cos, "tan": math.tan, "exp": math.exp, "log": math.log, "tanh": math.tanh,
     "sqrt": math.sqrt, "atan2": math.atan2, "sign": lambda x: float(np.sign(x)), "abs": abs, "min": min, "max": max,
-    "where": lambda said, value, other: value if said else other,
+    "log1p": math.log1p, "where": lambda said, value, other: value if said else other,
 }  # fmt: skip
 
 
@@ -233,6 +233,11 @@ def test_parts_that_occur_twice_are_written_once():
     # a sum, a sine, a product, a square, a sum
     assert made.n_operations == count_operations([EXPRESSIONS["shared"]], X) == 5
     assert made.variable_indices == (0, 1)
+
+
+def test_only_a_sum_or_a_negative_number_has_brackets_in_a_product():
+    made = format_expressions([0.5 * A * (B + 1), A**-0.5], X, NAMES)
+    assert made.expression_texts == ("0.5*v[0]*(v[1] + 1)", "v[0]^(-0.5)")
 
 
 def test_nothing_is_left_of_what_cancels():

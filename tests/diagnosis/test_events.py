@@ -16,6 +16,7 @@ from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.events import (
     EventSet,
     ForceOrFaultEvent,
+    _alone,
     _floor,
     _one_each,
     _Overspeed,
@@ -236,6 +237,18 @@ def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
     assert event.peak_value == pytest.approx(0.05, abs=2e-3)
     assert event.start_time == pytest.approx(wrong.joints.t[500], abs=0.006)
     assert event.end_time == pytest.approx(wrong.joints.t[501], abs=0.006)
+
+
+@pytest.mark.parametrize(("count", "wrong", "named"), [(45, 1, 1), (45, 3, 1), (45, 4, 0), (39, 1, 0)])
+def test_up_to_three_samples_among_forty_are_named_as_wrong(count, wrong, named):
+    t = 0.01 * np.arange(count)
+    values = np.sin(3 * t) + 1e-4 * np.random.default_rng(0).standard_normal(count)
+    values[20 : 20 + wrong] += 0.1
+    found = list(_alone(t, values, np.full(count, 1e-4), "run", ("elbow", "joints.position.elbow", "rad")))
+    assert len(found) == named
+    for event in found:
+        assert (event.start_time, event.end_time) == pytest.approx((0.195, 0.195 + 0.01 * wrong))
+        assert event.peak_value == pytest.approx(0.1, abs=5e-3)
 
 
 def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(bench):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -289,6 +290,19 @@ def test_parameters_with_priors_are_drawn_in_their_order_so_that_a_seed_draws_th
     assert [truth[name] for name in names] == sorted(truth.values())
 
 
+def test_what_a_plan_cannot_divide_goes_to_the_largest_remainders():
+    found = counted(plan_blind_cases(7, 1, WEIGHTS, WHOLE), lambda e: e.category)
+    assert found == {"null": 1, "single": 3, "pair": 1, "outside": 1, "left_out": 1}
+
+
+def test_recordings_are_seen_by_a_camera_where_the_real_ones_are(drawn):
+    assert not drawn().conditions.has_camera
+    real = problem()
+    [group] = real.episodes[0].recording.points
+    real.episodes[0].recording = replace(real.episodes[0].recording, points=(replace(group, camera_pose=np.eye(4)),))
+    assert BlindCaseGenerator(real, 3, None).conditions.has_camera
+
+
 def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
     found = counted(plan_blind_cases(100, 1, {"bare": 1.0}), lambda e: e.category)
     assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
@@ -360,9 +374,6 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
         assert low <= min(ratios) < max(ratios) <= high
         assert {f.location for f in by_kind[kind]} == {"T1", "T2"}
     assert all(0.05 <= f.values["size"] <= 0.15 for f in by_kind["gusts"])
-
-
-def test_every_size_outside_the_library_has_a_range():
     assert {*_OUT_OF_LIBRARY_SIZES} == {*OUT_OF_LIBRARY_FORCE_BUILDERS}
     assert all(0 < low < high for _, low, high, _ in _OUT_OF_LIBRARY_SIZES.values())
 

@@ -162,6 +162,8 @@ def test_defaults_are_those_that_it_advises_and_follow_from_its_samples_by_the_r
     settings = [rule.setting for rule in _CALIBRATION_RULES.values()]
     assert kept["format"] == _CALIBRATION_FORMAT
     assert kept["settings"] == {setting: getattr(DEFAULT_THRESHOLDS, setting) for setting in settings}
+    least = DEFAULT_THRESHOLDS.null_test_limits.min_excess_chi2_per_dof
+    assert least == kept["settings"]["min_excess_chi2_per_dof"]
     rules = kept["rules"]
     assert set(rules) == set(_CALIBRATION_RULES)
     for name, rule in _CALIBRATION_RULES.items():

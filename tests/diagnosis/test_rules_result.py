@@ -119,6 +119,8 @@ def test_candidates_are_listed_with_what_was_added_first():
     assert [entry["closure"] for entry in listed] == [pytest.approx(0.95), pytest.approx(0.65), None]
     assert listed[1]["closure_ci"] == [pytest.approx(0.6), pytest.approx(0.7)]
     assert listed[2]["closure_ci"] == [None, None]
+    # the statistic is that of the best of three tries
+    assert made.to_dict()["statistics"]["candidate"] == pytest.approx(3 * 0.05)
     # of an unknown gap, refits before scores
     made = finding(
         "unknown", single_effect_models=(fit([OFFSET]),), screening=screening([score(FRICTION), score(OFFSET)])

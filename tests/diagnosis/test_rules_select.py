@@ -411,6 +411,8 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     assert closed == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2, 3]
     assert "scoring the residual gap next to a@x and b@x" in rounds.heard.stages
+    alone = [what for what, *_ in rounds.refits[3:] if "without" in what]
+    assert alone == [f"a@x and b@x and c@x without {one}@x" for one in "ab"], "the last one has just been tried there"
 
 
 def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
@@ -426,6 +428,9 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING)
     monkeypatch.setattr(select, "_is_plausible", lambda of, fitted, limits: of.kind != "b")
     assert rounds.compose()[1] == ["a", "c"]
+    # of those that close too little, what does as well and is plausible is said first, even if it leaves more
+    little = {"": (3.0, 3.2), "a": (2.951, 3.151), "b": (2.95, 3.15), "c": (2.98, 3.18)}
+    assert Rounds(monkeypatch, little).compose() == (["a", "b", "c"], [], ())
     # the first one may be larger, and what is in the place of one that is may be too
     alone = Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)})
     assert alone.compose()[1] == ["b"]
@@ -646,6 +651,8 @@ def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
     _, chosen, added = Rounds(monkeypatch, losses).compose(max_effects=2)
     assert chosen == ["a", "b"]
     assert [of.kind for of in added[0].equivalent_effects] == ["a", "c"]
+    assert sum(added[0].shares) == pytest.approx(1.0)
+    assert added[0].shares[0] > added[0].shares[1] > 0.1, "the nearer, the likelier"
 
 
 @pytest.mark.parametrize(("std", "there"), [(0.499, True), (0.51, False)])
