@@ -165,8 +165,8 @@ class RecordedMomentumCorrection:
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
     effect such as an armature, a fitted mass or damping of the arm, or a torque other than the recorded torque, changes
-    the momentum of the motion. Without this shift the feedback would oppose it: at a wrist, whose momentum gain times
-    h/2 is near one, by half. `parameter_names` are those on which the momentum depends if the torques are known.
+    the momentum of the motion. Without this shift the feedback would oppose it: by half at a joint whose momentum gain
+    times h/2 is one. `parameter_names` are those on which the momentum depends if the torques are known.
     """
 
     def __init__(self, step: Step) -> None:
