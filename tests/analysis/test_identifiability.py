@@ -360,6 +360,13 @@ def test_an_open_interval_lowers_the_verdict():
     assert verdicts(identifiability(problem, intervals="all")) == ["weak"]
 
 
+def test_a_narrow_minimum_near_zero_beside_which_the_usual_size_is_as_likely_is_no_estimate():
+    """The data rise by 9 up to the usual size, which 99.9 % allow; the interval about the minimum alone is narrow."""
+    problem = Formula(lambda x: [3 * (1 - ca.exp(-1e3 * (x["a"] - 0.02)))], {"a": 0.02}, scales={"a": 2.0})
+    assert verdicts(identifiability(problem)) == ["identifiable"]
+    assert verdicts(identifiability(problem, intervals="all")) == ["not_identifiable"]
+
+
 def test_a_point_is_a_solution_an_array_or_the_start():
     problem = Formula(two(), START)
     np.testing.assert_array_equal(unknowns_from_solution(problem, None), [2.0, 50.0])

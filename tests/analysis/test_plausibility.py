@@ -11,15 +11,25 @@ import numpy as np
 import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
-from yid_ocp.analysis.clock_checks import _by_clock, _clock_error, clock_drift_and_overstated_noise_issues
+from yid_ocp.analysis.clock_checks import (
+    _by_clock,
+    _clock_error,
+    clock_drift_and_overstated_noise_issues,
+    search_clock_offset_and_drift,
+)
+from yid_ocp.analysis.estimation import _baselines
 from yid_ocp.analysis.joint_checks import (
+    _GRASP_FORCE_STD,
+    _OFFSET_FRACTION,
     RecordedJointsModel,
+    _loaded,
     inertial_effort_excitation_issues,
     inverse_dynamics_effort_issues,
     joint_excitation_issues,
     joint_limit_issues,
 )
 from yid_ocp.analysis.point_checks import (
+    _moved,
     cable_point_geometry_issues,
     forward_kinematics_issues,
     object_point_rollout_issues,
@@ -265,6 +275,8 @@ def test_too_little_of_a_recording_says_nothing(arms, runs, drives):
     assert list(joint_limit_issues(arm, blind)) == list(forward_kinematics_issues(arm, blind, usual)) == []
     assert list(joint_excitation_issues([blind, runs[1]], {"else": ("else.damping",)}, USUAL)) == []
     assert list(inertial_effort_excitation_issues(drives, swung(drives, size=1e-3, **SLOW), USUAL)) == []
+    runs = (swung(drives, lambda e: 1e3 * e, length=0.005 * (count - 0.5)) for count in (29, 30))
+    assert [len(inverse_dynamics_effort_issues(drives, run)) for run in runs] == [0, 2], "thirty samples are enough"
 
 
 def test_limits_of_joints(arms, runs):
@@ -446,6 +458,53 @@ def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
     for doubt in found:
         assert doubt.limit_violation_ratio == pytest.approx(ratio, rel=1e-3)
         assert re.fullmatch(r"w_T1 from the object's root is \S+ m, 0.813 m along the object", doubt.what)
+
+
+def test_two_points_on_either_side_of_the_root_are_too_far_apart_for_the_branches_between_them(arms, runs):
+    recording = with_points(runs[1], "points_camera", lambda p: p + np.array([[0.0, 0.6, 0.0], [0.0, -0.6, 0.0]]))
+    (doubt,) = point_distance_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
+    assert doubt.what == "w_T1 from w_T3 is 1.81 m, 1.14 m along the object"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_half_a_turn_is_told_as_such_although_its_cosine_may_be_rounded_below_minus_one(seed):
+    rng = np.random.default_rng(seed)
+    place, axis = rng.standard_normal((20, 2, 3)), rng.standard_normal(3)
+    turned = 2 * np.multiply.outer(place @ axis, axis) / (axis @ axis) - place
+    assert [change.words for change in _moved(turned, place)][1] == "turned by 180 degrees and shifted"
+
+
+def test_a_held_object_loads_a_joint_by_its_lever(drives):
+    """By the length of a grasp's path per angle, of the grasp that moves most, whatever its direction."""
+    slopes = np.array([[[[0.3, 0.0], [0.4, 0.1], [0.0, 0.0]], [[0.2, 0.0], [0.2, 0.0], [0.2, 0.1]]]])
+    arm = SimpleNamespace(frame_positions_and_jacobians=lambda frames, q: (None, slopes))
+    data = SimpleNamespace(holders=("a", "b"), motion=SimpleNamespace(q=np.zeros((1, 2))), arm=arm)
+    reach = _GRASP_FORCE_STD * np.array([0.5, 0.1]) / (3 * _OFFSET_FRACTION)
+    for factor, loaded in ((0.99, True), (1.01, False)):
+        data.size = factor * reach
+        assert _loaded(data).tolist() == [loaded, loaded]
+
+
+def test_a_search_without_drifts_finds_a_lateness_alone():
+    t, rates = np.linspace(1.0, 9.0, 200), [[1.0, 2.0, 3.0]]
+
+    def path(at):
+        return np.sin(np.multiply.outer(at, rates))
+
+    seen = path(t - 0.2 - 0.02 * (t - 5.0))
+    alone = search_clock_offset_and_drift(path, (0.0, 10.0), t, seen)
+    assert alone == (pytest.approx(0.2, abs=5e-3), 0.0)
+    both = search_clock_offset_and_drift(path, (0.0, 10.0), t, seen, drifts=True)
+    assert both == pytest.approx((0.2, 0.02), abs=1e-4)
+
+
+def test_a_guess_of_a_cable_covers_the_samples_that_the_model_predicts():
+    run, names = hanging(), ("p4", "a3")
+    episode = SimpleNamespace(recording=run, grid=SimpleNamespace(start_time=0.5, node_times=np.array([0.5, 1.0])))
+    sensor = SimpleNamespace(naive_prediction="stays", point_names=names, group_name="points")
+    guess = _baselines(episode, SimpleNamespace(sensor=sensor, value=np.zeros((51, 6))), CABLE)["stays"]
+    start = run.points[0].position[1, [4, 11]].ravel()
+    np.testing.assert_array_equal(guess, np.tile(start, (51, 1)))
 
 
 POSE = np.eye(4)

@@ -189,6 +189,8 @@ def test_rates_are_over_the_cases_that_they_speak_of():
     assert {name: found[name] for name in rates} == pytest.approx(rates), (
         "an effect that is named alone is a set of one"
     )
+    named = detection_and_false_alarm_rates([marked("null", experiment=name) for name in "abb"])["experiments"]
+    assert {name: own["cases"] for name, own in named.items()} == {"a": 1, "b": 2}
     none = detection_and_false_alarm_rates([])
     assert (none["cases"], {none[name] for name in rates}) == (0, {None})
     assert all(entry["rate"] is None for entry in none["intervals"].values())

@@ -24,6 +24,7 @@ from yid_ocp.solvers import Status
 
 # the package's own name `refit_with_effects` is the function
 module = importlib.import_module("yid_ocp.diagnosis.refit")
+diagnosing = importlib.import_module("yid_ocp.diagnosis.diagnose")
 LIMITS = Thresholds()
 FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
 A, S = "friction@elbow.a", "friction@elbow.s"
@@ -349,3 +350,24 @@ def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting)
     assert told["episodes"] == ["two"]
     none, _ = predicting((episode("one", of=[group]), "it snaps"))
     assert _held_out_loss(none, np.zeros(1)).channel_rmse == {}
+
+
+@cases(
+    "known, in_blocks, start, solved",
+    {
+        "a solution is there": (3.0, False, {"k": 3.0}, 0),
+        "it is solved first": (None, False, {"k": 2.0}, 1),
+        "a part of it is held out": (None, True, {}, 0),
+    },
+)
+def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, in_blocks, start, solved):
+    def solution(value):
+        return SimpleNamespace(unknown_names=("k",), x=np.array([value]))
+
+    asked = []
+    monkeypatch.setattr(diagnosing, "solve", lambda *given, **how: asked.append(given) or solution(2.0))
+    monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
+    composed = SimpleNamespace(is_split_in_blocks=in_blocks)
+    given = None if known is None else solution(known)
+    assert diagnosing.fit_nominal_model("problem", composed, given) == start
+    assert len(asked) == solved

@@ -121,6 +121,8 @@ def test_candidates_are_listed_with_what_was_added_first():
     assert listed[2]["closure_ci"] == [None, None]
     # the statistic is that of the best of three tries
     assert made.to_dict()["statistics"]["candidate"] == pytest.approx(3 * 0.05)
+    chance = screening([score(OFFSET, p=0.8), score(FRICTION, p=0.9)])
+    assert finding(screening=chance).to_dict()["statistics"]["candidate"] == 1.0
     # of an unknown gap, refits before scores
     made = finding(
         "unknown", single_effect_models=(fit([OFFSET]),), screening=screening([score(FRICTION), score(OFFSET)])
