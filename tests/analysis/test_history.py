@@ -19,7 +19,7 @@ from yid_ocp.analysis.estimate_history import (
 )
 from yid_ocp.analysis.friction_law_comparison import (
     CrossValidatedFrictionLawFit,
-    cross_validate_friction_law,
+    cross_validate_over_motion_kinds,
     mean_and_std_error_over_motion_kinds,
     measured_and_predicted_friction_torques,
     recording_names_by_name_stem,
@@ -201,7 +201,7 @@ def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_
     assert recording_names_by_name_stem(dry) == {"slow": ("slow_1", "slow_2"), "fast": ("fast_1",), "turn": ("turn_1",)}
     driven = dry.with_episodes(dry.episodes[:-1], ())
     solution = solve(driven, GaussNewton(), restarts=False)
-    fit = cross_validate_friction_law("coulomb", driven, solution, recording_names_by_name_stem(driven))
+    fit = cross_validate_over_motion_kinds("coulomb", driven, solution, recording_names_by_name_stem(driven))
     assert set(fit.left_out_errors) == {"slow_1", "slow_2", "fast_1", "turn_1"}
     assert all(error < 1.3e-3 for error in fit.left_out_errors.values())
     assert fit.parameters["joint_coulomb@shoulder.tau_c"].value == pytest.approx(1.2, abs=0.05)
@@ -223,7 +223,7 @@ def test_a_kind_of_motion_is_predicted_from_the_others_alone(dry, monkeypatch):
 
     solution = solve(driven, GaussNewton(), restarts=False)
     monkeypatch.setattr(GaussNewton, "minimize_cost", searched)
-    cross_validate_friction_law("coulomb", driven, solution, recording_names_by_name_stem(driven))
+    cross_validate_over_motion_kinds("coulomb", driven, solution, recording_names_by_name_stem(driven))
     names = {"slow_1", "slow_2", "fast_1", "turn_1"}
     assert folds == [(names - own, own) for own in ({"slow_1", "slow_2"}, {"fast_1"}, {"turn_1"})]
 

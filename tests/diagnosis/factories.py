@@ -18,10 +18,10 @@ from made_series import seeing
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
-    AllCandidatesLinearization,
     CandidateDetectability,
     CandidateScore,
     ConfusabilityMatrix,
+    ProjectedCandidatesLinearization,
     ScreeningResult,
     _EffectSignature,
 )
@@ -87,8 +87,8 @@ def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) 
     return _EffectSignature(of, named, columns, noise, priors * np.ones_like(noise))
 
 
-def point(residual, *signatures: _EffectSignature) -> AllCandidatesLinearization:
-    return AllCandidatesLinearization(np.asarray(residual, float), signatures)
+def point(residual, *signatures: _EffectSignature) -> ProjectedCandidatesLinearization:
+    return ProjectedCandidatesLinearization(np.asarray(residual, float), signatures)
 
 
 def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> CandidateScore:

@@ -9,7 +9,7 @@ from made_series import series
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import (
-    AllCandidatesLinearization,
+    ProjectedCandidatesLinearization,
     _candidate_detectable_amplitudes,
     _confusability_matrix,
     _EffectSignature,
@@ -89,7 +89,7 @@ def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_t
 
 def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_noise(screened):
     _, _, point = screened
-    still = AllCandidatesLinearization(0 * point.projected_residual, point.signatures)
+    still = ProjectedCandidatesLinearization(0 * point.projected_residual, point.signatures)
     sizes, silent = ([v.detectable_amplitudes for v in _candidate_detectable_amplitudes(at)] for at in (point, still))
     assert sizes == silent
     coulomb = next(size["joint_coulomb@elbow.tau_c"] for size in sizes if "joint_coulomb@elbow.tau_c" in size)
@@ -108,6 +108,6 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     signatures = tuple(
         _EffectSignature(effect, values, x, x.T @ x, 0 * x.T @ x) for values, x in zip(grid, columns, strict=True)
     )
-    point = AllCandidatesLinearization(residual[:, 0], signatures)
+    point = ProjectedCandidatesLinearization(residual[:, 0], signatures)
     best = _score_candidates(point, [series(range(200))], _candidate_detectable_amplitudes(point))[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]

@@ -12,7 +12,7 @@ from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.effects.base import arm_link_end_frame_names, effort_limit_ratio_to_baxter, one_frame_name_per_arm_link
 from yid_ocp.effects.bodies import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.mechanism import (
     Frame,
     Inertia,
@@ -42,7 +42,7 @@ def arm() -> System:
 def mechanics(system: System):
     """Mass matrix, dL/dq and dL/dv of a system at (q, v) as functions of its parameters."""
     q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
-    rigid = rigid_body_lagrangian_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
+    rigid = lagrangian_first_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
     outputs = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
     return ca.Function("mechanics", [q, v, system.parameters.symbols], [ca.densify(x) for x in outputs])
 

@@ -29,7 +29,7 @@ from yid_ocp.model import (
 )
 from yid_ocp.model.kinematics import motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import ForceWithDerivativeFactors, floating_joint_mechanism
+from yid_ocp.model.system import ForceWithDerivativeFactors, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -204,7 +204,7 @@ def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
     """The cable, bent, its end held by a clamp whose six coordinates are prescribed; with its configuration."""
     bent = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
     pose = tip(cable().mechanism, "w_C", bent)
-    clamp = floating_joint_mechanism("clamp")
+    clamp = six_joint_floating_mechanism("clamp")
     grasp = Grasp("clamp", "clamp", "w_C", kind, held_orientation=ca.SX(ca.DM(pose[:3, :3])))
     objects = [(cable_object(), None, None)]
     system = System.build(

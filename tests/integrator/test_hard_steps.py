@@ -13,7 +13,7 @@ import pytest
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutInputs, RolloutStatus, SensitivityDirections
 from yid_ocp.model import Grasp, System
-from yid_ocp.model.system import floating_joint_mechanism
+from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
@@ -54,7 +54,7 @@ class Hard:
 
 def gripped_cable(parts, shape):
     """The cable in a shape, its end held by a prescribed clamp."""
-    clamp, end = floating_joint_mechanism("clamp"), parts.tip(parts.cable().mechanism, "w_C", shape)[:3, 3]
+    clamp, end = six_joint_floating_mechanism("clamp"), parts.tip(parts.cable().mechanism, "w_C", shape)[:3, 3]
     objects, grasps = [(parts.cable_object(), None, None)], [Grasp("end", "clamp", "w_C")]
     system = System.build(clamp, objects=objects, grasps=grasps, prescribed=clamp.joint_names)
     return system, np.concatenate([end, np.zeros(3), shape])

@@ -16,7 +16,7 @@ from yid_ocp.integrator.tracking_feedback import (
     proportional_tracking_feedback,
 )
 from yid_ocp.model import FlexibleSegment, System, flexible_object, forward_kinematics
-from yid_ocp.model.kinematics import mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.urdf import read_urdf
 
 ANGLE, RATE, TORQUE = 0.02, 0.3, 1.0
@@ -52,7 +52,7 @@ def test_gains_far_from_the_end_solve_the_riccati_equation(step, robot):
     posture = np.array([0.3, -0.2])
     q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
     tree = robot.with_numeric_values()
-    rigid = rigid_body_lagrangian_derivatives(forward_kinematics(tree, q), v, ca.SX(ca.DM([0, 0, -9.81])))
+    rigid = lagrangian_first_derivatives(forward_kinematics(tree, q), v, ca.SX(ca.DM([0, 0, -9.81])))
     function = ca.Function("arm", [q, v], [mass_matrix(rigid, tree), rigid.lagrangian_by_q])
     inertia, by_q = (np.array(ca.densify(x)) for x in function(posture, [0, 0]))
     torque = np.tile(-by_q.ravel(), (STEPS, 1))

@@ -8,7 +8,7 @@ import pytest
 
 from yid_ocp.integrator.discrete import discrete_equations, nlp_step_constraints
 from yid_ocp.model import System, forward_kinematics
-from yid_ocp.model.kinematics import rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import lagrangian_first_derivatives
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ PULL_MIDDLE = {"node": 0.0, "midpoint": 0.5}
 def discrete_lagrangian(system: System, q0: ca.SX, q1: ca.SX, h: ca.SX) -> ca.SX:
     """L_d = h L((q0 + q1)/2, (q1 - q0)/h) without effects [J s] (Marsden and West 2001, section 1.3)."""
     q, v = (q0 + q1) / 2, (q1 - q0) / h
-    rigid = rigid_body_lagrangian_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
+    rigid = lagrangian_first_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
     return h * (rigid.kinetic_energy - rigid.potential_energy - system.elastic_energy(q))
 
 

@@ -17,7 +17,7 @@ from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
-from yid_ocp.model.system import floating_joint_mechanism
+from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -25,7 +25,7 @@ def hung_cable(span: float):
     """A cable of 0.6 m that starts level along x, its end held at a fraction of its length; statics and clamp pose."""
     turn = rotation_from_rpy(0.0, np.pi / 2, 0.0)
     segment = FlexibleSegment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rest_rotation=turn)
-    clamp = floating_joint_mechanism("clamp")
+    clamp = six_joint_floating_mechanism("clamp")
     objects, grasps = [(flexible_object([segment], name="cable"), None, None)], [Grasp("end", "clamp", "w_C")]
     system = System.build(clamp, objects=objects, grasps=grasps, prescribed=clamp.joint_names)
     return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False)), np.array([0.6 * span, 0, 0, 0, 0, 0])

@@ -14,7 +14,7 @@ from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import NewtonStatusCode
 from yid_ocp.model import EffectStepTerms, FlexibleSegment, Grasp, Parameters, System, flexible_object
 from yid_ocp.model.mechanism import Inertia
-from yid_ocp.model.system import floating_joint_mechanism
+from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
 ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
@@ -312,7 +312,7 @@ PULL, WEIGHT = 100.0, 9.81  # [N]
 def test_tension_makes_no_motion_grow_where_constraints_pull_at_the_midpoint(parts):
     """A light cable, almost straight, drawn up by a clamp of 1 kg."""
     light = {"mass": 0.06, "radius": 0.01, "bend": 0.5, "twist": 0.5, "damping": 1e-3}
-    clamp, bent = floating_joint_mechanism("clamp"), np.array([0.02, 0, 0, -0.03, 0, 0, 0.01, 0, 0])
+    clamp, bent = six_joint_floating_mechanism("clamp"), np.array([0.02, 0, 0, -0.03, 0, 0, 0.01, 0, 0])
     body = Inertia.from_values(1.0, np.zeros(3), 1e-3 * np.eye(3))
     clamp = replace(clamp, joints=tuple(replace(j, bodies=(body,) * (j.name == "clamp_z")) for j in clamp.joints))
     held = [name for name in clamp.joint_names if name != "clamp_z"]

@@ -14,7 +14,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import mechanism as mechanism_module
-from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import lagrangian_first_derivatives, lagrangian_second_derivatives, mass_matrix
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.workflow.build import build_system
 
@@ -91,7 +91,7 @@ MODELS = {
 def dynamics(mechanism: Mechanism, gravity: np.ndarray) -> ca.Function:
     q, v = (ca.SX.sym(name, len(mechanism.joints)) for name in "qv")
     kinematics = forward_kinematics(mechanism, q)
-    rigid = rigid_body_lagrangian_derivatives(kinematics, v, ca.SX(ca.DM(gravity)))
+    rigid = lagrangian_first_derivatives(kinematics, v, ca.SX(ca.DM(gravity)))
     bias = lagrangian_second_derivatives(rigid, mechanism)[1].T @ v - rigid.lagrangian_by_q
     places = [kinematics.frame_pose(name).homogeneous_matrix() for name in mechanism.frames]
     return ca.Function("dynamics", [q, v], [mass_matrix(rigid, mechanism), bias, *places])

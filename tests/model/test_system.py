@@ -21,7 +21,7 @@ from yid_ocp.model import (
 )
 from yid_ocp.model.mechanism import merge_bodies, rotation_from_rpy
 from yid_ocp.model.objects.foam_y import foam_y_object
-from yid_ocp.model.system import floating_joint_mechanism
+from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -69,7 +69,7 @@ def test_forces_and_energy(robot):
 @pytest.mark.parametrize(("kind", "count"), [("point", 3), ("axis", 5), ("weld", 6)])
 def test_grasp_equations(kind, count):
     """Zero where holder, turned and offset, meets the held frame; linear in small displacements."""
-    tree = floating_joint_mechanism("one").with_attached_mechanism(floating_joint_mechanism("two"))
+    tree = six_joint_floating_mechanism("one").with_attached_mechanism(six_joint_floating_mechanism("two"))
     turn = rotation_from_rpy(0.3, -0.5, 0.9)
     grasp = Grasp("g", "one", "two", kind, ca.SX(ca.DM(turn)), ca.SX(ca.DM([0.1, 0.2, 0.3])), axial_slip=ca.SX(0.05))
     system = System.build(tree, grasps=[grasp])
@@ -148,13 +148,13 @@ def test_errors_of_build(robot, name):
 
 
 def test_a_clamp_has_six_massless_coordinates():
-    clamp = floating_joint_mechanism("hand", frame="palm")
+    clamp = six_joint_floating_mechanism("hand", frame="palm")
     assert clamp.joint_names == tuple(f"hand_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))
     assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
     assert clamp.parent_joint_indices == (-1, 0, 1, 2, 3, 4)
     assert all(merge_bodies(j.bodies) is None for j in clamp.joints)
     assert clamp.frame("palm").joint_index == 5
-    assert floating_joint_mechanism("hand").frame("hand").joint_index == 5
+    assert six_joint_floating_mechanism("hand").frame("hand").joint_index == 5
 
 
 @pytest.fixture

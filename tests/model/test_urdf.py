@@ -14,7 +14,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import urdf as urdf_files
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, merge_bodies
-from yid_ocp.model.system import floating_joint_mechanism
+from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, resolve_urdf_path
 
 BODY = '<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
@@ -217,7 +217,7 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
         (lambda path: read_urdf(path).frame("tol"), ["frame 'tol'", "'tool'"]),
         (lambda path: read_urdf(path).with_attached_mechanism(read_urdf(path)), ["two parts", "'bracket'"]),
         (
-            lambda path: read_urdf(path).with_attached_mechanism(floating_joint_mechanism("c"), "rotr"),
+            lambda path: read_urdf(path).with_attached_mechanism(six_joint_floating_mechanism("c"), "rotr"),
             ["'rotr'", "'rotor'"],
         ),
     ],

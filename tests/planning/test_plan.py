@@ -114,7 +114,7 @@ def test_what_hangs_below_the_point_comes_to_rest_as_well(moved, wanted):
     goal = tuple(map(float, point_at(moved, GOAL, "lower")))
     done = plan_motion_to_target(moved, replace(wanted, point="lower", target_position=goal))
     assert done.is_successful, done.message
-    moves = np.diff(done.point_trajectories["tip"][done.simulator.standstill_node_indices], axis=0)
+    moves = np.diff(done.point_trajectories["tip"][done.simulator.node_indices_after_motion], axis=0)
     assert np.linalg.norm(moves, axis=1).max() / done.simulator.step.time_step < wanted.point_rest_speed_tolerance
 
 
@@ -212,7 +212,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         assert done.is_successful, done.message
         errors = []
         for mover in (elsewhere(done, -0.6), elsewhere(done, 0.6)):
-            state = mover.simulate_path(done.spline_coefficients).state[mover.standstill_node_indices]
+            state = mover.simulate_path(done.spline_coefficients).state[mover.node_indices_after_motion]
             errors.append(np.sqrt(np.mean(np.sum((places(mover, state) - options.target_position) ** 2, axis=1))))
         worst.append(max(errors))
     assert worst[1] < 0.8 * worst[0]

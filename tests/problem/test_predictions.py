@@ -128,7 +128,7 @@ def test_the_method_that_is_not_named_is_gauss_newton(problem, solution):
 
 def test_a_frame_has_every_parameter_and_its_interval(solution, monkeypatch):
     pytest.importorskip("pandas")
-    frame = solution.to_dataframe()
+    frame = solution.parameters_to_dataframe()
     assert set(frame.index[:2]) == set(FREE)
     assert set(frame.index) == set(solution.parameters)
     assert list(frame.columns) == ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
@@ -142,7 +142,7 @@ def test_a_frame_has_every_parameter_and_its_interval(solution, monkeypatch):
             assert [abs(row["lower"]), abs(row["upper"])] == ends
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
     with pytest.raises(ConfigError, match="needs the package pandas") as caught:
-        solution.to_dataframe()
+        solution.parameters_to_dataframe()
     assert "yid-ocp[pandas]" in caught.value.hint
 
 

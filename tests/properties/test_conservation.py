@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from yid_ocp.integrator.step import compile_step, step_with_time_step
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import mass_matrix
-from yid_ocp.model.system import floating_joint_mechanism
+from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -121,7 +121,7 @@ def grasped_cable(urdf_folder):
     cable = flexible_object([FlexibleSegment("C", 0.6, 0.3, 0.1, 3, bend=2.0, twist=2.0, damping=2e-3)])
     bent = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
     pose = forward_kinematics(cable.mechanism.with_numeric_values(), ca.SX(ca.DM(bent))).frame_position("w_C")
-    clamp, grasp = floating_joint_mechanism("clamp"), Grasp("end", "clamp", "w_C")
+    clamp, grasp = six_joint_floating_mechanism("clamp"), Grasp("end", "clamp", "w_C")
     system = System.build(clamp, objects=[(cable, None, None)], grasps=[grasp], prescribed=clamp.joint_names)
     q = np.concatenate([np.array(ca.DM(pose)).ravel(), np.zeros(3), bent])
     return system, q, np.zeros_like(q), [], 0.1, (50, 100, 200)

@@ -10,7 +10,7 @@ import pytest
 
 from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import mechanism as mechanism_module
-from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import lagrangian_first_derivatives, lagrangian_second_derivatives, mass_matrix
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
@@ -44,7 +44,7 @@ class Twin:
         n = len(self.mechanism.joints)
         q, v, a = (ca.SX.sym(name, n) for name in "qva")
         kinematics = forward_kinematics(self.mechanism, q)
-        rigid = rigid_body_lagrangian_derivatives(kinematics, v, ca.SX(ca.DM(GRAVITY)))
+        rigid = lagrangian_first_derivatives(kinematics, v, ca.SX(ca.DM(GRAVITY)))
         by_qv = lagrangian_second_derivatives(rigid, self.mechanism)[1]
         M = mass_matrix(rigid, self.mechanism)
         effort = M @ a + by_qv.T @ v - rigid.lagrangian_by_q

@@ -9,7 +9,7 @@ from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
-from yid_ocp.model.system import System, floating_joint_mechanism
+from yid_ocp.model.system import System, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
@@ -35,7 +35,7 @@ def cable():
     ]
     item = flexible_object(segments, name="cable")
     system = System.build(
-        floating_joint_mechanism("clamp"), objects=[(item, "clamp", None)], prescribed=CLAMP, damping={}
+        six_joint_floating_mechanism("clamp"), objects=[(item, "clamp", None)], prescribed=CLAMP, damping={}
     )
     step = compile_step(system, H)
     t = H * np.arange(STEPS + 1)

@@ -149,7 +149,7 @@ def test_the_end_is_evaluated_where_the_solver_found_its_equilibria_and_has_devi
     solution = solve(problem, Steps([[1.0, 2.0]]))
     assert solution.std == {"k1": pytest.approx(1.0), "k0": pytest.approx(1.0)}
     pytest.importorskip("pandas")
-    assert list(solution.to_dataframe()["lower"]) == pytest.approx([2.0 - 1.96, 1.0 - 1.96, 7.0])
+    assert list(solution.parameters_to_dataframe()["lower"]) == pytest.approx([2.0 - 1.96, 1.0 - 1.96, 7.0])
 
 
 def reaching(limit):

@@ -17,7 +17,7 @@ import yid_ocp
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
@@ -82,7 +82,7 @@ def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms
     run, system = runs(arms, 2e-4), SYSTEMS[arms]
     q, u = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("u", len(system.driven))
     kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body_lagrangian_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), system.gravity)
+    rigid = lagrangian_first_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), system.gravity)
     force = rigid.lagrangian_by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u, q, q)
     jacobian = ca.jacobian(system.constraint_residual(kinematics), q)
     function = ca.Function("statics", [q, u, system.parameters.symbols], [force, jacobian])
@@ -352,7 +352,7 @@ def test_shaking_takes_the_torque_that_was_asked_for_and_leaves_the_travel_alone
     assert np.all((omega >= 2 * np.pi * 5.0) & (omega <= 2 * np.pi * 8.0))
     q = ca.SX.sym("q", system.n_coordinates)
     tree, zero = system.mechanism.with_numeric_values(), ca.SX(ca.DM.zeros(system.n_coordinates))
-    mass = mass_matrix(rigid_body_lagrangian_derivatives(forward_kinematics(tree, q), zero, zero[:3]), tree)
+    mass = mass_matrix(lagrangian_first_derivatives(forward_kinematics(tree, q), zero, zero[:3]), tree)
     posture = grasping_joint_angles(system)
     start = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
     inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass])(start))))

@@ -12,7 +12,7 @@ from virtual_examples import SYSTEMS, TRUTH, mujoco
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
-from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.system import MidpointState
 from yid_ocp.virtual import injected
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error
@@ -63,7 +63,7 @@ def symbolic(kind, location, values, q, v):
     reaction = ca.SX.sym("r", SYSTEM.n_constraints)
     kinematics, nominal = (forward_kinematics(system.mechanism, sq) for system in (changed, SYSTEM))
     terms = effect.step_terms(MidpointState(changed, kinematics, sq, sv, none, none, u, reaction, {}, ca.SX(1)))
-    rigid = (rigid_body_lagrangian_derivatives(k, 0 * sv, SYSTEM.gravity) for k in (kinematics, nominal))
+    rigid = (lagrangian_first_derivatives(k, 0 * sv, SYSTEM.gravity) for k in (kinematics, nominal))
     weight, usual = (terms_at_rest.lagrangian_by_q for terms_at_rest in rigid)
     closed = terms.force_with_derivatives
     forces = (terms.generalized_force, terms.dissipative_force, None if closed is None else closed.force)

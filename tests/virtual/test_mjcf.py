@@ -24,9 +24,9 @@ from yid_ocp.model import (
     System,
     flexible_object,
 )
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.mechanism import Frame, Inertia, Placement
-from yid_ocp.model.system import floating_joint_mechanism
+from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.mjcf import ExpressionEvaluator, mujoco_model_from_mjcf, mujoco_xml, system_joint_dynamics_terms
 
@@ -83,7 +83,7 @@ OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", 
 
 def clamped_beam() -> System:
     beam = flexible_object([FlexibleSegment("B", 0.5, 0.2, 0.01, links=3)], name="beam")
-    clamp = floating_joint_mechanism("clamp")
+    clamp = six_joint_floating_mechanism("clamp")
     body = Inertia.from_values(0.3, [0.01, 0.02, 0.03], np.diag([1e-3, 2e-3, 2.5e-3]))
     clamp = replace(clamp, joints=(*clamp.joints[:-1], replace(clamp.joints[-1], bodies=(body,))))
     return System.build(clamp, objects=[(beam, "clamp", None)], driven=["clamp_x"], damping=0.1)
@@ -93,7 +93,7 @@ def assert_same_mechanics(system: System, values: dict[str, float]) -> None:
     """Mass matrix, bias and passive forces, and places of points are in MuJoCo what they are in symbols."""
     q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
     kinematics, none = forward_kinematics(system.mechanism, q), ca.SX(0, 1)
-    rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
+    rigid = lagrangian_first_derivatives(kinematics, v, system.gravity)
     mass = mass_matrix(rigid, system.mechanism)
     bias = ca.jtimes(rigid.lagrangian_by_v, q, v) - rigid.lagrangian_by_q
     passive = system.viscous_force(v) - ca.gradient(system.elastic_energy(q), q)
@@ -275,12 +275,12 @@ def test_what_mujoco_cannot_express_is_refused() -> None:
     with pytest.raises(ModelError, match="compliance of joint 'B_0_x' is zero"):
         mujoco_xml(replace(system, joint_compliances={"B_0_x": ca.SX(0)}))
     with pytest.raises(ModelError, match="has a mass"):
-        mujoco_xml(System.build(floating_joint_mechanism("clamp")))
+        mujoco_xml(System.build(six_joint_floating_mechanism("clamp")))
     beam = flexible_object([FlexibleSegment("B", 0.5, 0.2, 0.01)])
     tree = SYSTEMS[1].mechanism
     bare = Frame(tree.joint_index("T2_1_y"), Placement.identity())
     with pytest.raises(ModelError, match="more than six"):
-        mujoco_xml(System.build(floating_joint_mechanism("clamp"), objects=[(beam, "clamp", None)]))
+        mujoco_xml(System.build(six_joint_floating_mechanism("clamp"), objects=[(beam, "clamp", None)]))
     tree = replace(tree, frames={**tree.frames, "bare": bare})
     with pytest.raises(ModelError, match="is on a joint without mass"):
         mujoco_xml(replace(SYSTEMS[1], point_frames=("bare",), mechanism=tree))

@@ -51,7 +51,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
     return {kind: tuple(own) for kind, own in found.items()}
 
 
-def cross_validate_friction_law(
+def cross_validate_over_motion_kinds(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> CrossValidatedFrictionLawFit:
     """Fit a friction law to all recordings, and refit it without each of the `kinds` of motion to get errors."""

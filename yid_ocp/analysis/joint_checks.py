@@ -16,7 +16,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period, white_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects.base import EffectBase, joint_names_by_arm
-from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
@@ -119,7 +119,7 @@ class RecordedJointsModel:
         size = self.system.n_coordinates
         full = [ca.SX.sym(name, size) for name in ("q", "v", "a")]
         known = [ca.SX.sym(name, len(self.joint_names)) for name in ("q", "v", "a")]
-        rigid = rigid_body_lagrangian_derivatives(
+        rigid = lagrangian_first_derivatives(
             forward_kinematics(self.system.mechanism, full[0]), full[1], self.system.gravity
         )
         by_v = rigid.lagrangian_by_v

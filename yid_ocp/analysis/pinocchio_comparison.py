@@ -20,9 +20,9 @@ from yid_ocp.arrays import Array
 from yid_ocp.files import MAX_TEXT_BYTES, check_input_file
 from yid_ocp.model.kinematics import (
     forward_kinematics,
+    lagrangian_first_derivatives,
     lagrangian_second_derivatives,
     mass_matrix,
-    rigid_body_lagrangian_derivatives,
 )
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
@@ -166,8 +166,8 @@ def _compared(
     n = len(mechanism.joints)
     q, v, a = (ca.SX.sym(name, n) for name in "qva")
     kinematics = forward_kinematics(mechanism, q)
-    rigid = rigid_body_lagrangian_derivatives(kinematics, v, ca.SX(ca.DM(gravity)))
-    still = rigid_body_lagrangian_derivatives(kinematics, ca.SX.zeros(n), ca.SX(ca.DM(gravity))).lagrangian_by_q
+    rigid = lagrangian_first_derivatives(kinematics, v, ca.SX(ca.DM(gravity)))
+    still = lagrangian_first_derivatives(kinematics, ca.SX.zeros(n), ca.SX(ca.DM(gravity))).lagrangian_by_q
     mass, by_qv = mass_matrix(rigid, mechanism), lagrangian_second_derivatives(rigid, mechanism)[1]
     ours = ca.Function("ours", [q, v, a], [mass, -still, mass @ a + by_qv.T @ v - rigid.lagrangian_by_q])
     rng = np.random.default_rng(0)

@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import AllCandidatesLinearization, linearize_candidates
+from yid_ocp.diagnosis.screening import ProjectedCandidatesLinearization, linearize_candidates
 from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_within_segment
@@ -62,7 +62,7 @@ class PlannedBlindCase:
     is_brisk: bool = False  # whether it moves with three times the acceleration
 
 
-def plan_blind_cases(
+def assign_blind_case_categories(
     count: int,
     seed: int,
     weights: Mapping[str, float],
@@ -289,7 +289,7 @@ class BlindCaseGenerator:
         made = record_random_motion(nominal, system, posture, own, values, injected, rng, conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
-    def _linearize_clean_recordings(self) -> AllCandidatesLinearization:
+    def _linearize_clean_recordings(self) -> ProjectedCandidatesLinearization:
         """The candidates' signatures on recordings without effects."""
         rng = self._rng(0)
         names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]

@@ -384,7 +384,7 @@ def _after(
     if null_test.residuals_exceed_noise(tests, limits.null_test_limits):
         rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.gap_window_z)
     windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
-    where = smoother.gap_locations_from_effect_closures(where, judged.closure_by_location, rest, windows)
+    where = smoother.gap_locations_from_effects_and_smoother(where, judged.closure_by_location, rest, windows)
     return tests[1], where, rest
 
 

@@ -29,7 +29,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.integrator.step import Step, input_or_servo_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.system import MidpointState, System
 from yid_ocp.problem.signal_filters import effort_low_pass_filter
 
@@ -81,8 +81,8 @@ def _function(system: System, time_step: float) -> ca.Function:
     n, names = system.n_coordinates, tuple(system.effect_internal_coordinate_symbols)
     q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
     kinematics = forward_kinematics(system.mechanism, q)
-    moving = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
-    weight = rigid_body_lagrangian_derivatives(kinematics, ca.SX.zeros(n), system.gravity).lagrangian_by_q
+    moving = lagrangian_first_derivatives(kinematics, v, system.gravity)
+    weight = lagrangian_first_derivatives(kinematics, ca.SX.zeros(n), system.gravity).lagrangian_by_q
     rest, u = ca.SX.zeros(len(names)), ca.SX.zeros(len(system.driven))
     pulls = ca.SX.zeros(system.n_constraints)
     rows = {name: i for i, name in enumerate(names)}

@@ -48,7 +48,7 @@ class _EffectSignature:
 
 
 @dataclass(frozen=True)
-class AllCandidatesLinearization:
+class ProjectedCandidatesLinearization:
     """Residual and candidate signatures linearised at one point, with the model's free parameters projected out."""
 
     projected_residual: Array  # P r, shape (nr,)
@@ -87,7 +87,7 @@ def linearize_candidates(
     base: Sequence[EffectBase],
     values: Mapping[str, float],
     grid: int = DEFAULT_THRESHOLDS.shape_parameter_grid_size,
-) -> AllCandidatesLinearization:
+) -> ProjectedCandidatesLinearization:
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
     The model contains the effects in `base`, with all their parameters free. `values` are the fitted unknowns of this
@@ -120,7 +120,7 @@ def linearize_candidates(
             by_priors = priors.T @ priors
             noise = _covariance_of_scores(columns, series) + driven @ driven.T + by_priors
             signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors))
-    return AllCandidatesLinearization(residual, tuple(signatures))
+    return ProjectedCandidatesLinearization(residual, tuple(signatures))
 
 
 def _basis(matrix: Array) -> Array:
@@ -131,7 +131,7 @@ def _basis(matrix: Array) -> Array:
 
 
 def _candidate_detectable_amplitudes(
-    point: AllCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
+    point: ProjectedCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
 ) -> tuple[CandidateDetectability, ...]:
     """Smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
     found: dict[str, list[CandidateDetectability]] = {}
@@ -177,7 +177,9 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 
 
 def _score_candidates(
-    point: AllCandidatesLinearization, series: Sequence[ResidualChannel], visible: Sequence[CandidateDetectability]
+    point: ProjectedCandidatesLinearization,
+    series: Sequence[ResidualChannel],
+    visible: Sequence[CandidateDetectability],
 ) -> tuple[CandidateScore, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
@@ -281,7 +283,7 @@ class AllCandidatesScoreModel:
 
 
 def _make_joint_score_model(
-    point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
+    point: ProjectedCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
 ) -> AllCandidatesScoreModel:
     """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}

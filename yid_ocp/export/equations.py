@@ -11,7 +11,7 @@ from yid_ocp.analysis.step_symbols import NamedStepEquations, count_operations
 from yid_ocp.arrays import Array
 from yid_ocp.files import atomic_write, make_folder, write_strict_json, write_text
 from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 
 _MAX_JACOBIAN_OPERATIONS = 60_000  # operations; longer C keeps a compiler busy for minutes
 _ARGUMENT_NAMES = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
@@ -34,7 +34,7 @@ def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, 
     made = [ca.Function(name, e.arguments, out, list(_ARGUMENT_NAMES), list(o)) for name, (out, o) in parts.items()]
     q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
+    rigid = lagrangian_first_derivatives(kinematics, v, system.gravity)
     places = [kinematics.frame_position(name) for name in system.point_frames]
     mechanics = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
     internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())

@@ -506,7 +506,7 @@ def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[fl
     return tuple(joined)
 
 
-def gap_locations_from_effect_closures(
+def gap_locations_from_effects_and_smoother(
     before: Sequence[GapLocation],
     closed: Mapping[str, float],
     rest: Sequence[GapLocation],

@@ -30,10 +30,10 @@ import casadi as ca
 from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.kinematics import (
     Kinematics,
-    MultibodyLagrangianDerivatives,
+    LagrangianFirstDerivatives,
     forward_kinematics,
+    lagrangian_first_derivatives,
     lagrangian_second_derivatives,
-    rigid_body_lagrangian_derivatives,
 )
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import ForceWithDerivativeFactors, Grasp, MidpointState, System
@@ -98,7 +98,7 @@ class DiscreteEquations:
     # factor on phi(q_{k+1}) in `constraint_residual` if a grasp relaxes: g = 1 + T/h; phi(q_k) has 1 - g
     constraint_relaxation_gain: ca.SX | None
     p1: ca.SX
-    rigid_body_terms: MultibodyLagrangianDerivatives
+    rigid_body_terms: LagrangianFirstDerivatives
     # `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force: for
     # Jacobians without differentiating the tree
     balance_remainder: ca.SX
@@ -161,7 +161,7 @@ def discrete_equations(
     at = _Symbols.from_system(system)
     lam, h, qm, vm = at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
-    rigid = rigid_body_lagrangian_derivatives(kinematics, vm, system.gravity)
+    rigid = lagrangian_first_derivatives(kinematics, vm, system.gravity)
     lagrangian, force, internal, closed = _summed_terms(system, at, kinematics)
     extra_q, extra_v = ca.gradient(lagrangian, qm), ca.gradient(lagrangian, vm)
 
@@ -193,7 +193,7 @@ def discrete_equations(
         constraint_residual=constraint,
         constraint_relaxation_gain=gain,
         p1=at.placed(p1),
-        rigid_body_terms=MultibodyLagrangianDerivatives(**rigid_at_midpoint),
+        rigid_body_terms=LagrangianFirstDerivatives(**rigid_at_midpoint),
         balance_remainder=at.placed(balance_rest),
         p1_remainder=at.placed(p1_rest),
         force_with_derivatives=closed,
@@ -451,7 +451,7 @@ def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpS
         free rows of the momentum balance / h   internal equations   constraints   (p_{k+1} - p1(q_k, q_{k+1})) / h
 
     The rows do not depend on recordings: torques, prescribed coordinates and parameters may be data or unknowns. The
-    bodies' second derivatives have a closed form (`MultibodyLagrangianDerivatives`) with a quarter of the operations of
+    bodies' second derivatives have a closed form (`LagrangianFirstDerivatives`) with a quarter of the operations of
     automatic differentiation. All other derivatives come from automatic differentiation.
     """
     e, h, system = equations, time_step, equations.system

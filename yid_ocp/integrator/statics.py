@@ -314,7 +314,9 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     """Sum of 1/2 gain (u - q)^2 over all servos [J]; limits and damping do not change the lowest equilibrium."""
     at = zip(system.driven, system.actuated_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
     known = ((system.servos[name], part, q[i]) for name, i, part in at)
-    energies = [0.5 * servo.gain * servo.position_error(command, angle) ** 2 for servo, command, angle in known]
+    energies = [
+        0.5 * servo.gain * servo.position_error_beyond_dead_band(command, angle) ** 2 for servo, command, angle in known
+    ]
     return sum(energies, ca.SX(0))
 
 

@@ -2,7 +2,7 @@
 
 A spatial velocity consists of the angular velocity and the linear velocity of the body point at the world origin. A
 wrench consists of the moment about the world origin and the force. With both in one fixed frame, the derivatives of the
-Lagrangian have the closed forms of `MultibodyLagrangianDerivatives`, which make the compiled step cheap.
+Lagrangian have the closed forms of `LagrangianFirstDerivatives`, which make the compiled step cheap.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Kinematics:
 
 
 @dataclass(frozen=True)
-class MultibodyLagrangianDerivatives:
+class LagrangianFirstDerivatives:
     """First derivatives of the rigid-body Lagrangian, and vectors from which the second derivatives follow.
 
     S_j is the screw of joint j and D_j = V_parent(j) x S_j, with the velocity V_parent(j) of the link before the joint.
@@ -112,9 +112,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
     return Kinematics(mechanism, tuple(rotations), tuple(origins), tuple(screws))
 
 
-def rigid_body_lagrangian_derivatives(
-    kinematics: Kinematics, v: ca.SX, gravity: ca.SX
-) -> MultibodyLagrangianDerivatives:
+def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> LagrangianFirstDerivatives:
     """Compute the Lagrangian derivatives of a mechanism's bodies for velocities v (n, 1) and gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
@@ -137,7 +135,7 @@ def rigid_body_lagrangian_derivatives(
     gradients = [ca.densify(ca.vertcat(ca.SX(0, 1), *entries)) for entries in (by_q, by_v)]
     columns = ((S, 6), (D, 6), (F, 6), (B, 6), (G, 3))
     vectors = [ca.densify(ca.horzcat(ca.SX(rows, 0), *entries)) for entries, rows in columns]
-    return MultibodyLagrangianDerivatives(*[*gradients, kinetic, potential, *vectors])
+    return LagrangianFirstDerivatives(*[*gradients, kinetic, potential, *vectors])
 
 
 @dataclass
@@ -189,13 +187,13 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
     return moved, kinetic, potential
 
 
-def mass_matrix(rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
+def mass_matrix(rigid: LagrangianFirstDerivatives, mechanism: Mechanism) -> ca.SX:
     """Mass matrix (n, n) of the mechanism from its Lagrangian derivatives `rigid`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(
-    rigid: MultibodyLagrangianDerivatives, mechanism: Mechanism
+    rigid: LagrangianFirstDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Second derivatives L_qq, L_qv, L_vv of the bodies' Lagrangian, each (n, n). Rows of L_qv belong to q."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G

@@ -187,7 +187,7 @@ class PositionServo:
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """Servo torque [N m] or force [N] for the commanded coordinate, the coordinate q and the rate v."""
         on = command < MOTOR_OFF_COMMAND / 2
-        error, drag = self.position_error(command, q), self.damping * v
+        error, drag = self.position_error_beyond_dead_band(command, q), self.damping * v
         error = error if self.integral.is_zero() else error + self.integral
         if self.motor_kind == "ideal":
             return ca.if_else(on, _clipped(self.gain * error - drag, self.torque_limit_tightness), 0)
@@ -197,7 +197,7 @@ class PositionServo:
             torque = self.torque_constant * _clipped(current, self.current_limit_tightness)
         return ca.if_else(on, torque, 0)
 
-    def position_error(self, command: ca.SX, q: ca.SX) -> ca.SX:
+    def position_error_beyond_dead_band(self, command: ca.SX, q: ca.SX) -> ca.SX:
         """Position error beyond the dead band [rad or m]. It is zero while the motor is off."""
         error = ca.if_else(command < MOTOR_OFF_COMMAND / 2, command, q) - q
         if self.dead_band.is_zero():

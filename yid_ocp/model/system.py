@@ -136,7 +136,7 @@ class NodeState:
 class ForceWithDerivativeFactors:
     """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives, (n, 1) [N m or N].
 
-    S_j and D_j are as in `MultibodyLagrangianDerivatives`. A_j and T_j are the columns of A and T (6, n). For i an
+    S_j and D_j are as in `LagrangianFirstDerivatives`. A_j and T_j are the columns of A and T (6, n). For i an
     ancestor of joint j or j itself:
 
         dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
@@ -226,7 +226,7 @@ class _ServoIntegral(Effect):
         row, rate = state.internal_rows[name], state.z_rate[state.internal_rows[name]]
         if self.location in system.servos:  # not while the joint is held
             command = state.u[system.driven.index(self.location)]
-            rate -= system.servos[self.location].position_error(
+            rate -= system.servos[self.location].position_error_beyond_dead_band(
                 command, state.q[system.mechanism.joint_index(self.location)]
             )
         return EffectStepTerms(internal_equations={name: rate}, static_equations={name: state.z[row]})
@@ -488,7 +488,7 @@ def _check_names(
         tree.frame(frame)
 
 
-def floating_joint_mechanism(name: str, frame: str | None = None) -> Mechanism:
+def six_joint_floating_mechanism(name: str, frame: str | None = None) -> Mechanism:
     """Build a massless mechanism of six joints `NAME_x` to `NAME_rz` that move a frame `frame` (default `NAME`)."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(

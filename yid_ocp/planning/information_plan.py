@@ -352,7 +352,7 @@ def _distances(
 ) -> dict[tuple[str, str], tuple[float, float]]:
     assert isinstance(criterion, EffectDiscriminationCriterion)
     recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_recording_sensitivities(w)
-    before, after = criterion.pairwise_effect_distances(recorded), criterion.pairwise_effect_distances(planned)
+    before, after = criterion.distances_from_best_imitation(recorded), criterion.distances_from_best_imitation(planned)
     labels = [effect.label for effect in rivals]
     pairs = itertools.permutations(range(len(labels)), 2)
     return {(labels[i], labels[j]): (float(before[i, j]), float(after[i, j])) for i, j in pairs}

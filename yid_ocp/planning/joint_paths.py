@@ -211,7 +211,7 @@ class PathSimulator:
         return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
 
     @cached_property
-    def standstill_node_indices(self) -> IntArray:
+    def node_indices_after_motion(self) -> IntArray:
         """Indices of the nodes at which the motion has ended and the joints stand still."""
         return np.flatnonzero(self.node_times >= self.path.duration - 1e-9)
 
@@ -349,7 +349,9 @@ def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, gues
     return rest
 
 
-def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str) -> None:
+def check_rest_effort_and_spring_limits(
+    step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str
+) -> None:
     """Raise `ConfigError` if efforts or spring angles exceed their limits at the equilibrium `rest`."""
     system, joints = step.system, step.system.mechanism.joints
     efforts = zip(system.prescribed_coordinate_indices, simulate(step, theta, rest.state, 1).effort[0], strict=True)

@@ -22,12 +22,12 @@ from yid_ocp.planning.joint_paths import (
     PlannedMotion,
     PlanOptions,
     RestToRestSplineBasis,
-    check_standstill_limits,
+    check_rest_effort_and_spring_limits,
     solve_equilibrium_at_point_target,
     solve_start_equilibrium,
     start_joint_positions_as_array,
 )
-from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionSearch, TargetMotionSearchResult
+from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionCoefficients, TargetMotionSearch
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
 _MAX_STEP_HALVINGS = 3  # largest number of halvings of the time step
@@ -91,9 +91,9 @@ def plan_motion_to_target(
     place = _place(options, mover.frame_positions_along_states(point, start.state[None])[0, 0])
     if inside is not None:
         _check_box(options, inside, mover.frame_positions_along_states(inside, start.state[None])[0], place)
-    check_standstill_limits(step, values, start, options.limits, "where the motion begins")
+    check_rest_effort_and_spring_limits(step, values, start, options.limits, "where the motion begins")
     end = solve_equilibrium_at_point_target(step, values, start, point, place, options.position_tolerance)
-    check_standstill_limits(step, values, end, options.limits, "where it ends")
+    check_rest_effort_and_spring_limits(step, values, end, options.limits, "where it ends")
 
     def attempt(duration: float) -> TargetMotionPlan:
         own = replace(mover, path=replace(path, duration=duration))
@@ -198,7 +198,7 @@ def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array)
     """Whether the final position of the point and its standstill are the same with half the time step."""
     pairs = ((rows.simulator, 1), (finer, 2))
     own, other = (arm.frame_positions_along_states(rows.point, arm.simulate_path(w).state[::n]) for arm, n in pairs)
-    change = (other - own)[rows.simulator.standstill_node_indices]
+    change = (other - own)[rows.simulator.node_indices_after_motion]
     place = np.linalg.norm(change[:, 0], axis=1).max()
     speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step
     reached, rest = rows.options.position_tolerance, rows.options.point_rest_speed_tolerance
@@ -230,7 +230,7 @@ def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) 
 
 def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: ParameterCovariance) -> Array:
     """Derivative of the point's final position, at each final node, by the uncertain parameters, (nodes, 3, count)."""
-    mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.standstill_node_indices
+    mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.node_indices_after_motion
     rollout = mover.simulate_path(w, names=known.parameter_names)
     assert rollout.state_sensitivity is not None
     _, by_q = rows.point.positions_and_jacobian(rollout.state[end, :n], mover.theta)
@@ -238,7 +238,7 @@ def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: Paramete
 
 
 def _outcome(
-    rows: PlanResidualAndLimitFunctions, shot: TargetMotionSearchResult, known: ParameterCovariance
+    rows: PlanResidualAndLimitFunctions, shot: TargetMotionCoefficients, known: ParameterCovariance
 ) -> TargetMotionPlan:
     mover = rows.simulator
     rollout, std = mover.simulate_path(shot.w), None
@@ -246,7 +246,7 @@ def _outcome(
         slope = _point_slopes(rows, shot.w, known)[-1]
         std = np.sqrt(np.maximum(np.diag(slope @ known.covariance @ slope.T), 0.0))
     own = mover.frame_positions_along_states(rows.point, rollout.state)
-    end = mover.standstill_node_indices
+    end = mover.node_indices_after_motion
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
     course = rows.point_reference_trajectory

@@ -90,7 +90,7 @@ class PlanResidualAndLimitFunctions:
         assert rollout.effort_sensitivity is not None
         at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
         by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
-        end, course = mover.standstill_node_indices, self.point_reference_trajectory
+        end, course = mover.node_indices_after_motion, self.point_reference_trajectory
         after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
         by_speed = (by_w[after] - by_w[before]) / h
         parts = [_rows(at[end, :3] - self.target, by_w[end, :3], reached)]
@@ -191,7 +191,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 
 @dataclass(frozen=True)
-class TargetMotionSearchResult:
+class TargetMotionCoefficients:
     """Coefficients w (K, nc) of a planned motion, and whether the search converged within the limits."""
 
     w: Array
@@ -221,7 +221,7 @@ class TargetMotionSearch:
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
-    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> TargetMotionSearchResult:
+    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> TargetMotionCoefficients:
         """Optimise the spline coefficients of a motion, (K, nc): K coefficients for each of nc prescribed joints.
 
         The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
@@ -250,7 +250,7 @@ class TargetMotionSearch:
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
             message = f"the search was stopped after {iterations} evaluations; raise plan.max_iterations"
-        return TargetMotionSearchResult(x.reshape(self._shape), finished, message, self.evaluations)
+        return TargetMotionCoefficients(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
@@ -314,7 +314,7 @@ class EffectDiscriminationCriterion:
     amplitude_cases: tuple[Array, ...]
     parameter_columns: tuple[int, ...]  # columns with a prior: nominal parameters and parameters of effects
 
-    def pairwise_effect_distances(self, rows: Array) -> Array:
+    def distances_from_best_imitation(self, rows: Array) -> Array:
         """Distances [data stds] of effect i (row) from its best imitation by effect j; infinite diagonal."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):

@@ -133,7 +133,7 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
     def camera_pose(self) -> Array | None: ...
 
 
-class RecordedJointGroup(Protocol):
+class RecordedJointsInterface(Protocol):
     """Interface of recorded joints, with names, times and channels; implemented by `data.recording.JointGroup`."""
 
     @property
@@ -171,7 +171,7 @@ class _RecordingData(Protocol):
     @property
     def name(self) -> str: ...
     @property
-    def joints(self) -> RecordedJointGroup | None: ...
+    def joints(self) -> RecordedJointsInterface | None: ...
     @property
     def points(self) -> Sequence[RecordedPointGroup]: ...
     @property
@@ -184,7 +184,7 @@ def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> Dat
     return DataError(what, where=where, allowed=f"a standard deviation above 0 [{unit}]", hint=hint)
 
 
-def recorded_joint_column_indices(joints: RecordedJointGroup, names: tuple[str, ...], where: str) -> list[int]:
+def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[str, ...], where: str) -> list[int]:
     """Column indices of the named joints in the recorded arrays. Raises `DataError` if one is not recorded."""
     for name in names:
         if name not in joints.names:

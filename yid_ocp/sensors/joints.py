@@ -18,7 +18,7 @@ from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
     RecordedChannelKind,
-    RecordedJointGroup,
+    RecordedJointsInterface,
     RecordedPointGroup,
     Sensor,
     SensorData,
@@ -178,7 +178,7 @@ def nodes_and_decorrelated_values(
     return kept, measured[kept]
 
 
-def is_noise_std_stated(joints: RecordedJointGroup, group: str, choice: SensorOptions) -> bool:
+def is_noise_std_stated(joints: RecordedJointsInterface, group: str, choice: SensorOptions) -> bool:
     """Whether recording or settings specify the noise of `group` (`joints.effort` or `joints.position`).
 
     A recorded encoder resolution also specifies the noise of joint positions.
@@ -203,7 +203,7 @@ def quantization_step(values: Array) -> float:
 
 
 def _joint_noise_std(
-    joints: RecordedJointGroup, names: Sequence[str], choice: SensorOptions, where: str, *, group: str
+    joints: RecordedJointsInterface, names: Sequence[str], choice: SensorOptions, where: str, *, group: str
 ) -> Array:
     channel, columns = CHANNEL_KINDS[group], recorded_joint_column_indices(joints, tuple(names), where)
     values, given, step = getattr(joints, channel.quantity)[:, columns], choice.std, np.zeros(len(names))
@@ -232,7 +232,7 @@ joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME
 """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
 
 
-def joint_torque_bias_std(joints: RecordedJointGroup, names: Sequence[str], choice: SensorOptions) -> Array:
+def joint_torque_bias_std(joints: RecordedJointsInterface, names: Sequence[str], choice: SensorOptions) -> Array:
     """Standard deviation of the recorded torques' constant errors, (len(names),) [N m]. Zero if unknown."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
     key = f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"

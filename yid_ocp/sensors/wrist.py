@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import casadi as ca
 
-from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.mechanism import Inertia, Placement
-from yid_ocp.model.system import MidpointState, NodeState, System, floating_joint_mechanism
+from yid_ocp.model.system import MidpointState, NodeState, System, six_joint_floating_mechanism
 from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelKind
 from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
@@ -56,7 +56,7 @@ def _wrench_on_sensor(state: NodeState, frame: str) -> ca.SX:
         return ca.vertcat(values[:first], ca.SX(ca.DM.zeros(_N_LOCKED_JOINTS)), values[first:])
 
     kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
+    rigid = lagrangian_first_derivatives(kinematics, v, system.gravity)
     momentum, push = rigid.lagrangian_by_v[locked], rigid.lagrangian_by_q[locked]
     u, z_rate = ca.SX(len(system.driven), 1), ca.SX(*state.z.shape)
     middle = MidpointState(system, kinematics, q, v, state.z, z_rate, u, state.lam, state.internal_rows, ca.SX(1))
@@ -80,7 +80,7 @@ def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
     before, first = frame.joint_index, frame.joint_index + 1
     last, turn = before + _N_LOCKED_JOINTS, frame.placement.rotation.T
     back = Placement(turn, -turn @ frame.placement.translation)
-    chain = list(floating_joint_mechanism(f"{name} cut").joints)
+    chain = list(six_joint_floating_mechanism(f"{name} cut").joints)
     chain[0] = replace(chain[0], parent_index=before, placement=frame.placement)
     near = (body.scaled_by(ca.SX(-1)) for body in frame.proximal_bodies)
     bodies = tuple(body.transformed_by(back) for body in (*tree.joints[before].bodies, *near))

@@ -165,7 +165,7 @@ class Solution(ReprMixin):
         known = [(episode, result) for episode, result in pairs if not isinstance(result, str)]
         return tuple(sample for pair in known for sample in channel_predictions(*pair))
 
-    def to_dataframe(self) -> pandas.DataFrame:
+    def parameters_to_dataframe(self) -> pandas.DataFrame:
         """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
         `lower` and `upper` are the 95 % interval, infinite at an open end. Raises `ConfigError` if pandas is not

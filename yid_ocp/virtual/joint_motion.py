@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
 from yid_ocp.virtual.mjcf import ExpressionEvaluator
@@ -135,7 +135,7 @@ def random_multisine_motion(
     if chosen.shake_torque_rms == 0.0:
         return motion
     rest = ca.SX(ca.DM.zeros(system.n_coordinates))
-    rigid = rigid_body_lagrangian_derivatives(kinematics, rest, ca.SX(ca.DM.zeros(3)))
+    rigid = lagrangian_first_derivatives(kinematics, rest, ca.SX(ca.DM.zeros(3)))
     inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
     return _shaken(motion, chosen, inertia[list(system.actuated_coordinate_indices)], rng)
 

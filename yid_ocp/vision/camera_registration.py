@@ -238,7 +238,7 @@ class RobustCostDerivatives:
     # (counted twice), and at least the last sum (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
 
-    def data_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
+    def weighted_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
         """Return weight * Hessian, weight * gradient, and the weight. `precision` is the prior's inverse covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
@@ -248,7 +248,7 @@ class RobustCostDerivatives:
 
     def state_covariance(self, precision: Array) -> Array:
         """Covariance (10, 10) of the state that minimises data and prior cost."""
-        hessian, _, weight = self.data_hessian_gradient_and_weight(precision)
+        hessian, _, weight = self.weighted_hessian_gradient_and_weight(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 

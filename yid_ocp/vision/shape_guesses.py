@@ -27,7 +27,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import DataError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
-from yid_ocp.model.system import System, floating_joint_mechanism
+from yid_ocp.model.system import System, six_joint_floating_mechanism
 from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
 
 _N_NEIGHBOURS = 10
@@ -222,7 +222,7 @@ def system_with_free_root(system: System, values: Mapping[str, float] | None = N
     place = ca.Function("root", [q], [forward_kinematics(tree, q).joint_origins[base]])(np.zeros(system.n_coordinates))
     under = np.eye(4)
     under[:3, 3] = -np.array(place).ravel()
-    carrier = floating_joint_mechanism(_FREE_ROOT_PREFIX)
+    carrier = six_joint_floating_mechanism(_FREE_ROOT_PREFIX)
     carried = carrier.with_attached_mechanism(system.mechanism, _FREE_ROOT_PREFIX, under)
     return replace(system, mechanism=carried, grasps=()), carrier.joint_names
 
@@ -241,7 +241,7 @@ class ShapeGuessFinder:
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]
     ) -> None:
         self._rest, self._bends = rest, frozenset(bends)
-        self._root = [tree.joint_index(name) for name in floating_joint_mechanism(_FREE_ROOT_PREFIX).joint_names]
+        self._root = [tree.joint_index(name) for name in six_joint_floating_mechanism(_FREE_ROOT_PREFIX).joint_names]
         self._parent = [joint.parent_index for joint in tree.joints]
         self._axis = [np.array(joint.axis, float) for joint in tree.joints]
         self._turns = [joint.kind == "revolute" for joint in tree.joints]

@@ -197,7 +197,7 @@ class _Proof:
         experiments, chains = _blind_experiments_and_refinable_subset(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
         own, of = self.part
-        whole = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
+        whole = blind.assign_blind_case_categories(self.count, self.seed, weights, chains, self.purpose)
         plan = [entry for entry in whole if entry.number % of == own - 1]
         if not plan:
             what, allowed = f"slice {own}/{of} of {self.count} cases is empty", f"at most {self.count} slices"

@@ -40,7 +40,7 @@ from yid_ocp.model.flexible import (
 from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement, symbolic_rotation_from_axis_angle
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectBuilder
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import Grasp, System, SystemBuildArguments, floating_joint_mechanism
+from yid_ocp.model.system import Grasp, System, SystemBuildArguments, six_joint_floating_mechanism
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -138,7 +138,7 @@ def clamped_cable_system(
     if options.shape_memory_fraction is not None:
         item = _with_memory(item, options.shape_memory_fraction)
     clamps = _start_clamp(lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]], cable)
-    clamps = clamps.with_attached_mechanism(floating_joint_mechanism(END_CLAMP))
+    clamps = clamps.with_attached_mechanism(six_joint_floating_mechanism(END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
     if options.end_clamp_grasp_kind == "weld":
         text = "roll of the end clamp about the last edge"
@@ -213,7 +213,7 @@ def _with_vertices(
 
 
 def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
-    clamp = floating_joint_mechanism(START_CLAMP)
+    clamp = six_joint_floating_mechanism(START_CLAMP)
     text = "roll of the start clamp about the first edge"
     roll = Parameter(f"{START_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
     edge = Parameter(f"{START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
