@@ -21,7 +21,12 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import FrictionLawSettings
 from yid_ocp.diagnosis import law as gap_law
-from yid_ocp.effects.law import TorqueLaw, TorqueLawTable, make_torque_law, torque_law_quantity_values_along_rollout
+from yid_ocp.effects.law import (
+    TorqueLaw,
+    TorqueLawTable,
+    torque_law_from_tables,
+    torque_law_quantity_values_along_rollout,
+)
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.problem import EstimationProblem
@@ -69,7 +74,7 @@ def left_out_errors(
         low, high = min(low, -high), max(high, -low)
     room, zeros = (high - low) / (N_KNOTS - 3), np.zeros(N_KNOTS)
     knots = np.linspace(low - room / 2, high + room / 2, N_KNOTS)
-    law = make_torque_law(JOINT, base.system, [TorqueLawTable(quantity, knots, zeros, zeros)], TORQUE_STD)
+    law = torque_law_from_tables(JOINT, base.system, [TorqueLawTable(quantity, knots, zeros, zeros)], TORQUE_STD)
     names, known = law.parameters.names, base.named_values(solution.x)
     step = compile_step_like(base.step, base.system.with_effects([law]))
     nominal = dict(zip(base.system.parameters.names, map(float, base.theta), strict=True))

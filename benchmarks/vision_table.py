@@ -45,7 +45,7 @@ from yid_ocp.virtual.joint_motion import (
 )
 from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.vision import CameraIntrinsics, FrameSequence, SceneModel, TrackOptions, TrackResult, look_at_pose
+from yid_ocp.vision import CameraIntrinsics, FrameSequence, SceneDescription, TrackOptions, TrackResult, look_at_pose
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint
 from yid_ocp.vision.track import track_object
@@ -358,7 +358,7 @@ def measured(depths: Sequence[Array], cosines: Sequence[Array], noise: Noise, rn
 class Film:
     """What `track_object` is given, and what was true."""
 
-    scene: SceneModel
+    scene: SceneDescription
     recording: Recording
     sequence: FrameSequence
     place: Callable[[float], Array]
@@ -401,7 +401,7 @@ def film(play: Played, row: Row, seed: int, frames: int) -> Film:
     names = tuple(f"frame {i}" for i in range(frames))
     sequence = FrameSequence(stamps, names, told, load, LENS, "independent camera")
     recording = Recording(play.joints(seed), (play.arm_points(seed),), source="MuJoCo", name="table")
-    return Film(SceneModel(system, "package:baxter", values), recording, sequence, stage.place, taken)
+    return Film(SceneDescription(system, "package:baxter", values), recording, sequence, stage.place, taken)
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,7 +90,7 @@ class MadeUp:
             fraction=np.zeros(data), n_residuals=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=steps, time_step=0.1)
-        return SimpleNamespace(name=f"run {i}", grid=grid, measurements=(group,), has_uncertain_sensor_biases=False)
+        return SimpleNamespace(name=f"run {i}", grid=grid, measurements=(group,), has_biases_treated_as_noise=False)
 
     @property
     def positive_unknowns_mask(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, _estimated_without, add_baseline_prior
+from yid_ocp.diagnosis.baseline import DiagnosisBaseline, _estimated_without, add_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -116,7 +116,7 @@ def test_the_world_without_effects_is_estimated_on_its_own_recordings(beam):
 
 
 def test_without_earlier_runs_there_is_nothing_to_differ():
-    none = EarlierRunsBaseline.from_runs([], ())
+    none = DiagnosisBaseline.from_run_estimates([], ())
     assert (none.combined_estimates, none.between_runs_p_value) == (None, 1.0)
 
 
@@ -131,7 +131,8 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
     both = refit_with_effects(AllCandidatesProblem(add_baseline_prior(problem, known), (), False), (), {})
-    [shift] = EarlierRunsBaseline.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
+    baseline = DiagnosisBaseline.from_run_estimates([known], ())
+    [shift] = baseline.compare_with_baseline(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:
         assert shift.z_score is None  # the recording says nothing beside such a baseline

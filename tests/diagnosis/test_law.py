@@ -11,8 +11,8 @@ from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.law import (
     TorqueLawTable,
-    make_torque_law,
     read_torque_law_tables,
+    torque_law_from_tables,
     torque_law_quantity_values_along_rollout,
     torque_law_tables_csv,
 )
@@ -99,7 +99,7 @@ def tables(count=7, quantities=("angle",)):
 
 def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond(system):
     [table] = tables()
-    law = make_torque_law("elbow", system, [table])
+    law = torque_law_from_tables("elbow", system, [table])
     plain, with_law = compile_step(system, H), compile_step(system.with_effects([law]), H)
     t = H * np.arange(201)
     path = np.column_stack([0.2 * np.sin(t), 1.5 * np.sin(3 * t)])
@@ -117,7 +117,7 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
 def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
     servos = ServoModelOptions(motor=MotorOptions("dc"))
     plain = pendulum_step(urdf_folder, driven=JOINTS, servos=servos)
-    law = make_torque_law("elbow", plain.system, tables(quantities=("command",)))
+    law = torque_law_from_tables("elbow", plain.system, tables(quantities=("command",)))
     with_law = compile_step(plain.system.with_effects([law]), H, use_compiler=False)
     commands = np.tile([0.4, -0.3], (40, 1))
     commands[:20] = MOTOR_OFF_COMMAND
@@ -138,7 +138,7 @@ def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
 
 @pytest.mark.parametrize("quantities", [("angle",), ("speed",), ("angle", "speed"), ("time",)])
 def test_derivatives_by_the_values_at_the_knots(system, urdf_folder, quantities):
-    law = make_torque_law("elbow", system, tables(5, quantities))
+    law = torque_law_from_tables("elbow", system, tables(5, quantities))
     step = compile_step(system.with_effects([law]), H, use_compiler=False)
     run = moved(urdf_folder, UNNAMED["angle"], 5, seconds=0.4)
     problem = EstimationProblem(step, [run], law.parameters.names, ProblemOptions(path_cutoff=float("inf")))
@@ -176,9 +176,9 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, said):
 
 def test_a_law_has_a_place_and_a_quantity_there(system):
     with pytest.raises(ConfigError, match="no location 'nowhere'"):
-        make_torque_law("nowhere", system, tables())
+        torque_law_from_tables("nowhere", system, tables())
     with pytest.raises(ConfigError, match="cannot depend on 'command'"):
-        make_torque_law("elbow", system, tables(quantities=("command",)))
+        torque_law_from_tables("elbow", system, tables(quantities=("command",)))
 
 
 def test_a_configuration_has_a_law_by_its_table(tmp_path):

@@ -20,7 +20,7 @@ from yid_ocp.diagnosis.blind import (
     BlindCaseGenerator,
     CaseGroundTruth,
     PlannedBlindCase,
-    SyntheticMeasurementConditions,
+    SyntheticRecordingConditions,
     assign_blind_case_categories,
     scale_parameters_to_more_links,
 )
@@ -199,7 +199,7 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     assert max(seeds) > 2**24
     assert drawn(seed=9).draw_recordings_and_ground_truth(wanted[3])[1].truth != first[3].truth
     # an ensemble to calibrate by shares no case with the one that is reported
-    calibrating = drawn(conditions=SyntheticMeasurementConditions(purpose="calibration"))
+    calibrating = drawn(conditions=SyntheticRecordingConditions(purpose="calibration"))
     assert calibrating.draw_recordings_and_ground_truth(wanted[3])[1].truth != first[3].truth
 
 
@@ -264,7 +264,7 @@ def test_a_brisk_motion_has_three_times_the_acceleration(drawn):
 
 
 def test_truth_has_ordinary_friction_and_parameters_as_uncertain_as_their_priors(drawn):
-    ensemble = drawn(conditions=SyntheticMeasurementConditions(ordinary_friction=()))
+    ensemble = drawn(conditions=SyntheticRecordingConditions(ordinary_friction=()))
     known = ensemble.problem
     known.system.effects = (FRICTION,)
     known.system.parameters.names += ("joint_coulomb@elbow.tau_c",)

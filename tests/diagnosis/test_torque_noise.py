@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.screening import linearize_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_unknown_forces
-from yid_ocp.inference.uncertainty import unknowns_covariance_factor
+from yid_ocp.inference.uncertainty import noise_only_covariance_factor
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_with_relinearized_held_out_whitening,
@@ -182,7 +182,7 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
     made = composed(step, True)
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
-    spread = unknowns_covariance_factor(fit.problem, fit.evaluation)
+    spread = noise_only_covariance_factor(fit.problem, fit.evaluation)
     off = fit.problem.unknown_vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     moved = replace(fit, values=fit.problem.named_values(off))
     assert _held_out_null_test(moved).p_value < 1e-12

@@ -15,7 +15,7 @@ from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import urdf as urdf_files
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, merge_bodies
 from yid_ocp.model.system import six_joint_floating_mechanism
-from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, resolve_urdf_path
+from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, urdf_path_from_robot_name
 
 BODY = '<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
 TENSOR = 'ixx="{0}" iyy="{1}" izz="{2}" ixy="0" ixz="0" iyz="0"'
@@ -277,7 +277,7 @@ def test_a_joint_that_follows_is_locked_where_its_leader_stands(tmp_path, caplog
 
 
 def test_mechanisms_that_ship_are_found_by_name_also_where_a_wheel_put_them(urdf_folder, tmp_path, monkeypatch) -> None:
-    assert resolve_urdf_path("default:turntable.urdf").samefile(urdf_folder / "turntable.urdf")
+    assert urdf_path_from_robot_name("default:turntable.urdf").samefile(urdf_folder / "turntable.urdf")
 
     class Installed(PurePosixPath):
         def locate(self):
@@ -286,9 +286,9 @@ def test_mechanisms_that_ship_are_found_by_name_also_where_a_wheel_put_them(urdf
     files = [Installed("../../../share/yid_ocp/urdf/turntable.urdf"), Installed("yid_ocp/cli.py")]
     monkeypatch.setattr(urdf_files, "__file__", str(tmp_path / "site-packages" / "yid_ocp" / "model" / "urdf.py"))
     monkeypatch.setattr(urdf_files.metadata, "files", {"yid-ocp": files}.__getitem__)
-    assert resolve_urdf_path("default:turntable.urdf") == urdf_folder / "turntable.urdf"
+    assert urdf_path_from_robot_name("default:turntable.urdf") == urdf_folder / "turntable.urdf"
     with pytest.raises(ModelError, match="no URDF"):
-        resolve_urdf_path("default:cli.py")
+        urdf_path_from_robot_name("default:cli.py")
 
 
 @pytest.mark.parametrize(
@@ -302,4 +302,4 @@ def test_mechanisms_that_ship_are_found_by_name_also_where_a_wheel_put_them(urdf
     ],
 )
 def test_a_robot_of_example_robot_data_is_found_by_its_stem_in_any_case(name: str, file: str) -> None:
-    assert resolve_urdf_path(f"package:{name}").as_posix().endswith(f"robots/{file}")
+    assert urdf_path_from_robot_name(f"package:{name}").as_posix().endswith(f"robots/{file}")

@@ -88,8 +88,8 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     stated = EstimationProblem(step, recorded, ("elbow.mass",), given)
     bare = replace(given, sensors={"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.0})})
     spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))
-    assert stated.episodes[0].has_uncertain_sensor_biases
-    assert not spelt.episodes[0].has_uncertain_sensor_biases
+    assert stated.episodes[0].has_biases_treated_as_noise
+    assert not spelt.episodes[0].has_biases_treated_as_noise
     weighted, beside = (problem_with_whitening_at(problem, problem.initial_unknowns) for problem in (stated, spelt))
     assert weighted.whitening_filters[0] is not None
     expected, _ = least(beside, spelt.initial_unknowns)

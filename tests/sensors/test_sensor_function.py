@@ -18,7 +18,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, Mechanism, System, flexible_object
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import Effect, NodeState
+from yid_ocp.model.system import Effect, NodeStateSymbols
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.sensors import EffortSensor, PointSensor, RecordedChannelKind, Sensor, sensor_reading_function
 from yid_ocp.solvers.symbolic_transcription import transcribe
@@ -53,7 +53,7 @@ def read(system: System, sensor: Sensor, q=None, effort=None) -> np.ndarray:
 class Drift(Effect):
     """Adds gain (memory + effort of the first joint) to every reading: what depends on all that a sensor may see."""
 
-    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         memory = self.internal_coordinate_symbols[f"{LABEL}.memory"]
         return output + self.parameters[f"{LABEL}.gain"].symbol * (memory**2 + ca.sin(state.load[0]))
 
@@ -167,7 +167,7 @@ class Hand(Sensor):
     def channel_names(self) -> tuple[str, ...]:
         return tuple(f"hand.touch.{name}" for name in ("speed", "acceleration", "force"))
 
-    def ideal_reading(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         return ca.vertcat(state.v[1] * ca.cos(state.q[0]), state.a[1] * state.q[0], state.lam[0])
 
 

@@ -13,7 +13,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
-from yid_ocp.model.system import MidpointState
+from yid_ocp.model.system import MidpointStateSymbols
 from yid_ocp.virtual import injected
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect, run_experiment_with_effects
@@ -62,7 +62,7 @@ def symbolic(kind, location, values, q, v):
     none, u = ca.SX(0, 1), ca.SX.sym("u", len(SYSTEM.driven))
     reaction = ca.SX.sym("r", SYSTEM.n_constraints)
     kinematics, nominal = (forward_kinematics(system.mechanism, sq) for system in (changed, SYSTEM))
-    terms = effect.step_terms(MidpointState(changed, kinematics, sq, sv, none, none, u, reaction, {}, ca.SX(1)))
+    terms = effect.step_terms(MidpointStateSymbols(changed, kinematics, sq, sv, none, none, u, reaction, {}, ca.SX(1)))
     rigid = (lagrangian_first_derivatives(k, 0 * sv, SYSTEM.gravity) for k in (kinematics, nominal))
     weight, usual = (terms_at_rest.lagrangian_by_q for terms_at_rest in rigid)
     closed = terms.force_with_derivatives

@@ -18,7 +18,7 @@ from yid_ocp.model import (
     EffectStepTerms,
     FlexibleSegment,
     Grasp,
-    MidpointState,
+    MidpointStateSymbols,
     Parameter,
     Parameters,
     System,
@@ -101,7 +101,7 @@ def assert_same_mechanics(system: System, values: dict[str, float]) -> None:
         at = system.mechanism.joint_index(joint)
         passive[at] -= (q[at] + system.joint_relaxation_times[joint] * v[at]) / compliance
     for effect in system.effects:
-        terms = effect.step_terms(MidpointState(system, kinematics, q, v, none, none, none, none, {}, ca.SX(1)))
+        terms = effect.step_terms(MidpointStateSymbols(system, kinematics, q, v, none, none, none, none, {}, ca.SX(1)))
         mass, passive = mass + ca.hessian(terms.lagrangian, v)[0], passive + ca.gradient(terms.lagrangian, q)
         passive += 0 if terms.dissipative_force is None else terms.dissipative_force
     points = ca.horzcat(ca.SX(3, 0), *(kinematics.frame_position(name) for name in system.point_frames))
@@ -259,7 +259,7 @@ def test_mechanics_equals_the_symbolic_one(system: System, values: dict[str, flo
 
 
 class Pull(Effect):
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         return EffectStepTerms(generalized_force=self.parameters["pull@T1.force"].symbol * state.v)
 
 

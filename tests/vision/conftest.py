@@ -70,7 +70,7 @@ def recording(system, run):
 
 
 # a quarter of an Xtion's pixels, each as good: a test has four times as many frames in the time
-COARSE = vision.DepthSensorModel(
+COARSE = vision.DepthCameraModel(
     CameraIntrinsics.from_field_of_view(320, 240, math.radians(58.0)), disparity_std=1 / 32, disparity_step=1 / 16
 )
 
@@ -84,7 +84,7 @@ def tracked(system, run, recording, shape):
 
     def make(outliers=0.0, seed=0, late=(), **timing):
         when = vision.VirtualCameraTiming(mean_rate=3.0, latency=0.06, **timing)
-        scene = vision.SceneModel(system, "package:baxter")
+        scene = vision.SceneDescription(system, "package:baxter")
         camera = vision.VirtualCameraSetup(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = vision.render_virtual_frames(scene, run.t, run.q, camera)
         options = vision.TrackOptions(

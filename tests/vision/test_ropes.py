@@ -12,7 +12,7 @@ from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.system import System
-from yid_ocp.vision import FrameSequence, SceneModel, TrackOptions, look_at_pose
+from yid_ocp.vision import FrameSequence, SceneDescription, TrackOptions, look_at_pose
 from yid_ocp.vision.frame_selection import is_shape_self_touching
 from yid_ocp.vision.track import track_object
 
@@ -89,14 +89,14 @@ def errors(found, lines):
 
 def test_a_rope_on_a_table(rope):
     lines, near = [snake(k) for k in range(3)], replace(OPTIONS, approximate_root_position=(-0.5, 0.0, 0.0))
-    found = track_object(SceneModel(rope), None, film(lines, TABLE), near)
+    found = track_object(SceneDescription(rope), None, film(lines, TABLE), near)
     apart, off = errors(found, lines)
     assert len(found.t) == 3
     assert apart.max() < 4 * MILLIMETRE
     assert (np.abs(off) < 3 * found.std).all()
     assert "approximate_root_position" in found.root_note
     there = replace(OPTIONS, approximate_root_position=(0.5, 0.0, 0.0))
-    other = track_object(SceneModel(rope), None, film(lines[:1], TABLE), there)
+    other = track_object(SceneDescription(rope), None, film(lines[:1], TABLE), there)
     assert np.linalg.norm(other.position[0, 0] - lines[0][-1]) < 4 * MILLIMETRE
     assert found.recording_with_points(None).points[0].names == ("rope:0%", "rope:50%", "w_rope")
 
@@ -104,7 +104,7 @@ def test_a_rope_on_a_table(rope):
 @pytest.mark.parametrize(("root", "word"), [("fixed", "stays in its place"), ("free", "higher")])
 def test_the_root_of_a_hanging_rope_is_found(rope, root, word):
     lines = [swing(k) for k in range(3)]
-    found = track_object(SceneModel(rope), None, film(lines, WALL), replace(OPTIONS, root_placement=root))
+    found = track_object(SceneDescription(rope), None, film(lines, WALL), replace(OPTIONS, root_placement=root))
     assert errors(found, lines)[0].max() < 5 * MILLIMETRE
     assert word in found.root_note
 
@@ -113,7 +113,7 @@ def test_a_rope_that_hands_turn_over_keeps_its_root(rope):
     """The end that was lower goes above the other; nothing but the frames before says which one it is."""
     turns = np.linspace(0.0, 0.9 * np.pi, 6)
     lines = [swing(1) @ np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]).T for a in turns]
-    found = track_object(SceneModel(rope), None, film([places - [0, 0, 0.4] for places in lines], WALL), OPTIONS)
+    found = track_object(SceneDescription(rope), None, film([places - [0, 0, 0.4] for places in lines], WALL), OPTIONS)
     roots = found.position[:, 0] + [0, 0, 0.4]
     truth = [np.array([places[k] for places in lines]) for k in (0, -1)]
     assert min(np.linalg.norm(roots - places, axis=1).max() for places in truth) < 5 * MILLIMETRE
@@ -121,7 +121,7 @@ def test_a_rope_that_hands_turn_over_keeps_its_root(rope):
 
 def test_either_end_where_nothing_tells(rope):
     lines = [snake(k) for k in range(2)]
-    found = track_object(SceneModel(rope), None, film(lines, TABLE), OPTIONS)
+    found = track_object(SceneDescription(rope), None, film(lines, TABLE), OPTIONS)
     assert "either end" in found.root_note
     assert all(frame.alternative_fit is not None for frame in found.frame_reports)
 
@@ -147,7 +147,8 @@ def test_branches_tell_where_the_root_is():
         counts = (1600, 1200, 800)
         clouds.append(np.concatenate([seen(p, TABLE, rng, count=n) for p, n in zip(parts, counts, strict=True)]))
         truth.append([stem[0], *(part[-1] for part in parts)])
-    found = track_object(SceneModel(system), None, FrameSequence.from_clouds(np.arange(3.0), clouds, TABLE), OPTIONS)
+    frames = FrameSequence.from_clouds(np.arange(3.0), clouds, TABLE)
+    found = track_object(SceneDescription(system), None, frames, OPTIONS)
     assert np.linalg.norm(found.position - truth, axis=2).max() < 4 * MILLIMETRE
     assert "lengths and branches" in found.root_note
 
@@ -172,7 +173,7 @@ def folded(s):
 )
 def test_what_cannot_be_followed_is_refused_with_the_reason(rope, make, reason):
     with pytest.raises(DataError, match="no frame could be used") as caught:
-        track_object(SceneModel(rope), None, film([make()], TABLE), OPTIONS)
+        track_object(SceneDescription(rope), None, film([make()], TABLE), OPTIONS)
     assert reason in caught.value.what
 
 
@@ -190,7 +191,7 @@ def test_shapes_that_touch_themselves():
 
 def test_a_robot_says_where_the_root_is(rope):
     with pytest.raises(ConfigError, match="a robot holds the object"):
-        track_object(SceneModel(rope, "package:baxter"), None, film([snake(0)], TABLE), OPTIONS)
+        track_object(SceneDescription(rope, "package:baxter"), None, film([snake(0)], TABLE), OPTIONS)
 
 
 def test_the_command_needs_no_recording(tmp_path, capsys):

@@ -29,7 +29,7 @@ def inner(image):
 
 @pytest.mark.parametrize("distance", [1.0, 2.0, 3.0])
 def test_noise_grows_with_the_square_of_distance(distance):
-    camera = vision.DepthSensorModel()
+    camera = vision.DepthCameraModel()
     seen = inner(camera._simulate_depth_image(*wall(distance), np.random.default_rng(0)))
     disparity_std = np.hypot(camera.disparity_std, camera.disparity_step / np.sqrt(12.0))
     expected = distance**2 / (camera.intrinsics.fx * camera.baseline) * disparity_std
@@ -38,7 +38,7 @@ def test_noise_grows_with_the_square_of_distance(distance):
 
 
 def test_the_figures_at_two_metres():
-    cameras = replace(vision.DepthSensorModel(), disparity_step=0.0), vision.DepthSensorModel()
+    cameras = replace(vision.DepthCameraModel(), disparity_step=0.0), vision.DepthCameraModel()
     fine, stepped = (inner(own._simulate_depth_image(*wall(2.0), np.random.default_rng(0))) for own in cameras)
     assert np.nanstd(fine) == pytest.approx(0.0058, rel=0.05)
     steps = np.unique(stepped)
@@ -46,7 +46,7 @@ def test_the_figures_at_two_metres():
 
 
 def test_what_is_out_of_range_or_seen_at_a_grazing_angle_is_lost():
-    camera, rng = vision.DepthSensorModel(), np.random.default_rng(0)
+    camera, rng = vision.DepthCameraModel(), np.random.default_rng(0)
     assert np.isnan(camera._simulate_depth_image(*wall(0.5), rng)).all()
     assert np.isnan(camera._simulate_depth_image(*wall(np.inf), rng)).all()
     assert np.isnan(camera._simulate_depth_image(np.full(SHAPE, 2.0), np.full(SHAPE, 0.05), rng)).all()
@@ -56,7 +56,7 @@ def test_what_is_out_of_range_or_seen_at_a_grazing_angle_is_lost():
 def test_edges_have_holes_and_a_shadow_on_one_side():
     depth, cosine = wall(3.0)
     depth[:, 300:340] = 1.5
-    camera = replace(vision.DepthSensorModel(), loss_probability=0.0)
+    camera = replace(vision.DepthCameraModel(), loss_probability=0.0)
     lost = np.isnan(camera._simulate_depth_image(depth, cosine, np.random.default_rng(1))).mean(axis=0)
     shift = round(camera.intrinsics.fx * camera.baseline * (1 / 1.5 - 1 / 3.0))
     assert (lost[342 : 338 + shift] == 1).all(), "the projector's shadow"
@@ -67,7 +67,7 @@ def test_edges_have_holes_and_a_shadow_on_one_side():
 
 
 def test_outliers_are_as_many_as_asked_for():
-    camera = replace(vision.DepthSensorModel(), outlier_probability=0.2)
+    camera = replace(vision.DepthCameraModel(), outlier_probability=0.2)
     seen = inner(camera._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
     assert (np.abs(seen - 2.0) > 0.04).mean() == pytest.approx(0.2 * 0.9, abs=0.02)
 
@@ -86,7 +86,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
     camera = vision.VirtualCameraSetup(pose, timing=vision.VirtualCameraTiming(mean_rate=2.0))
     one, two = (
-        vision.render_virtual_frames(vision.SceneModel(system), run.t, run.q, replace(camera, seed=seed))
+        vision.render_virtual_frames(vision.SceneDescription(system), run.t, run.q, replace(camera, seed=seed))
         for seed in (3, 4)
     )
     first = one.sequence.load_cloud(1)
@@ -101,7 +101,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert np.median(away) < 0.006
     assert len(away) > 5000
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        vision.render_virtual_frames(vision.SceneModel(system), run.t, run.q, replace(camera, pose=None))
+        vision.render_virtual_frames(vision.SceneDescription(system), run.t, run.q, replace(camera, pose=None))
 
 
 @pytest.fixture(scope="module")

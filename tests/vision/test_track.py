@@ -8,7 +8,7 @@ from yid_ocp import vision
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import SceneModel, TrackOptions
+from yid_ocp.vision import SceneDescription, TrackOptions
 from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CalibrationState
 from yid_ocp.vision.track import FrameTracker, track_object
 
@@ -20,7 +20,7 @@ LATENCY, CALIBRATION_FRAMES = 0.06, 4
 def plain(system, small):
     """The small sequence tracked without the robot's meshes, all points."""
     options = TrackOptions(tracked_points=system.point_frames)
-    return track_object(SceneModel(system), small.recording, small.sequence, options)
+    return track_object(SceneDescription(system), small.recording, small.sequence, options)
 
 
 def some_of(sequence, indices):
@@ -59,7 +59,7 @@ def test_a_small_sequence_from_disk_whatever_the_seed(system, small, plain):
     """The same frame sequence, other random points in the walk: within the noise."""
     for seed, off in ((0, 0.0), (1, 2 * MILLIMETRE)):
         options = TrackOptions(tracked_points=system.point_frames, seed=seed)
-        found = track_object(SceneModel(system), small.recording, small.sequence, options)
+        found = track_object(SceneDescription(system), small.recording, small.sequence, options)
         assert np.abs(plain.position - found.position).max() <= off
     assert np.linalg.norm(plain.position - small.truth, axis=2).max() < 8 * MILLIMETRE
     assert [frame.n_raw_points for frame in plain.frame_reports] == [len(cloud) for cloud in small.clouds]
@@ -85,7 +85,7 @@ def test_a_displaced_camera_is_put_right(system, recording, clean):
     pose = sequence.camera_pose.copy()
     pose[:3, 3] += [0.03, -0.025, 0.02]
     pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
-    found = track_object(SceneModel(system, "package:baxter"), recording, replace(sequence, camera_pose=pose))
+    found = track_object(SceneDescription(system, "package:baxter"), recording, replace(sequence, camera_pose=pose))
     assert "sees the arm" in found.camera_calibration.message
     errors = found.position - np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])
     assert np.nanmean((errors / found.std) ** 2) < 1.5
@@ -121,10 +121,10 @@ def test_positions_of_a_straight_object_stay_with_their_points(clean, recording)
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
-    tracker = FrameTracker(SceneModel(system), small.recording, small.sequence, TrackOptions())
+    tracker = FrameTracker(SceneDescription(system), small.recording, small.sequence, TrackOptions())
     assert tracker.point_names == ("w_T1", "w_T3")
     with pytest.raises(ConfigError, match="no point 'w_T9'"):
-        track_object(SceneModel(system), small.recording, small.sequence, TrackOptions(tracked_points=("w_T9",)))
+        track_object(SceneDescription(system), small.recording, small.sequence, TrackOptions(tracked_points=("w_T9",)))
 
 
 def test_the_spline_passes_through_the_good_frames(clean, system):
@@ -165,7 +165,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
         return small.clouds[[2, 0, 1][index] if index < 3 else 0]
 
     sequence = replace(small.sequence, stamps=np.array(stamps), frame_names=tuple(map(str, stamps)), load_cloud=load)
-    found = track_object(SceneModel(system), small.recording, sequence)
+    found = track_object(SceneDescription(system), small.recording, sequence)
     assert np.array_equal(found.t, t)
     reports = {frame.index: frame.drop_reason for frame in found.frame_reports}
     assert list(reports)[:2] == [1, 3 + len(bad)]
@@ -189,7 +189,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
 def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, message):
     sequence = replace(small.sequence, load_cloud=lambda index: scale * small.clouds[index])
     with pytest.raises(DataError, match="no frame could be used") as caught:
-        track_object(SceneModel(system), small.recording, sequence, options)
+        track_object(SceneDescription(system), small.recording, sequence, options)
     assert message in caught.value.what
     assert caught.value.what.endswith(f"({len(small.clouds)} of {len(small.clouds)})")  # all for one reason
     assert "other than the model says" not in caught.value.what
@@ -199,21 +199,21 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, messa
 def test_the_time_of_another_clock(system, small):
     later = replace(small.sequence, stamps=small.sequence.stamps + 1.7e9)
     with pytest.raises(DataError, match="the clocks differ") as caught:
-        track_object(SceneModel(system), small.recording, later)
+        track_object(SceneDescription(system), small.recording, later)
     assert "set track.options.clock.initial_stamp_minus_joint_time" in caught.value.hint
     options = TrackOptions(clock=vision.CameraClockOptions(initial_stamp_minus_joint_time=1.7e9))
-    assert len(track_object(SceneModel(system), small.recording, later, options).t) == 3
+    assert len(track_object(SceneDescription(system), small.recording, later, options).t) == 3
 
 
 def test_a_recording_that_does_not_fit(system, small, urdf_folder):
     joints = small.recording.joints
     points = PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3)))
     with pytest.raises(DataError, match="no joint angles"):
-        track_object(SceneModel(system), Recording(points=(points,)), small.sequence)
+        track_object(SceneDescription(system), Recording(points=(points,)), small.sequence)
     names = ("left_s9", *joints.names[1:])
     with pytest.raises(DataError, match="joint 'left_s0' of the model is not recorded"):
-        track_object(SceneModel(system), Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
+        track_object(SceneDescription(system), Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
     with pytest.raises(ModelError, match="no visual meshes"):
-        track_object(SceneModel(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
+        track_object(SceneDescription(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
     with pytest.raises(DataError, match="pose of the camera is missing"):
         vision.FrameSequence.from_clouds([0.0], [small.clouds[0]], None)

@@ -28,7 +28,7 @@ from yid_ocp.data import (
     write_recording,
 )
 from yid_ocp.model.servos_and_springs import MotorOptions
-from yid_ocp.model.urdf import resolve_urdf_path
+from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.workflow.build import build_system, free_parameter_names
 
 RATE = 125.0
@@ -310,7 +310,7 @@ def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, r
 def pushed_pendulum(folder: Path, phases: Sequence[float], name: str) -> None:
     """A double pendulum in free air, its efforts by Pinocchio with friction, rotors, zeros of sensors and a payload."""
     pin = pytest.importorskip("pinocchio")
-    urdf = resolve_urdf_path("default:double_pendulum.urdf")
+    urdf = urdf_path_from_robot_name("default:double_pendulum.urdf")
     model = pin.buildModelFromUrdf(str(urdf))
     rng, t = np.random.default_rng(len(name)), np.arange(0, 6, 0.005)
     model.appendBodyToJoint(2, pin.Inertia(0.3, np.array([0.0, 0.05, -0.4]), np.zeros((3, 3))), pin.SE3.Identity())

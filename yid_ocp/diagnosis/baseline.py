@@ -95,7 +95,7 @@ def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> Es
 
 
 @dataclass(frozen=True)
-class EarlierRunsBaseline:
+class DiagnosisBaseline:
     """Combined estimates of earlier runs, and reference recordings made without the sought effect."""
 
     combined_estimates: RunEstimates | None  # all earlier runs together
@@ -103,12 +103,12 @@ class EarlierRunsBaseline:
     reference_recordings: tuple[Recording, ...]
 
     @staticmethod
-    def from_runs(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> EarlierRunsBaseline:
+    def from_run_estimates(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> DiagnosisBaseline:
         """Make a baseline from the estimates of several runs and from reference recordings `without` the effect."""
         if not runs:
-            return EarlierRunsBaseline(None, 1.0, without)
+            return DiagnosisBaseline(None, 1.0, without)
         known, chi2, degrees = pool_estimates_and_chi2(runs)
-        return EarlierRunsBaseline(known, chi2_p_value(chi2, degrees), without)
+        return DiagnosisBaseline(known, chi2_p_value(chi2, degrees), without)
 
     def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> EarlierRunsComparison | None:
         """Compute the shifts of a fit's parameters from its baseline prior. None if there are no runs."""

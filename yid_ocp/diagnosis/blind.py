@@ -184,7 +184,7 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
 
 
 @dataclass(frozen=True)
-class SyntheticMeasurementConditions:
+class SyntheticRecordingConditions:
     """Settings of an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
 
     estimation_count: int = 1  # number of estimation recordings; one more is held out
@@ -223,7 +223,7 @@ class BlindCaseGenerator:
         limits: Thresholds = DEFAULT_THRESHOLDS,
         *,
         simulated_system: System | None = None,
-        conditions: SyntheticMeasurementConditions | None = None,
+        conditions: SyntheticRecordingConditions | None = None,
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
@@ -236,7 +236,7 @@ class BlindCaseGenerator:
         recording = problem.episodes[0].recording
         self.initial_configuration = first_recorded_driven_joint_positions(self.simulated_system, recording)
         seen = any(group.camera_pose is not None for group in recording.points)
-        self.conditions = replace(conditions or SyntheticMeasurementConditions(), has_camera=seen)
+        self.conditions = replace(conditions or SyntheticRecordingConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
             what, hint = "MuJoCo can represent none of the candidates", "add one of the allowed kinds"
@@ -440,7 +440,7 @@ def record_random_motion(
     values: Mapping[str, float],
     injected: Sequence[InjectedEffect],
     rng: np.random.Generator,
-    conditions: SyntheticMeasurementConditions,
+    conditions: SyntheticRecordingConditions,
 ) -> Recording:
     """Record a simulation of `simulated` along a random multisine motion planned with the nominal system."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL

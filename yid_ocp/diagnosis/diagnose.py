@@ -18,7 +18,7 @@ from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_st
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
+from yid_ocp.diagnosis.baseline import DiagnosisBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import (
     DiagnosisResult,
     diagnosis_summary_text,
@@ -51,7 +51,7 @@ from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.null_test import NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
-from yid_ocp.inference.uncertainty import unknowns_covariance_factor
+from yid_ocp.inference.uncertainty import noise_only_covariance_factor
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -70,7 +70,7 @@ def diagnose(
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
     progress: Progress = _LOG_PROGRESS,
     known_fits: NominalSolutionAndRefitStore = _NOTHING_KNOWN,
-    baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
+    baseline: RunEstimates | Sequence[RunEstimates] | DiagnosisBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: whether it exists, where, its causes, and what closes it.
@@ -89,10 +89,10 @@ def diagnose(
         Recordings that no fit uses. Default: those of the problem. Without any, alternate blocks are held out.
     progress : Progress
         Default: the package's log.
-    baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
+    baseline : RunEstimates or sequence of RunEstimates, or DiagnosisBaseline
         Estimates of earlier runs of the same model (`read_estimates`), used as priors, so that changes since then are
         diagnosed. A problem that already has these priors (`add_baseline_prior`) is used as it is. An
-        `EarlierRunsBaseline` can also hold reference recordings made without the sought effects; these are predicted
+        `DiagnosisBaseline` can also hold reference recordings made without the sought effects; these are predicted
         with the found effects removed.
 
     Returns
@@ -103,7 +103,7 @@ def diagnose(
     with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         begun = time.perf_counter()
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
-        earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_runs(runs, ())
+        earlier = runs if isinstance(runs, DiagnosisBaseline) else DiagnosisBaseline.from_run_estimates(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = add_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, progress)
@@ -273,7 +273,7 @@ def _excess_of(residual: Array) -> float:
     return float(residual @ residual) - np.count_nonzero(residual)
 
 
-def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
+def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBaseline) -> DiagnosisResult:
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
     steps, end_stage = (problem.step.time_step, nominal.problem.step.time_step), functools.partial(_end_stage, search)
     moved = earlier.fit_parameters_differ_significantly(nominal, limits)
@@ -339,7 +339,7 @@ def _offsets_stated(problem: EstimationProblem) -> bool:
     """Whether the size of torque offsets or of constant sensor errors is stated."""
     errors = (episode.input_errors for episode in problem.episodes)
     torques = any(entry is not None and np.any(entry.torque_bias_std > 0) for entry in errors)
-    return torques or any(episode.has_uncertain_sensor_biases for episode in problem.episodes)
+    return torques or any(episode.has_biases_treated_as_noise for episode in problem.episodes)
 
 
 def _fitted_nominal_model(search: RefitContext, start: Mapping[str, float], name: str = "") -> RefittedModel:
@@ -451,7 +451,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
     found = _held_out_residuals(problem, x, True)
     residual = np.concatenate([part.residual for part in found])
     slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
-    by_parameters = slopes @ unknowns_covariance_factor(problem, fit.evaluation)[:shared]
+    by_parameters = slopes @ noise_only_covariance_factor(problem, fit.evaluation)[:shared]
     by_path = null_test.encoder_noise_residual_factor(own, x, residual_of)[: len(residual)]
     residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
     return _null_test(own, residual, 0, limits)
@@ -463,7 +463,7 @@ def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnkno
     if problem.has_process_noise:
         problem = problem_with_sensor_noise_only(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
-    if any(episode.has_uncertain_sensor_biases for episode in problem.episodes):
+    if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
         less = [
             replace(e, measurements=subtract_estimated_biases(e.measurements, result.predicted_outputs))
             for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)

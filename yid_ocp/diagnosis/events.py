@@ -24,7 +24,7 @@ from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
     DetectedForcePulse,
     ForceEstimate,
-    InverseDynamicsModel,
+    InverseDynamicsTerms,
     detect_force_pulses,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -151,7 +151,7 @@ def find_force_and_fault_events(
     runs = [(e, result, problem.predictor.theta_with_episode_values(e, theta)) for e, result, theta in told]
     ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
     wrong = [e for run in runs for e in _wrong_samples(problem, run) if e.end_time < ends._end_of(e.recording)]
-    torques = InverseDynamicsModel(problem.step)
+    torques = InverseDynamicsTerms(problem.step)
     histories = [history for run in runs for history in _read_forces(problem, run, torques, limits)]
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques, limits)
@@ -192,7 +192,7 @@ def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate |
 
 
 def _allowed(
-    torques: InverseDynamicsModel, run: _RecordingRollout, nodes: IntArray, limits: Thresholds
+    torques: InverseDynamicsTerms, run: _RecordingRollout, nodes: IntArray, limits: Thresholds
 ) -> tuple[Array, Array]:
     """Assumed model error of every coordinate's torque, and the torque that friction can hold, (M, n)."""
     episode, result, theta = run
@@ -205,7 +205,7 @@ def _allowed(
 
 
 def _read_forces(
-    problem: EstimationProblem, run: _RecordingRollout, torques: InverseDynamicsModel, limits: Thresholds
+    problem: EstimationProblem, run: _RecordingRollout, torques: InverseDynamicsTerms, limits: Thresholds
 ) -> Iterator[ForceEstimate]:
     """Force estimates of prescribed joints with compared efforts, from required and measured torque."""
     episode, result, _ = run
@@ -245,7 +245,7 @@ def _driving_forces(
     evaluation: Evaluation,
     runs: Sequence[_RecordingRollout],
     smoothed: SmoothedUnknownsResult,
-    torques: InverseDynamicsModel,
+    torques: InverseDynamicsTerms,
     limits: Thresholds,
 ) -> list[ForceEstimate]:
     """Force estimates of coordinates moved by unknown forces, if the smoother found some for a part of the time."""

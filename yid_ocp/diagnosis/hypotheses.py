@@ -158,7 +158,7 @@ class AllCandidatesProblem:
         return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held, alone)
 
     @property
-    def nominal_free_parameters(self) -> tuple[str, ...]:
+    def nominal_free_parameter_names(self) -> tuple[str, ...]:
         """Names of the free parameters of the nominal problem."""
         return self.problem.free
 
@@ -221,7 +221,7 @@ class AllCandidatesProblem:
     def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Estimation problem with the nominal parameters and those of `effects` free."""
         own = (name for effect in effects for name in effect.parameters.names)
-        return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameters, *own))
+        return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameter_names, *own))
 
     def with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]

@@ -25,7 +25,7 @@ from yid_ocp.effects.law import (
     TorqueLaw,
     TorqueLawTable,
     allowed_torque_law_quantity_names,
-    make_torque_law,
+    torque_law_from_tables,
     torque_law_quantity_values_along_rollout,
 )
 from yid_ocp.files import to_json_types
@@ -220,7 +220,7 @@ def _neutral_law(model: RefittedModel, place: str, names: Sequence[str], system:
         tables.append(TorqueLawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
     # of the torque of springs or through a joint [N m]
     size = float(np.std(_visited(model, place, "load"))) or 1.0
-    return make_torque_law(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * size)
+    return torque_law_from_tables(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * size)
 
 
 def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:

@@ -30,7 +30,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.integrator.step import Step, input_or_servo_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
-from yid_ocp.model.system import MidpointState, System
+from yid_ocp.model.system import MidpointStateSymbols, System
 from yid_ocp.problem.signal_filters import effort_low_pass_filter
 
 _STANDSTILL_SPEED = 0.1  # speed below which friction can stick [rad/s or m/s]
@@ -47,7 +47,7 @@ class _TorqueTermSizes:
     static_friction_limit: Array  # limit of static friction, zero above `_STANDSTILL_SPEED` [N m or N]
 
 
-class InverseDynamicsModel:
+class InverseDynamicsTerms:
     """Inverse dynamics of a step's system, M(q) a + c(q, v) + g(q) = tau, compiled once for all recordings."""
 
     def __init__(self, step: Step) -> None:
@@ -86,7 +86,7 @@ def _function(system: System, time_step: float) -> ca.Function:
     rest, u = ca.SX.zeros(len(names)), ca.SX.zeros(len(system.driven))
     pulls = ca.SX.zeros(system.n_constraints)
     rows = {name: i for i, name in enumerate(names)}
-    state = MidpointState(system, kinematics, q, v, z, rest, u, pulls, rows, ca.SX(time_step))
+    state = MidpointStateSymbols(system, kinematics, q, v, z, rest, u, pulls, rows, ca.SX(time_step))
     energy, viscous, others = -system.elastic_energy(q), system.viscous_force(v), ca.SX.zeros(n)
     for effect in system.effects:
         terms = effect.step_terms(state)

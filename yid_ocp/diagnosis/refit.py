@@ -22,7 +22,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
-from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, unknowns_covariance_factor
+from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_factor
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_with_sensor_noise_only,
@@ -343,7 +343,7 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
 
 def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
     """Factor F (nx, nx) of the covariance F F' of the unknowns, inflated by the misfit as in `solve`."""
-    factor = unknowns_covariance_factor(problem, finish)
+    factor = noise_only_covariance_factor(problem, finish)
     fit = assess_goodness_of_fit(problem, finish, limits.null_test_limits)
     std = np.sqrt(np.diag(misfit_robust_covariance(problem, finish, fit)))
     return factor * (std / np.linalg.norm(factor, axis=1))[:, None]

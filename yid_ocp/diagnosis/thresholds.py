@@ -8,13 +8,13 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le, Lt
 
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, RESIDUAL_WINDOW_SECONDS
-from yid_ocp.inference.smoother_model import SmootherThresholds
+from yid_ocp.inference.smoother_model import SmootherOptions
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.options import ExcessResidualCriteria
 
 
 @dataclass(frozen=True)
-class Thresholds(SmootherThresholds):
+class Thresholds(SmootherOptions):
     """Thresholds of every step of a diagnosis, from the null test to the events.
 
     Each field has a description, repeated in the section `diagnosis` of the settings reference.

@@ -16,7 +16,7 @@ import casadi as ca
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD, PositionServo
-from yid_ocp.model.system import EffectStepTerms, MidpointState, NodeState, System
+from yid_ocp.model.system import EffectStepTerms, MidpointStateSymbols, NodeStateSymbols, System
 
 _PLAY_TORQUE = 0.2  # torque at which tanh reaches three quarters [N m]
 _DEFAULT_EFFORT_LIMIT = 10.0  # for a joint without an effort limit [N m or N]
@@ -73,7 +73,7 @@ class _DistortedReading(EffectBase):
     def _is_own(self, channel: str) -> bool:
         return channel == f"{self.quantity}.{self.location}"
 
-    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         if not self._is_own(channel):
             return output
         return output + self._error(state.load[state.system.mechanism.joint_index(self.location)])
@@ -127,7 +127,7 @@ class Backlash(_DistortedReading):
         """Name `play` (present backlash) for a joint with a servo. Other joints have no internal coordinate."""
         return ("play",) if location in system.servos else ()
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         if not self.internal_coordinate_symbols:
             return EffectStepTerms()
         [name] = self.internal_coordinate_symbols
@@ -147,7 +147,7 @@ class Backlash(_DistortedReading):
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["width"] / 2 * ca.tanh(effort / _PLAY_TORQUE)
 
-    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         for name in self.internal_coordinate_symbols if self._is_own(channel) else ():
             return output + state.z[state.internal_rows[name]]
         return super().reading_from_true_value(channel, output, state)
@@ -191,7 +191,7 @@ class _EffortGain(_DistortedEffort):
             return None
         return {name: 1.0 if value < 0 else -1.0}
 
-    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         return output / self["inverse"] if self._is_own(channel) else output
 
     def true_value_from_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:

@@ -15,7 +15,7 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, Repor
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Inertia, merge_bodies, symbolic_rotation_from_rpy
 from yid_ocp.model.parameters import Parameter
-from yid_ocp.model.system import EffectStepTerms, ForceWithDerivativeFactors, MidpointState, System
+from yid_ocp.model.system import EffectStepTerms, ForceWithDerivativeFactors, MidpointStateSymbols, System
 
 _MAX_PAYLOAD_DISTANCE = 0.5  # distance of a payload's centre from its frame [m]
 _MAX_COM_SHIFT = 0.05  # shift of a link's centre of mass without added mass [m]
@@ -275,7 +275,7 @@ class _RotorInertia(EffectBase):
         base.effort_limit_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "rotor inertia at the joint"),
     )
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         v = state.v[state.system.mechanism.joint_index(self.location)]
         return EffectStepTerms(lagrangian=self["armature"] / 2 * v**2)
 
@@ -293,7 +293,7 @@ class _AerodynamicDrag(EffectBase):
     possible_locations = base.segment_names
     declared_parameters = (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         system, kinematics = state.system, state.kinematics
         tree, segment = system.mechanism, system.segment_layout(self.location)
         velocity = _velocities(kinematics, state.v)

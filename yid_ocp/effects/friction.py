@@ -11,7 +11,7 @@ import casadi as ca
 
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, effort_limit_scaled_parameter_definition
-from yid_ocp.model.system import Effect, EffectStepTerms, MidpointState, System
+from yid_ocp.model.system import Effect, EffectStepTerms, MidpointStateSymbols, System
 
 SIGN_SMOOTHING_SPEED = 0.02
 """v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
@@ -48,7 +48,7 @@ class _JointFriction(EffectBase):
         """Torque opposite to the speed v."""
         raise NotImplementedError
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         v = state.v[state.system.mechanism.joint_index(self.location)]
         return EffectStepTerms(
             dissipative_force=base.generalized_force_at_joint(state.system, self.location, -self._friction(v))
@@ -115,14 +115,14 @@ class _JointLoadFriction(_JointFriction):
         ParameterDefinition("share", "1", 0.0, 0.0, 2.0, (0.0, 0.5), "friction per torque through the gear"),
     )
 
-    def _load(self, state: MidpointState) -> ca.SX:
+    def _load(self, state: MidpointStateSymbols) -> ca.SX:
         """Torque through the gear [N m]."""
         system, index = state.system, state.system.mechanism.joint_index(self.location)
         if self.location not in system.driven:  # its motor is assumed to balance the external torque
             return -2 * system.weight_and_grasp_force_on_coordinate(state, index)
         return system.gear_torque_on_coordinate(state, index)
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         load = self._load(state)
         size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
         v = state.v[state.system.mechanism.joint_index(self.location)]
@@ -166,7 +166,7 @@ class _JointPresliding(EffectBase):
         """Bound 1 on the initial |s|. The initial `s` of every recording is estimated."""
         return dict.fromkeys(self.internal_coordinate_symbols, 1.0)
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         [name] = self.internal_coordinate_symbols
         row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
         s, rate, width = state.z[row], state.z_rate[row], self["yield_angle"]
@@ -202,6 +202,6 @@ class _JointSpring(EffectBase):
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         stretch = state.q[state.system.mechanism.joint_index(self.location)] - self["rest_angle"]
         return EffectStepTerms(lagrangian=-self["stiffness"] / 2 * stretch**2)

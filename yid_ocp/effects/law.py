@@ -25,7 +25,7 @@ from yid_ocp.files import read_input_text
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
-from yid_ocp.model.system import EffectStepTerms, MidpointState, System
+from yid_ocp.model.system import EffectStepTerms, MidpointStateSymbols, System
 
 TorqueLawQuantitiesName = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
 """Quantities on which a law's torque depends: one, or two with a sum of functions."""
@@ -91,7 +91,7 @@ class TorqueLaw(EffectBase):
         """Names of the parameters at the knots of one quantity."""
         return tuple(f"{self.label}.{quantity}{k}" for k in range(len((self.knots or {})[quantity])))
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         force = ca.SX(state.system.n_coordinates, 1)
         for index in _coordinate_indices(state.system, self.location):
             for quantity in self.quantities:
@@ -139,11 +139,11 @@ def _coordinate_indices(system: System, location: str) -> list[int]:
     return [index(location)]
 
 
-def _servo_input(state: MidpointState, index: int) -> ca.SX:
+def _servo_input(state: MidpointStateSymbols, index: int) -> ca.SX:
     return state.u[state.system.actuated_coordinate_indices.index(index)]
 
 
-def _quantity(quantity: str, state: MidpointState, label: str, index: int) -> ca.SX:
+def _quantity(quantity: str, state: MidpointStateSymbols, label: str, index: int) -> ca.SX:
     system = state.system
     if quantity == "time":
         return state.z[state.internal_rows[f"{label}.time"]]
@@ -192,7 +192,7 @@ def torque_law_quantity_values_along_rollout(
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     kinematics = forward_kinematics(system.mechanism, symbols["q"])
     rows = {name: i for i, name in enumerate(internal)}
-    state = MidpointState(
+    state = MidpointStateSymbols(
         system,
         kinematics,
         symbols["q"],
@@ -217,7 +217,7 @@ def torque_law_quantity_values_along_rollout(
     return values
 
 
-def make_torque_law(
+def torque_law_from_tables(
     location: str, system: System, tables: Sequence[TorqueLawTable], torque_scale: float = math.inf
 ) -> TorqueLaw:
     """Make a law at a joint or segment from its tables. `torque_scale` is the expected size of its torque [N m].

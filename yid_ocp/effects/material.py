@@ -10,7 +10,7 @@ import numpy as np
 
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elastic_joints_within_segment, segment_names
 from yid_ocp.model.flexible import ElasticJoint
-from yid_ocp.model.system import EffectStepTerms, MidpointState, System
+from yid_ocp.model.system import EffectStepTerms, MidpointStateSymbols, System
 
 _ABS_SMOOTHING_SPEED = 1e-3  # smoothing range of |v| in Dahl's law [rad/s]
 _REFERENCE_ANGLE = 0.5  # largest angle assumed for the range of k3 without data [rad]
@@ -32,7 +32,7 @@ class _SegmentEffect(EffectBase):
 
     possible_locations = segment_names
 
-    def _springs(self, state: MidpointState) -> list[tuple[ElasticJoint, int]]:
+    def _springs(self, state: MidpointStateSymbols) -> list[tuple[ElasticJoint, int]]:
         index = state.system.mechanism.joint_index
         return [
             (spring, index(spring.joint_name)) for spring in elastic_joints_within_segment(state.system, self.location)
@@ -70,7 +70,7 @@ class _KelvinVoigt(_SegmentEffect):
     required_excitation = "how fast it moves"
     declared_parameters = (ParameterDefinition("tau", "s", 0.0, 0.0, 1.0, (0.005, 0.2), "damping over stiffness"),)
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         force = ca.SX(state.system.n_coordinates, 1)
         for spring, index in self._springs(state):
             force[index] = -self["tau"] * spring.stiffness * state.v[index]
@@ -90,7 +90,7 @@ class _StandardLinearSolid(_SegmentMemory):
         ParameterDefinition("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "of the branch", True),
     )
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         energy, equations = ca.SX(0), {}
         for spring, index in self._springs(state):
             name = f"{self.label}.{spring.joint_name}"
@@ -124,7 +124,7 @@ class _Hysteresis(_SegmentMemory):
         ParameterDefinition("yield_angle", "rad", 0.15, 5e-3, 5.0, (0.05, 0.5), "angle over which it yields", True),
     )
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         force, equations, start = ca.SX(state.system.n_coordinates, 1), {}, {}
         for spring, index in self._springs(state):
             name = f"{self.label}.{spring.joint_name}"
@@ -163,7 +163,7 @@ class _CubicStiffness(_SegmentEffect):
         low, high = k3.prior_range
         return replace(self, definitions=(replace(k3, prior_range=(factor * low, factor * high)),))
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         quartic = sum((state.q[i] ** 4 for _, i in self._springs(state)), ca.SX(0))
         return EffectStepTerms(lagrangian=-self["k3"] / 4 * quartic)
 

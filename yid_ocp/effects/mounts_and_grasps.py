@@ -11,7 +11,7 @@ from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS
 from yid_ocp.model.mechanism import Joint, Placement
-from yid_ocp.model.system import EffectStepTerms, Grasp, MidpointState, System
+from yid_ocp.model.system import EffectStepTerms, Grasp, MidpointStateSymbols, System
 
 _SPRING_RELAXATION_TIME = 5e-3  # for mount and junction springs: too short to damp visible motion [s]
 
@@ -173,7 +173,7 @@ class _GraspSlip(_GraspChange):
     def _changes(self, grasp: Grasp) -> dict[str, Any]:
         return {"axial_slip": grasp.axial_slip - self.internal_coordinate_symbols[f"{self.label}.offset"]}
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         [name] = self.internal_coordinate_symbols
         row, grasps = state.internal_rows[name], state.system.grasps
         at = base.grasp_names(state.system).index(self.location)

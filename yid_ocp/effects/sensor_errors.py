@@ -12,7 +12,7 @@ import casadi as ca
 
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_name_of_frame
 from yid_ocp.model.mechanism import Placement, symbolic_rotation_from_rpy
-from yid_ocp.model.system import NodeState, System
+from yid_ocp.model.system import NodeStateSymbols, System
 
 
 def _camera(system: System) -> tuple[str, ...]:
@@ -34,10 +34,10 @@ class _CameraEffect(EffectBase):
     required_sensors = frozenset({"camera"})
     possible_locations = _camera
 
-    def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
+    def _seen(self, point: ca.SX, camera: Placement, state: NodeStateSymbols) -> ca.SX:
         return point
 
-    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         return output if state.camera_pose is None else self._seen(output, state.camera_pose, state)
 
 
@@ -50,7 +50,7 @@ class _CameraTranslation(_CameraEffect):
         ParameterDefinition(axis, "m", 0.0, -0.3, 0.3, (-0.03, 0.03), f"seen less true {axis}") for axis in "xyz"
     )
 
-    def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
+    def _seen(self, point: ca.SX, camera: Placement, state: NodeStateSymbols) -> ca.SX:
         return point + ca.vertcat(self["x"], self["y"], self["z"])
 
 
@@ -63,7 +63,7 @@ class _CameraRotation(_CameraEffect):
         ParameterDefinition(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.06, 0.06), f"turn about {axis}") for axis in "xyz"
     )
 
-    def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
+    def _seen(self, point: ca.SX, camera: Placement, state: NodeStateSymbols) -> ca.SX:
         turn = symbolic_rotation_from_rpy(self["rx"], self["ry"], self["rz"])
         return camera.translation + turn @ (point - camera.translation)
 
@@ -75,7 +75,7 @@ class _CameraScale(_CameraEffect):
     equation = "seen point = c + scale (true - c)"
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "seen over true depth"),)
 
-    def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
+    def _seen(self, point: ca.SX, camera: Placement, state: NodeStateSymbols) -> ca.SX:
         return camera.translation + self["scale"] * (point - camera.translation)
 
 
@@ -89,7 +89,7 @@ class _SurfaceOffset(_CameraEffect):
         ParameterDefinition("fraction", "1", 0.0, 0.0, 1.5, (0.0, 1.0), "distance from the axis over the radius"),
     )
 
-    def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
+    def _seen(self, point: ca.SX, camera: Placement, state: NodeStateSymbols) -> ca.SX:
         segment = None if state.marked_frame is None else segment_name_of_frame(state.system, state.marked_frame)
         if segment is None:
             return point
@@ -157,7 +157,7 @@ class _MountedSensorEffect(EffectBase):
     def _read(self, quantity: str, output: ca.SX) -> ca.SX:
         return output
 
-    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         group, _, frame = self.location.partition(":")
         if state.marked_frame != frame or not channel.startswith((f"{group}.", f"{group}_")):
             return output

@@ -28,10 +28,10 @@ import threadpoolctl
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.kalman import FilterStateTransition, KalmanStepMatrices, kalman_matrices_and_next_covariance
 from yid_ocp.inference.smoother_model import (
-    DEFAULT_SMOOTHER_THRESHOLDS,
+    DEFAULT_SMOOTHER_OPTIONS,
     LinearResidualModel,
     SmoothedUnknownGroup,
-    SmootherThresholds,
+    SmootherOptions,
     residual_models_with_unknown_forces,
 )
 from yid_ocp.model.system import System
@@ -75,7 +75,7 @@ class SmoothedUnknownsResult:
     dof_after: float
     # log evidence of forces and offsets ("plant"), biases ("sensor") and "both", relative to neither ("none", 0)
     log_evidence: dict[str, float]
-    min_log_bayes_factor: float = DEFAULT_SMOOTHER_THRESHOLDS.min_log_bayes_factor  # smallest significant rise
+    min_log_bayes_factor: float = DEFAULT_SMOOTHER_OPTIONS.min_log_bayes_factor  # smallest significant rise
     # groups that could replace each selected group almost as well
     alternative_groups: Mapping[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]] = field(default_factory=dict)
 
@@ -245,7 +245,7 @@ def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]
 
 
 def _selected(
-    models: _Models, sources: _Groups, variance: _Variances, state: _State, limits: SmootherThresholds
+    models: _Models, sources: _Groups, variance: _Variances, state: _State, limits: SmootherOptions
 ) -> tuple[_Variances, _State]:
     """Add the group that raises the evidence most, repeatedly, while the rise exceeds chance."""
     while sum(v > 0 for v in variance.values()) < limits.max_smoother_unknown_groups:
@@ -327,7 +327,7 @@ def select_and_smooth_unknowns(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
+    limits: SmootherOptions = DEFAULT_SMOOTHER_OPTIONS,
 ) -> SmoothedUnknownsResult:
     """Select groups of unknown forces, offsets and biases by log evidence at a fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread
@@ -411,7 +411,7 @@ def _explained(models: _Models, variance: _Variances, plain: _State, state: _Sta
 
 
 def _alternatives(
-    models: _Models, variance: _Variances, state: _State, limits: SmootherThresholds
+    models: _Models, variance: _Variances, state: _State, limits: SmootherOptions
 ) -> tuple[_Variances, dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
     """Fall of the log evidence without each group, and the groups that could replace it."""
     drop, found = dict.fromkeys(variance, 0.0), {}

@@ -53,7 +53,7 @@ _FORCE_POINT = "75%"  # point of the push by arc length: a compromise of tip and
 
 
 @dataclass(frozen=True)
-class SmootherThresholds:
+class SmootherOptions:
     """Prior sizes of unknowns, and the log evidence that a group requires (5 means odds of 150 to 1)."""
 
     min_log_bayes_factor: Annotated[
@@ -69,7 +69,7 @@ class SmootherThresholds:
     ] = 0.9
 
 
-DEFAULT_SMOOTHER_THRESHOLDS = SmootherThresholds()
+DEFAULT_SMOOTHER_OPTIONS = SmootherOptions()
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class _SmootherUnknowns(NamedTuple):
         return self.loading + 3 * len(self.pushed)
 
 
-def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -> _SmootherUnknowns:
+def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherOptions) -> _SmootherUnknowns:
     """Unknowns of one recording, with their groups and reference sizes."""
     names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std_over_load)
     grasped, row = [], 0
@@ -264,7 +264,7 @@ def residual_models_with_unknown_forces(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
+    limits: SmootherOptions = DEFAULT_SMOOTHER_OPTIONS,
     interval: float = _MIN_INTERVAL,
 ) -> tuple[LinearResidualModel, ...]:
     """Linearize every recording's residual with respect to unknown forces, offsets and biases.
@@ -338,7 +338,7 @@ def _steps(
 
 
 def _recording(
-    course: _LinearizedEpisode, factor: Array, observed: Array, limits: SmootherThresholds, shortest: float
+    course: _LinearizedEpisode, factor: Array, observed: Array, limits: SmootherOptions, shortest: float
 ) -> LinearResidualModel:
     """Linear model of one recording from its whitened residuals and their derivatives."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps

@@ -121,14 +121,14 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
     """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
-    spread, chi2 = unknowns_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
+    spread, chi2 = noise_only_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
     scale = max(1.0, chi2)
     priors = residual_and_jacobian_without_weak_priors(problem, evaluation)[1][problem.residual_rows.stated_priors]
     pull = spread @ (priors @ spread).T * math.sqrt(max(0.0, problem.options.stated_std_factor**-2 - scale))
     return spread @ spread.T * scale + pull @ pull.T, chi2
 
 
-def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
+def noise_only_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
     """Factor F (nx, nx) of the covariance F F' from noise alone; F F' itself loses digits in uninformed directions."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
     _, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)

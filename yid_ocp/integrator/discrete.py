@@ -36,7 +36,7 @@ from yid_ocp.model.kinematics import (
     lagrangian_second_derivatives,
 )
 from yid_ocp.model.mechanism import Frame, Placement
-from yid_ocp.model.system import ForceWithDerivativeFactors, Grasp, MidpointState, System
+from yid_ocp.model.system import ForceWithDerivativeFactors, Grasp, MidpointStateSymbols, System
 
 ForceSplit = Literal["symmetric", "left"]
 ConstraintForcePlacement = Literal["node", "midpoint"]
@@ -248,7 +248,7 @@ def _summed_terms(
     """Lagrangian, force, internal equations (moving, at rest) and closed force of springs, inputs and effects."""
     names = tuple(system.effect_internal_coordinate_symbols)
     rows_of = {name: i for i, name in enumerate(names)}
-    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
+    state = MidpointStateSymbols(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
     energy = -system.elastic_energy(at.qm)
     force, viscous = system.input_force(at.u, at.qm, at.vm), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}

@@ -91,7 +91,7 @@ class Grasp:
 
 
 @dataclass(frozen=True)
-class MidpointState:
+class MidpointStateSymbols:
     """Symbols at the midpoint of one step, on which energies and forces may depend.
 
     The coordinates q and internal coordinates z are means of both nodes; v and z_rate are differences divided by h.
@@ -110,7 +110,7 @@ class MidpointState:
 
 
 @dataclass(frozen=True)
-class NodeState:
+class NodeStateSymbols:
     """Symbols at one node of a trajectory, on which measurements may depend.
 
     `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; the
@@ -181,11 +181,11 @@ class Effect:
         """Return the system with this effect, which may change masses, lengths, springs, grasps, gravity or joints."""
         return system
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         """Return the energy, forces and internal equations that this effect adds to a step at its midpoint."""
         return EffectStepTerms()
 
-    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+    def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         """Predict a reading from the error-free `output`. `channel` is `group.point` or `joints.quantity.JOINT`."""
         return output
 
@@ -221,7 +221,7 @@ class _ServoIntegral(Effect):
         servo, [z] = system.servos[self.location], self.internal_coordinate_symbols.values()
         return replace(system, servos={**system.servos, self.location: replace(servo, integral=servo.integral * z)})
 
-    def step_terms(self, state: MidpointState) -> EffectStepTerms:
+    def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         [name], system = self.internal_coordinate_symbols, state.system
         row, rate = state.internal_rows[name], state.z_rate[state.internal_rows[name]]
         if self.location in system.servos:  # not while the joint is held
@@ -432,7 +432,7 @@ class System(ReprMixin):
             force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
 
-    def weight_and_grasp_force_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
+    def weight_and_grasp_force_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
         """Generalized force [N m or N] at coordinate `index` from grasps and the weight of all bodies that it moves."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)
@@ -446,7 +446,7 @@ class System(ReprMixin):
             force -= ca.dot(slope, state.constraint_force)
         return force
 
-    def gear_torque_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
+    def gear_torque_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
         """Torque [N m or N] through the gear of a driven joint: input minus weight and grasps beyond."""
         outside = self.weight_and_grasp_force_on_coordinate(state, index)
         return self.input_force(state.u, state.q, state.v)[index] - outside

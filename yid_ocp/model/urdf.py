@@ -78,7 +78,7 @@ def _example_robot_urdf(robot: str) -> Path:
     raise ModelError(what, where=where, **said)
 
 
-def resolve_urdf_path(robot: str | Path) -> Path:
+def urdf_path_from_robot_name(robot: str | Path) -> Path:
     """Return the URDF path for a robot's name in the settings. The file need not exist.
 
     The name is a path, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
@@ -123,7 +123,7 @@ def read_urdf(
     Parameters
     ----------
     path : str or Path
-        Path or name, as for `resolve_urdf_path`.
+        Path or name, as for `urdf_path_from_robot_name`.
     joints : sequence of str, optional
         Movable joints, in this order except that parents come first; default: all movable joints of the file.
     locked : mapping of str to float, optional
@@ -131,7 +131,7 @@ def read_urdf(
     exclude_links : sequence of str
         Links to remove together with their subtrees, such as a tool that is not mounted.
     """
-    file, locked = resolve_urdf_path(path), dict(locked or {})
+    file, locked = urdf_path_from_robot_name(path), dict(locked or {})
     if not is_file(file):
         hint = "give a path, or package:NAME for example-robot-data"
         with contextlib.suppress(ModelError):

@@ -206,7 +206,7 @@ class Episode:
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
 
     @property
-    def has_uncertain_sensor_biases(self) -> bool:
+    def has_biases_treated_as_noise(self) -> bool:
         """Whether a sensor or its clock has a constant error of unknown size, which is treated as noise."""
         return any(samples.has_uncertain_biases_or_clock for samples in self.measurements)
 

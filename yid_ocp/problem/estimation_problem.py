@@ -286,7 +286,7 @@ class EstimationProblem(ReprMixin):
         """
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
-        weighted |= any(episode.has_uncertain_sensor_biases for episode in self.episodes)
+        weighted |= any(episode.has_biases_treated_as_noise for episode in self.episodes)
         if evaluation is None or (weighted and evaluation.jacobian is None):
             evaluation = self.evaluate(x, weighted, equilibrium_guesses)
         gradient = np.zeros(len(x))

@@ -230,7 +230,7 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 @dataclass(frozen=True)
 class TimeGridStateValues:
-    """Numerical values of `NodeState` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m)."""
+    """Numerical values of `NodeStateSymbols` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m)."""
 
     q: Array
     v: Array

@@ -20,7 +20,7 @@ from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, json_sha256, read_input_text, write_text
 from yid_ocp.integrator.compiler import private_cache_folder
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import resolve_urdf_path
+from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint, mesh_sources_sha256
 
 _MAX_FRAMES = 150  # largest number of frames on a page, interpolated linearly
@@ -106,7 +106,7 @@ def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[l
     Reading and thinning takes a second: the user's cache keeps them for the same files, mounted in the same way.
     """
     with contextlib.suppress(OSError, YidError, SyntaxError):  # the last of a damaged URDF
-        if robot is None or "<visual" not in read_input_text(resolve_urdf_path(robot)):
+        if robot is None or "<visual" not in read_input_text(urdf_path_from_robot_name(robot)):
             return {}
         mechanism = system.numeric_mechanism()
         told = (file_sha256(Path(__file__)), mesh_sources_sha256(robot, mechanism), system.mechanism.joint_names)

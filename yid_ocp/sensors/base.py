@@ -15,7 +15,7 @@ from annotated_types import Ge, Gt
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import NodeState, System
+from yid_ocp.model.system import NodeStateSymbols, System
 from yid_ocp.options import OptionInfo
 from yid_ocp.registry import Registry
 
@@ -265,7 +265,7 @@ class Sensor(ABC):
         return None
 
     @abstractmethod
-    def ideal_reading(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         """Symbolic error-free reading at a node, (outputs_per_channel * len(channel_names), 1)."""
 
 
@@ -273,8 +273,8 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     """Build a CasADi function of a sensor's readings y, including effects on the sensor, and of their derivatives.
 
     It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), with the
-    symbols of `NodeState`. dy/dtheta has one column per parameter in `names`. v, a and lam refer to the recorded clock;
-    their derivatives have no columns if the readings do not depend on them.
+    symbols of `NodeStateSymbols`. dy/dtheta has one column per parameter in `names`. v, a and lam refer to the recorded
+    clock; their derivatives have no columns if the readings do not depend on them.
     """
     rows = {name: i for i, name in enumerate(system.effect_internal_coordinate_symbols)}
     n = system.n_coordinates
@@ -282,7 +282,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     at = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     (at["q"], kinematics), scale = system.symbolic_kinematics, system.recorded_time_scale
     true = (at["q"], at["v"] / scale, at["a"] / scale**2, at["z"], at["load"], at["lam"] / scale)
-    state = NodeState(system, kinematics, *true, rows, sensor.camera_pose)
+    state = NodeStateSymbols(system, kinematics, *true, rows, sensor.camera_pose)
     parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
     read = []
     marked = sensor.frame_names or (None,) * len(sensor.channel_names)

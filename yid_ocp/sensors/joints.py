@@ -13,7 +13,7 @@ import scipy.special
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.model.system import NodeState
+from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
@@ -50,7 +50,7 @@ class JointSensor(Sensor):
     def channel_names(self) -> tuple[str, ...]:
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
-    def select_sensor_joint_rows(self, values: ca.SX, state: NodeState) -> ca.SX:
+    def select_sensor_joint_rows(self, values: ca.SX, state: NodeStateSymbols) -> ca.SX:
         """Select the rows of the sensor's joints from a column for all joints, (n, 1) to (nj, 1)."""
         return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
@@ -63,7 +63,7 @@ class PositionSensor(JointSensor):
     has_paper_weight = False
     group_name: str = JOINT_POSITION_GROUP_NAME
 
-    def ideal_reading(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         return self.select_sensor_joint_rows(state.q, state)
 
 
@@ -79,7 +79,7 @@ class EffortSensor(JointSensor):
     def effort_joints(self) -> tuple[str, ...]:
         return self.joint_names
 
-    def ideal_reading(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         return self.select_sensor_joint_rows(state.load, state)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.model.system import NodeState
+from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
@@ -45,7 +45,7 @@ class _MotorCurrentSensor(JointSensor):
     def effort_per_unit_reading(self) -> Array:
         return np.array(self.torque_constants)
 
-    def ideal_reading(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
 
 

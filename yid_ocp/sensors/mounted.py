@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.model.system import NodeState
+from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
@@ -45,11 +45,11 @@ class MountedSensor(Sensor):
     def channel_names(self) -> tuple[str, ...]:
         return tuple(f"{self.group_name}.{name}" for name in self.names)
 
-    def ideal_reading(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         frames = zip(self.signs, self.frame_names, strict=True)
         return ca.vertcat(*(sign * self._frame_reading(state, frame) for sign, frame in frames))
 
-    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         raise NotImplementedError
 
 
@@ -164,7 +164,7 @@ class _Gyroscope(MountedSensor):
 
     channel = _ANGULAR_VELOCITY
 
-    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         kinematics = state.kinematics
         return kinematics.frame_pose(frame).rotation.T @ (kinematics.angular_jacobian(frame) @ state.v)
 
@@ -175,7 +175,7 @@ class _Accelerometer(MountedSensor):
 
     channel = _SPECIFIC_FORCE
 
-    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         kinematics = state.kinematics
         jacobian = kinematics.position_jacobian(frame)
         acceleration = jacobian @ state.a + ca.jtimes(jacobian @ state.v, state.q, state.v)

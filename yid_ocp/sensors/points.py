@@ -11,7 +11,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import NodeState
+from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
@@ -46,7 +46,7 @@ class PointSensor(Sensor):
     def camera_pose(self) -> Placement | None:
         return None if self.camera_pose_matrix is None else Placement.from_matrix(self.camera_pose_matrix)
 
-    def ideal_reading(self, state: NodeState) -> ca.SX:
+    def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         return ca.vertcat(*(state.kinematics.frame_position(frame) for frame in self.frame_names))
 
 

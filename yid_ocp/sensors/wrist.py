@@ -16,7 +16,7 @@ import casadi as ca
 
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.mechanism import Inertia, Placement
-from yid_ocp.model.system import MidpointState, NodeState, System, six_joint_floating_mechanism
+from yid_ocp.model.system import MidpointStateSymbols, NodeStateSymbols, System, six_joint_floating_mechanism
 from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelKind
 from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
@@ -32,7 +32,7 @@ class _WristForceSensor(MountedSensor):
 
     channel = _FORCE
 
-    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[:3]
 
 
@@ -42,11 +42,11 @@ class _WristTorqueSensor(MountedSensor):
 
     channel = _TORQUE
 
-    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[3:]
 
 
-def _wrench_on_sensor(state: NodeState, frame: str) -> ca.SX:
+def _wrench_on_sensor(state: NodeStateSymbols, frame: str) -> ca.SX:
     """Force and torque (6, 1), along the frame's axes, that the part beyond a frame exerts on a sensor there."""
     system, first = _cut_at_frame(state.system, frame)
     locked, n = slice(first, first + _N_LOCKED_JOINTS), system.n_coordinates
@@ -59,7 +59,8 @@ def _wrench_on_sensor(state: NodeState, frame: str) -> ca.SX:
     rigid = lagrangian_first_derivatives(kinematics, v, system.gravity)
     momentum, push = rigid.lagrangian_by_v[locked], rigid.lagrangian_by_q[locked]
     u, z_rate = ca.SX(len(system.driven), 1), ca.SX(*state.z.shape)
-    middle = MidpointState(system, kinematics, q, v, state.z, z_rate, u, state.lam, state.internal_rows, ca.SX(1))
+    rows = state.internal_rows
+    middle = MidpointStateSymbols(system, kinematics, q, v, state.z, z_rate, u, state.lam, rows, ca.SX(1))
     for effect in system.effects:
         terms = effect.step_terms(middle)
         momentum += ca.gradient(terms.lagrangian, v)[locked]

@@ -443,7 +443,7 @@ class _MultiStartSearch:
         status, message = result.status, result.message
         if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
             message += "; weighted by the sensors' noise alone, without the noise that drives the motion"
-        constant = any(episode.has_uncertain_sensor_biases for episode in self._problem.episodes)
+        constant = any(episode.has_biases_treated_as_noise for episode in self._problem.episodes)
         if constant and not getattr(solver, "needs_rollout", True):
             message += "; weighted without the constant errors that sensors and clocks may have"
         if not finish.ok:

@@ -25,7 +25,7 @@ from yid_ocp.errors import ConfigError, DataError, ModelError, missing_package_e
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
-from yid_ocp.model.system import Effect, MidpointState, System
+from yid_ocp.model.system import Effect, MidpointStateSymbols, System
 
 FORMAT_ELEMENTS: Mapping[str, Mapping[str, str]] = YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml"))
 """Aspects of a model that an engine may or may not represent: a description (`is`) and the elements of each format."""
@@ -192,7 +192,7 @@ def _joint_terms(system: System, effect: Effect, value: ExpressionEvaluator) -> 
     u, reaction = ca.SX.sym("u", len(system.driven)), ca.SX.sym("reaction", system.n_constraints)
     none, h = ca.SX(0, 1), ca.SX.sym("h")
     kinematics = forward_kinematics(system.mechanism, q)
-    terms = effect.step_terms(MidpointState(system, kinematics, q, v, none, none, u, reaction, {}, h))
+    terms = effect.step_terms(MidpointStateSymbols(system, kinematics, q, v, none, none, u, reaction, {}, h))
     energy, closed = value._substitute_parameter_values(terms.lagrangian), terms.force_with_derivatives
     force = ca.gradient(energy, q)
     for part in (terms.generalized_force, terms.dissipative_force, None if closed is None else closed.force):

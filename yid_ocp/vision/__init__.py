@@ -16,9 +16,9 @@ from yid_ocp.vision.frames import FrameSequence as FrameSequence
 from yid_ocp.vision.frames import look_at_pose as look_at_pose
 from yid_ocp.vision.point_cloud import CloudFilterOptions as CloudFilterOptions
 from yid_ocp.vision.point_cloud import SkeletonOptions as SkeletonOptions
-from yid_ocp.vision.surface_meshes import DepthSensorModel as DepthSensorModel
+from yid_ocp.vision.surface_meshes import DepthCameraModel as DepthCameraModel
 from yid_ocp.vision.surface_meshes import ExtraMesh as ExtraMesh
-from yid_ocp.vision.surface_meshes import SceneModel as SceneModel
+from yid_ocp.vision.surface_meshes import SceneDescription as SceneDescription
 from yid_ocp.vision.surface_meshes import VirtualCameraSetup as VirtualCameraSetup
 from yid_ocp.vision.surface_meshes import VirtualCameraTiming as VirtualCameraTiming
 from yid_ocp.vision.surface_meshes import VirtualFramesWithTruth as VirtualFramesWithTruth

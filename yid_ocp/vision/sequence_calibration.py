@@ -244,7 +244,7 @@ class TubeDimensionEstimates:
         spread = np.einsum("ijk,kl,ijl->ij", chosen, self.covariance[np.ix_(used, used)], chosen)
         return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
 
-    def parameter_values(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
+    def values_with_estimated_dimensions(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
         """Parameter values with the model's dimensions replaced by the estimated ones."""
         return _changed(system, given, np.where(self.estimated_dimension_mask, self.log_ratio, 0.0))
 

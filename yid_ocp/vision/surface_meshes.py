@@ -32,7 +32,7 @@ from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import resolve_urdf_path
+from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.options import OptionInfo, PositiveFloat
 from yid_ocp.vision.frames import (
     XTION_INTRINSICS,
@@ -71,7 +71,7 @@ class ExtraMesh:
 
 
 @dataclass(frozen=True)
-class SceneModel:
+class SceneDescription:
     """Contents of a camera's scene: system, robot URDF, parameter values and extra meshes."""
 
     system: System
@@ -278,7 +278,7 @@ def load_robot_meshes_by_joint(
     """
     import yourdfpy
 
-    path = resolve_urdf_path(urdf)
+    path = urdf_path_from_robot_name(urdf)
     if not is_file(path):
         what, allowed = f"there is no URDF file '{path}'", "the path of a URDF file, or package:NAME"
         raise ModelError(what, where=str(urdf), allowed=allowed, hint="check the path")
@@ -309,7 +309,7 @@ def load_robot_meshes_by_joint(
 
 def mesh_sources_sha256(urdf: str | Path, mechanism: Mechanism) -> str:
     """Hash (SHA-256) of the files and link poses from which a robot's visual meshes are built."""
-    path = resolve_urdf_path(urdf)
+    path = urdf_path_from_robot_name(urdf)
     robot = ElementTree.fromstring(read_input_text(path))
     links = [name for entry in robot.iter("link") if (name := entry.get("name", "")) in mechanism.frames]
     carried = [(name, joint, pose.tolist()) for name in links for joint, pose in [_carrier(mechanism, name)]]
@@ -428,8 +428,8 @@ _PERIOD_JITTER = 0.25  # largest variation of a period, as a fraction of the mea
 
 
 @dataclass(frozen=True)
-class DepthSensorModel:
-    """Sensor model of a structured-light depth camera. The defaults represent an Asus Xtion Pro Live."""
+class DepthCameraModel:
+    """A structured-light depth camera with its noise and lost pixels. The defaults represent an Asus Xtion Pro Live."""
 
     intrinsics: CameraIntrinsics = XTION_INTRINSICS
     baseline: float = 0.075  # between projector and camera, along x [m]
@@ -527,13 +527,13 @@ class VirtualCameraSetup:
     """Virtual depth camera: sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
-    sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # default: an Asus Xtion Pro Live
+    sensor_model: DepthCameraModel = field(default_factory=DepthCameraModel)  # default: an Asus Xtion Pro Live
     timing: VirtualCameraTiming = field(default_factory=VirtualCameraTiming)
     seed: int = 0  # seed of all random draws
 
 
 def render_virtual_frames(
-    scene: SceneModel, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
+    scene: SceneDescription, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
 ) -> VirtualFramesWithTruth:
     """Render the frames that a virtual camera takes of a motion. A frame is rendered, reproducibly, on loading.
 

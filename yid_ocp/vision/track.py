@@ -39,7 +39,7 @@ from yid_ocp.vision.sequence_calibration import (
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
 from yid_ocp.vision.shape_guesses import ShapeGuessFinder, cloud_centerline_tree, system_with_free_root
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, SceneModel, TriangleMesh
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, SceneDescription, TriangleMesh
 from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
 
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
@@ -54,7 +54,7 @@ _GRASP_MARGIN = 0.06  # about a grasp, beyond the tube's radius, a point may be 
 
 
 def track_object(
-    scene: SceneModel,
+    scene: SceneDescription,
     recording: Recording | None,
     sequence: FrameSequence,
     options: TrackOptions | None = None,
@@ -104,7 +104,7 @@ class FrameTracker:
 
     def __init__(
         self,
-        scene: SceneModel,
+        scene: SceneDescription,
         recording: Recording | None,
         sequence: FrameSequence,
         options: TrackOptions,
@@ -230,7 +230,7 @@ class FrameTracker:
         used = sizes.estimated_dimension_mask
         key = tuple(np.where(used, sizes.log_ratio, 0.0).tolist()) if any(used) else ()
         if key not in self._shapes:
-            values = sizes.parameter_values(self.system, self.parameter_values)
+            values = sizes.values_with_estimated_dimensions(self.system, self.parameter_values)
             self._shapes[key] = self.shape_fitter.with_parameter_values(values)
         return self._shapes[key]
 

@@ -390,7 +390,7 @@ class _BlindExperiment:
     def _virtual_arm(self) -> VirtualArmOptions:
         return load_config(self.config_file).virtual_arm
 
-    def _recording_conditions(self) -> blind.SyntheticMeasurementConditions:
+    def _recording_conditions(self) -> blind.SyntheticRecordingConditions:
         varied = EXPERIMENT_VARIATIONS[self.variation]
         arm, step = self._virtual_arm, DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor
         noise = ArmSensorNoise(
@@ -399,7 +399,7 @@ class _BlindExperiment:
         )
         if varied.has_torque_noise:
             noise = replace(noise, effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)
-        return blind.SyntheticMeasurementConditions(
+        return blind.SyntheticRecordingConditions(
             varied.n_recordings,
             noise,
             SimulationOptions(time_step=step, period_jitter_std=arm.period_jitter_std),

@@ -19,7 +19,7 @@ from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.effects.bodies import system_with_link_mass_factors
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, effect_with_sign_smoothing_speed
-from yid_ocp.effects.law import make_torque_law, read_torque_law_tables
+from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
@@ -28,7 +28,7 @@ from yid_ocp.model.mjcf_robot import mjcf_joint_constants
 from yid_ocp.model.objects.base import CableTopology, ObjectBetweenClamps
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
-from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
+from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.sensors.base import additional_sensor_channel_kinds
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role, unknown_name_error
@@ -224,7 +224,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
         what, hint = "the law lacks `law_csv` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
         allowed = "`law_csv` and `depends_on`, without `values`"
         raise ConfigError(what, where=f"law@{said.location}", allowed=allowed, hint=hint)
-    return make_torque_law(said.location, system, read_torque_law_tables(Path(said.law_csv), said.depends_on))
+    return torque_law_from_tables(said.location, system, read_torque_law_tables(Path(said.law_csv), said.depends_on))
 
 
 def _with_robot_file_constants(run: RunSettings, system: System) -> System:
@@ -247,7 +247,7 @@ def _with_robot_file_constants(run: RunSettings, system: System) -> System:
 
 
 def _robot_file_constants(run: RunSettings) -> dict[str, dict[str, float]]:
-    return {} if run.model.robot is None else mjcf_joint_constants(resolve_urdf_path(run.model.robot))
+    return {} if run.model.robot is None else mjcf_joint_constants(urdf_path_from_robot_name(run.model.robot))
 
 
 def _matches(name: str, key: str) -> bool:

@@ -18,7 +18,7 @@ from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
+from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import RecordedChannelKind, additional_sensor_channel_kinds
@@ -195,7 +195,7 @@ def propose_config_choices(
 
 
 def _motor_and_gain(robot: str, mode: str, recordings: Sequence[Recording]) -> tuple[str | None, float | None]:
-    name = resolve_urdf_path(robot).stem.lower()
+    name = urdf_path_from_robot_name(robot).stem.lower()
     found = next((known for start, known in _LEROBOT_ARMS.items() if name.startswith(start)), None)
     if mode != "servo" or found is None:
         return None, None

@@ -17,7 +17,7 @@ from yid_ocp.analysis.estimate_history import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
+from yid_ocp.diagnosis.baseline import DiagnosisBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel, StoredFit
@@ -76,7 +76,7 @@ def run_diagnose(
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step", ahead=18.5)
         runs = run_history.estimates_of_each_baseline_run(run)
-        without, said = run_history.load_reference_or_baseline_recordings(run)
+        without, said = run_history.load_recordings_without_effect(run)
         if said:
             folder.log_event("message", level="WARNING", source="baseline", text=said)
         run = run_history.settings_with_baseline_effects(run, runs)
@@ -96,7 +96,7 @@ def run_diagnose(
                 thresholds=run.diagnosis,
                 progress=logged,
                 known_fits=NominalSolutionAndRefitStore(nominal, refits),
-                baseline=EarlierRunsBaseline.from_runs(runs, without),
+                baseline=DiagnosisBaseline.from_run_estimates(runs, without),
                 exclude=run.diagnosis.excluded_candidates,
             )
         except KeyboardInterrupt:

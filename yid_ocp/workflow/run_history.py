@@ -210,7 +210,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
     return replace(settings_with_added_effects(run, added), parameters={**run.parameters, **freed})
 
 
-def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
+def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
     """Load recordings without the sought effect, from settings or baseline, and the reason if there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):

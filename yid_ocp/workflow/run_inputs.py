@@ -19,7 +19,7 @@ from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.effects import EFFECTS
 from yid_ocp.errors import ConfigError, YidError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import file_sha256, is_file
-from yid_ocp.model.urdf import resolve_urdf_path
+from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.registry import Registry
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS
 
@@ -139,7 +139,7 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
     robot = run.model.robot
     if robot is not None:
         with add_setting_location_to_errors(run, "model", "robot"):
-            file = resolve_urdf_path(robot)
+            file = urdf_path_from_robot_name(robot)
         files[robot] = _existing(run, file, "URDF file", "model", "robot")
     for key, name in {} if run.model.object is None else run.model.object.input_file_paths().items():
         files[name] = _existing(run, Path(name), "file", "model", "object", key)

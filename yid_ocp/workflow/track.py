@@ -40,7 +40,7 @@ from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SharedFrameEstimates, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-from yid_ocp.vision.surface_meshes import SceneModel, VirtualFramesWithTruth
+from yid_ocp.vision.surface_meshes import SceneDescription, VirtualFramesWithTruth
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
@@ -220,15 +220,15 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         recording = record_simulation(system, None, experiment, truth)
         rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
         timing = surface_meshes.VirtualCameraTiming(rate, settings.dropped_frame_fraction, *latency)
-        depth = surface_meshes.DepthSensorModel(outlier_probability=settings.outlier_fraction)
+        depth = surface_meshes.DepthCameraModel(outlier_probability=settings.outlier_fraction)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
         camera = surface_meshes.VirtualCameraSetup(pose, depth, timing, seed=seed)
         made = surface_meshes.render_virtual_frames(_camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
 
-def _camera_scene(run: RunSettings, system: System) -> SceneModel:
-    return SceneModel(system, run.model.robot, extra_meshes=run.model.extra_meshes)
+def _camera_scene(run: RunSettings, system: System) -> SceneDescription:
+    return SceneDescription(system, run.model.robot, extra_meshes=run.model.extra_meshes)
 
 
 def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames_path"]) -> FrameSequence:
