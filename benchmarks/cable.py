@@ -31,7 +31,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (
-    CableBranchProperties,
+    CableBranchRigidityAndDensity,
     CableOptions,
     clamped_cable_system,
     edge_length_parameter_values,
@@ -51,7 +51,7 @@ TIME_STEP = 0.01  # [s]
 NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 to 0.20 mm) [m]
 MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
 GRAVITY = 9.81  # [m/s^2]
-BRANCH = CableBranchProperties(
+BRANCH = CableBranchRigidityAndDensity(
     bend_rigidity=1.5e-3, twist_rigidity=1e-3, bend_damping=1e-3, separate_twist_damping=True
 )  # a guess
 OPTIONS = CableOptions(default_branch=BRANCH, shape_memory_fraction=0.5, has_rest_angle_parameters=True)
@@ -71,7 +71,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
     names: list[str] = []
     for name in cable.vertex_names_by_branch:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
-        if options.branch_properties.get(name, options.default_branch).separate_twist_damping:
+        if options.branch_density_and_damping.get(name, options.default_branch).separate_twist_damping:
             names.append(f"{name}.twist_damping")
         if options.shape_memory_fraction is not None:
             names.append(f"{name}.memory")
@@ -211,7 +211,7 @@ def parameters(cable: CableTopology, x: Any, covariance: Any, names: tuple[str, 
         branch, _, quantity = name.partition(".")
         result[name] = {"value": float(x[i]), "std": float(covariance[i, i]) ** 0.5}
         if branch in cable.vertex_names_by_branch and quantity in units:
-            weight = OPTIONS.branch_properties.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
+            weight = OPTIONS.branch_density_and_damping.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
             result[name] |= {"per_weight": float(x[i]) / weight, "per_weight_unit": units[quantity]}
     return result
 

@@ -43,7 +43,7 @@ from yid_ocp.virtual.joint_motion import (
     grasping_joint_angles,
     random_multisine_motion,
 )
-from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
+from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.vision import CameraIntrinsics, FrameSequence, SceneDescription, TrackOptions, TrackResult, look_at_pose
 from yid_ocp.vision.frames import import_open3d
@@ -206,7 +206,7 @@ class Stage:
     def __init__(self, play: Played, clutter: str, seed: int) -> None:
         self.play, self.course = play, play.course
         system = play.system
-        self.model = mujoco_model_from_mjcf(mujoco_xml(system, play.values))
+        self.model = mujoco_model_from_mjcf_text(mujoco_xml(system, play.values))
         self.data = mujoco.MjData(self.model)
         names = system.mechanism.joint_names
         self.order = [self.model.joint(name).id for name in names]

@@ -180,7 +180,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
         ("--columns", "column_meanings", "COLUMN=MEANING", "t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),
         ("--units", "units", "UNIT", "units that are not SI: deg, mm, ms, or QUANTITY=UNIT"),
         ("--torque-constants", "torque_constants", "JOINT=N_M_PER_A", "where the efforts are currents; * is any text"),
-        ("--clock-offset", "clock_offsets", "FILE=SECONDS", "of several files: added to the times of the named one"),
+        ("--clock-offset", "file_clock_offsets", "FILE=SECONDS", "of several files: added to the times of that one"),
         ("--gear-ratios", "gear_ratios", "JOINT=RATIO", "turns of the motor per turn of the joint"),
     )
     for flag, key, shape, text in listed:

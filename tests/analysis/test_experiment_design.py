@@ -382,7 +382,7 @@ def drawn_motion(monkeypatch):
     )
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    functions = SimpleNamespace(step=None, recorded_momentum_correction=shift)
+    functions = SimpleNamespace(step=None, effect_momentum_shift=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,

@@ -207,7 +207,7 @@ def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words)
 
 # Numbers that may have any value: places, angles, offsets.
 ANY_NUMBER = {
-    "import.clock_offsets.NAME",
+    "import.file_clock_offsets.NAME",
     "plan.start_joint_positions.NAME",
     "import.torque_constants.NAME",
     "import.gear_ratios.NAME",

@@ -54,7 +54,7 @@ class Problem:
         self.at.append(self.named_values(self.unknown_vector(at)))
         return self.with_nominal_and_effects_free(effects)
 
-    def with_relinearized_held_out_filters(self, own, effects, at):
+    def relinearize_held_out_filters(self, own, effects, at):
         assert own is self
         self.foreseen.append(dict(at))
         return self

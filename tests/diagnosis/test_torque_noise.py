@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
-from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_unknown_forces
+from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_smoother_unknowns
 from yid_ocp.inference.uncertainty import noise_only_covariance_factor
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
@@ -142,7 +142,7 @@ def test_candidates_of_other_places_are_left_out_of_a_refit(step):
     found = []
     for hypotheses in (all_places, one_place):
         own = hypotheses.with_effects_and_relinearized_filters([friction], at)
-        own = hypotheses.with_relinearized_held_out_filters(own, [friction], at)
+        own = hypotheses.relinearize_held_out_filters(own, [friction], at)
         x = own.unknown_vector(at)
         evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
         rows = own.whitened_held_out_prediction_residual(0, *held).residual
@@ -352,7 +352,7 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     problem = problem_of(step, [recorded(step, 1)])
     weighted = problem_with_sensor_noise_only(problem)
     x = problem.initial_unknowns
-    model = residual_models_with_unknown_forces(weighted, x, weighted.evaluate(x))[0]
+    model = residual_models_with_smoother_unknowns(weighted, x, weighted.evaluate(x))[0]
     decay = math.exp(-_MIN_INTERVAL / _CORRELATION_TIME)
     column = model.unknown_names.index("shoulder")
     # the integral over a long time has the variance of white noise that is held over each sample
@@ -361,7 +361,7 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
     assert np.count_nonzero(model.torque_noise_variance) == 1
     calm = problem_without_input_errors(problem)
-    assert not residual_models_with_unknown_forces(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()
+    assert not residual_models_with_smoother_unknowns(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()
 
 
 def test_the_smoother_starts_at_rest_and_counts_priors_once(step):
@@ -370,7 +370,7 @@ def test_the_smoother_starts_at_rest_and_counts_priors_once(step):
     plain = problem_with_sensor_noise_only(problem_of(step, files))
     x = 1.1 * plain.initial_unknowns
     given = plain.with_options(replace(plain.options, prior_stds={"elbow.stiffness": 0.5}))
-    bare, models = (residual_models_with_unknown_forces(own, x, own.evaluate(x)) for own in (plain, given))
+    bare, models = (residual_models_with_smoother_unknowns(own, x, own.evaluate(x)) for own in (plain, given))
     assert [model.recording for model in models] == ["run_1", "run_2"]
     for i, (model, other) in enumerate(zip(models, bare, strict=True)):
         for j, (here, there) in enumerate(zip(model.intervals, other.intervals, strict=True)):

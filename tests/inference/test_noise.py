@@ -8,12 +8,12 @@ from held_rod import held_rod
 from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recording, seen, taken
 
 from yid_ocp.inference import kalman
-from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces
+from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
     problem_with_whitening_at,
     torque_bias_change_in_stds,
-    torque_biases_and_stds_by_recording,
+    torque_bias_estimates_by_recording,
 )
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -144,7 +144,7 @@ def test_compiled_filters_do_what_plain_ones_do(urdf_folder, monkeypatch, how):
         monkeypatch.setattr(kalman, "_library", lambda library=library: library)
         weighted = problem_with_whitening_at(problem, x, rounds=2)
         own = weighted.evaluate(x)
-        found.append((own.residual[rows], own.jacobian[rows], *torque_biases_and_stds_by_recording(weighted, x)[0]))
+        found.append((own.residual[rows], own.jacobian[rows], *torque_bias_estimates_by_recording(weighted, x)[0]))
     for compiled, plain in zip(*found, strict=True):
         np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
 
@@ -202,7 +202,7 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     episode = problem.episodes[0]
     problem = problem.with_episodes([replace(episode, torque=episode.torque + 0.35)], [])
     weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
-    ((value, std),) = torque_biases_and_stds_by_recording(weighted, problem.initial_unknowns)
+    ((value, std),) = torque_bias_estimates_by_recording(weighted, problem.initial_unknowns)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
     again = problem_with_whitening_at(weighted, problem.initial_unknowns)
@@ -210,9 +210,9 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     moved = torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
     assert moved == pytest.approx(value[0] / BIAS)
     assert torque_bias_change_in_stds(weighted.whitening_filters, [None]) == 0.0
-    ((settled, _),) = torque_biases_and_stds_by_recording(again, problem.initial_unknowns)
+    ((settled, _),) = torque_bias_estimates_by_recording(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
-    assert torque_biases_and_stds_by_recording(problem, problem.initial_unknowns) == [None]
+    assert torque_bias_estimates_by_recording(problem, problem.initial_unknowns) == [None]
 
 
 @pytest.mark.parametrize("feedback", [TRACKED, {"arm_tracking_feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
@@ -261,7 +261,7 @@ def test_what_may_act_on_a_held_rod(urdf_folder):
     problem = EstimationProblem(step, [recording(arm, felt)], ("T1.bend",), ProblemOptions(initial_state="equilibrium"))
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x)
-    [model] = residual_models_with_unknown_forces(problem, x, evaluation)
+    [model] = residual_models_with_smoother_unknowns(problem, x, evaluation)
     told = zip(model.unknown_names, model.unknown_groups, model.reference_std, strict=True)
     found = {name: (group.location, group.kind, std) for name, group, std in told}
     bent = evaluation.episode_predictions[0].rollout.state[:, 2 : system.n_coordinates]

@@ -28,7 +28,7 @@ from yid_ocp.inference.smoother_model import (
     _generalized_forces_per_newton,
     _IntervalModel,
     _segment_weights,
-    residual_models_with_unknown_forces,
+    residual_models_with_smoother_unknowns,
 )
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
@@ -147,7 +147,7 @@ def smoothed(monkeypatch, models, **limits):
         told["limits"] = given
         return tuple(models)
 
-    monkeypatch.setattr(smoother, "residual_models_with_unknown_forces", linear_model)
+    monkeypatch.setattr(smoother, "residual_models_with_smoother_unknowns", linear_model)
     chosen = Thresholds(**limits)
     found = smoother.select_and_smooth_unknowns(SimpleNamespace(), np.zeros(0), None, chosen)
     assert told["limits"] == chosen
@@ -389,7 +389,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
     problem = problem_of(driven, recording, feedback)
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x)
-    model = residual_models_with_unknown_forces(problem, x, evaluation)[0]
+    model = residual_models_with_smoother_unknowns(problem, x, evaluation)[0]
     column = model.unknown_names.index("elbow")
     size = 1e-4 / model.reference_std[column]
     state, moved = np.zeros(len(model.initial_state_std)), []

@@ -10,8 +10,8 @@ from yid_ocp.effects.bodies import system_with_link_mass_factors
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import (
+    EffectMomentumShift,
     JointMotionWithSensitivities,
-    RecordedMomentumCorrection,
     lqr_tracking_feedback,
     proportional_tracking_feedback,
 )
@@ -148,7 +148,7 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     step = step_with(plain, names)
     theta = step.system.parameters.vector()
     state, torque, internal = moved(step, theta)
-    shift = RecordedMomentumCorrection(step)
+    shift = EffectMomentumShift(step)
     read = torque + misread
     loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
     recorded, true = (JointMotionWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
@@ -163,7 +163,7 @@ def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(pla
     names = {"shoulder.mass_scale": 1.1, "elbow.mass_scale": 0.8, "elbow.damping": 0.4}
     theta = step.system.parameters.vector(names)
     state, torque, internal = moved(step, theta)
-    shift = RecordedMomentumCorrection(step)
+    shift = EffectMomentumShift(step)
     loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.theta_without_effects(theta))
     recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, internal)
     value, slopes = shift.effect_momentum_shifts_and_derivatives(recorded, recorded, theta, tuple(names))
@@ -176,7 +176,7 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     step = step_with(plain, ())
     theta = step.system.parameters.vector()
     state, torque, none = moved(step, theta)
-    shift = RecordedMomentumCorrection(step)
+    shift = EffectMomentumShift(step)
     assert set(shift.parameter_names) == OWN
     by_torque = np.stack([torque, 0 * torque], axis=2)
     recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, none)
@@ -195,7 +195,7 @@ def test_derivatives_are_those_of_differences(plain, names):
     step = step_with(plain, names)
     theta = step.system.parameters.vector()
     state, torque, internal = moved(step, theta)
-    shift = RecordedMomentumCorrection(step)
+    shift = EffectMomentumShift(step)
     wanted = shift.parameter_names
     d, rng = len(wanted) + 2, np.random.default_rng(1)
     by_angles, by_torque = (0.01 * rng.normal(size=(*x.shape, d)) for x in (state[:, ANGLES], torque))
@@ -219,7 +219,7 @@ def test_derivatives_are_those_of_differences(plain, names):
 
 def test_an_effect_away_from_neutral_or_sought_shifts_the_momentum(plain):
     step = step_with(plain, EFFECTS["armature"])
-    shift = RecordedMomentumCorrection(step)
+    shift = EffectMomentumShift(step)
     [name] = set(shift.parameter_names) - OWN
     theta = step.system.parameters.vector()
     neutral = shift.theta_without_effects(theta)

@@ -127,11 +127,11 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
     way = "plan={point: p6, point_target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
     fewer = (
         "child_branch_vertex_names={}",
-        "branch_properties={}",
+        "branch_density_and_damping={}",
         "main_branch_vertex_names=[p0, p1, p4, p6, p8, p11, p12]",
     )
     coarse = [f"model.object.{entry}" for entry in fewer]
-    coarse += ["model.object.branch_properties={parent: {separate_twist_damping: true, linear_density: 0.05}}"]
+    coarse += ["model.object.branch_density_and_damping={parent: {separate_twist_damping: true, linear_density: 0.05}}"]
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", "problem.use_compiler=false", *coarse, way)
     assert outcome.is_successful, outcome.result["message"]
     first = outcome.output.rollout.state[0]

@@ -11,7 +11,7 @@ from small_problems import PENDULUM, correlated, efforts, measured, pendulum_ste
 
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError
-from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces
+from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
@@ -127,7 +127,7 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
 
 def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     problem = correlated_problem(urdf_folder, prescribed=JOINTS)
-    [linear] = residual_models_with_unknown_forces(
+    [linear] = residual_models_with_smoother_unknowns(
         problem, problem.initial_unknowns, problem.evaluate(problem.initial_unknowns)
     )
     at = [linear.unknown_names.index(joint) for joint in JOINTS]

@@ -16,7 +16,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data import JointGroup, Recording, SensorChannelGroup, read_recording, write_recording
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
-from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces
+from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
@@ -113,13 +113,13 @@ def recorded(urdf: Path) -> Recording:
     """A motion of arm and rod in MuJoCo, with its own sensors on the lower link and at the rod's end, without noise."""
     mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install 'yid-ocp[blind]'")
     from yid_ocp.virtual.joint_motion import MultisineMotion
-    from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
+    from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml
     from yid_ocp.virtual.mujoco_simulation import MujocoScene, TrackingController, settle_to_equilibrium
 
     system, step = holding(urdf, driven=ARM), 2e-4
     own = "".join(f"<{kind} name='{site}{kind}' site='{site}'/>" for site in ("lower", "w_T1") for kind in KINDS)
     text = mujoco_xml(system, time_step=step).replace("</mujoco>", f"<sensor>{own}</sensor></mujoco>")
-    model = mujoco_model_from_mjcf(text)
+    model = mujoco_model_from_mjcf_text(text)
     scene = MujocoScene.from_compiled_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[[model.joint(name).id for name in ARM]] = list(START.values())
@@ -219,7 +219,7 @@ def test_unknown_forces_of_the_smoother_move_these_readings_as_an_effect_does(
     seen = replace(recorded, channel_groups=tuple(g for g in recorded.channel_groups if g.name == name))
     curved = holding(urdf, effects={"rest_curvature@T1": {}}, prescribed=ARM)
     made = problem(compile_step(curved, 0.01, use_compiler=False), seen, "rest_curvature@T1.qx")
-    [model] = residual_models_with_unknown_forces(
+    [model] = residual_models_with_smoother_unknowns(
         made, made.initial_unknowns, made.evaluate(made.initial_unknowns), interval=0.2
     )
     bent = [link[0] for link in curved.segment_layout("T1").link_joints]

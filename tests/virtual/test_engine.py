@@ -30,7 +30,7 @@ from yid_ocp.virtual.experiment import (
     run_virtual_experiment,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
-from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf, mujoco_xml
+from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
     MujocoScene,
     SimulationOptions,
@@ -155,7 +155,7 @@ def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) 
 def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoScene:
     """The scene with the joints a tenth of a radian from where the grippers meet another system's object."""
     scene = MujocoScene.from_compiled_model(
-        system, mujoco, mujoco_model_from_mjcf(mujoco_xml(system, values, time_step=time_step))
+        system, mujoco, mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=time_step))
     )
     scene.data.qpos[:] = scene.model.qpos_spring
     for name, angle in grasping_joint_angles(held, TRUTH).items():

@@ -28,7 +28,12 @@ from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_deriva
 from yid_ocp.model.mechanism import Frame, Inertia, Placement
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.mjcf import ExpressionEvaluator, mujoco_model_from_mjcf, mujoco_xml, system_joint_dynamics_terms
+from yid_ocp.virtual.mjcf import (
+    ExpressionEvaluator,
+    mujoco_model_from_mjcf_text,
+    mujoco_xml,
+    system_joint_dynamics_terms,
+)
 
 MECHANICAL = {
     "kelvin_voigt": ("T", {"tau": 0.05}),
@@ -106,7 +111,7 @@ def assert_same_mechanics(system: System, values: dict[str, float]) -> None:
         passive += 0 if terms.dissipative_force is None else terms.dissipative_force
     points = ca.horzcat(ca.SX(3, 0), *(kinematics.frame_position(name) for name in system.point_frames))
     ours = ca.Function("ours", [q, v, system.parameters.symbols], [mass, bias, passive, points])
-    model = mujoco_model_from_mjcf(mujoco_xml(system, values))
+    model = mujoco_model_from_mjcf_text(mujoco_xml(system, values))
     data = mujoco.MjData(model)
     order = [model.joint(name).id for name in system.mechanism.joint_names]
     assert model.nv == system.n_coordinates
@@ -176,7 +181,7 @@ def test_what_has_no_term_is_refused(system: System) -> None:
 
 def test_a_part_of_the_weight(system: System) -> None:
     changed = with_effect(system, "gravity_scale", "object", {"fraction": -0.4})
-    model, whole = (mujoco_model_from_mjcf(mujoco_xml(s)) for s in (changed, system))
+    model, whole = (mujoco_model_from_mjcf_text(mujoco_xml(s)) for s in (changed, system))
     light, heavy = mujoco.MjData(model), mujoco.MjData(whole)
     for m, d in ((model, light), (whole, heavy)):
         d.qpos[:] = np.linspace(-0.5, 0.5, m.nq)
@@ -197,7 +202,7 @@ def test_recorded_torques_become_those_that_act(system: System) -> None:
         system = with_effect(system, kind, location, values)
     late = with_effect(system, "effort_delay", "gripper", {"delay": 0.02})
     for changed, delay in ((system, 0.0), (late, 0.02)):
-        model = mujoco_model_from_mjcf(mujoco_xml(changed, time_step=1e-3, actuators=True))
+        model = mujoco_model_from_mjcf_text(mujoco_xml(changed, time_step=1e-3, actuators=True))
         data = mujoco.MjData(model)
         at, found = model.joint("elbow").id, []
         for _ in range(120):
@@ -213,14 +218,14 @@ def test_recorded_torques_become_those_that_act(system: System) -> None:
 
 def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
     changed = with_effect(system, *("grasp_compliance", *OTHERS["grasp_compliance"][:2]))
-    model = mujoco_model_from_mjcf(mujoco_xml(changed, emulate=True))
+    model = mujoco_model_from_mjcf_text(mujoco_xml(changed, emulate=True))
     data = mujoco.MjData(model)
     data.qpos[:] = 0.1
     mujoco.mj_forward(model, data)
     apart = data.site("grasp_hold_holder").xpos - data.site("grasp_hold_held").xpos
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jacSite(model, data, jacobian, None, model.site("grasp_hold_held").id)
-    plain = mujoco_model_from_mjcf(mujoco_xml(replace(changed, grasps=()), emulate=True))
+    plain = mujoco_model_from_mjcf_text(mujoco_xml(replace(changed, grasps=()), emulate=True))
     other = mujoco.MjData(plain)
     other.qpos[:] = 0.1
     mujoco.mj_forward(plain, other)
@@ -231,7 +236,7 @@ def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
 def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
     changed = with_effect(system, "joint_coulomb", "elbow", {"tau_c": 0.4})
     assert system_joint_dynamics_terms(changed, ExpressionEvaluator(changed))["elbow"].dry_friction == 0.4
-    model = mujoco_model_from_mjcf(mujoco_xml(changed, emulate=True))
+    model = mujoco_model_from_mjcf_text(mujoco_xml(changed, emulate=True))
     assert model.dof_frictionloss[model.joint("elbow").id] == 0.4
 
 

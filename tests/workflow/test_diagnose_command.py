@@ -18,7 +18,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, StoredFit
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_by_recording
+from yid_ocp.inference.whitening import problem_with_whitening_at, torque_bias_estimates_by_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -228,7 +228,7 @@ def test_errors_of_torques_shrink_like_all_other_noise(problem_of, encoders):
     assert all(made.whitening_filters[0] is not None for made in both)
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
-    (value, std), (smaller_value, smaller_std) = (torque_biases_and_stds_by_recording(made, x)[0] for made in both)
+    (value, std), (smaller_value, smaller_std) = (torque_bias_estimates_by_recording(made, x)[0] for made in both)
     np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
 

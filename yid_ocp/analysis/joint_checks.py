@@ -222,7 +222,7 @@ def known_effect_config_line(kind: str, location: str, quantity: str, value: flo
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
 
-def inertial_effort_excitation_issues(
+def slow_motion_excitation_issues(
     arm: RecordedJointsModel, recording: Recording, effort: SensorOptions
 ) -> Iterator[Issue]:
     """Yield an issue if a motion is too slow to determine damping, friction and inertia from measured efforts.

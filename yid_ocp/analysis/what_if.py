@@ -73,7 +73,7 @@ class ChangedExperimentResult:
 
 
 @dataclass(frozen=True, repr=False)
-class ExperimentChangeRanking(ReprMixin):
+class ExperimentChangesByIdentifiableCount(ReprMixin):
     """Changes of an experiment, ranked by the number of parameters that they make identifiable.
 
     `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
@@ -108,7 +108,7 @@ def what_if(
     considered_changes: Collection[str] | None = None,
     progress: Progress = NULL_PROGRESS,
     evaluate_changes: ChangeSetEvaluationFunction | None = None,
-) -> ExperimentChangeRanking:
+) -> ExperimentChangesByIdentifiableCount:
     """Rank changes of an experiment by the number of parameters that they make identifiable, without new measurements.
 
     A new sensor observes the simulation of the recorded motion, in which the tracking filter keeps the arms on that
@@ -139,7 +139,7 @@ def what_if(
     changes = [c for c in outcomes.possible if considered_changes is None or c.name in considered_changes]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
     smallest = _rank_results(_smallest(outcomes, changes, base))
-    return ExperimentChangeRanking(base, tuple(singles), tuple(smallest), len(outcomes.known))
+    return ExperimentChangesByIdentifiableCount(base, tuple(singles), tuple(smallest), len(outcomes.known))
 
 
 def evaluate_experiment_change_sets(

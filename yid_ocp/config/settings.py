@@ -246,7 +246,7 @@ class ImportSettings:
         _Numbers, OptionInfo("torque per current by joint or pattern, if efforts are motor currents", "N m/A")
     ] = None
     gear_ratios: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
-    clock_offsets: Annotated[_Numbers, OptionInfo("several files: added to times of each, by file stem", "s")] = None
+    file_clock_offsets: Annotated[_Numbers, OptionInfo("several files: added to each one's times, by stem", "s")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
     recorded_or_nominal_times: Annotated[RecordedOrNominalTimes | None, OptionInfo("table: kind of its times")] = None
     point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None

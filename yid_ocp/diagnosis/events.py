@@ -37,7 +37,7 @@ from yid_ocp.inference.smoother import (
     generalised_force_unit,
     smoothed_unknown_significance_mask,
 )
-from yid_ocp.inference.smoother_model import residual_models_with_unknown_forces, sensor_bias_location_name
+from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns, sensor_bias_location_name
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -254,7 +254,7 @@ def _driving_forces(
     if not any(sought.values()):
         return found
     with threadpoolctl.threadpool_limits(1):
-        models = residual_models_with_unknown_forces(problem, x, evaluation, limits, _FORCE_INTERVAL)
+        models = residual_models_with_smoother_unknowns(problem, x, evaluation, limits, _FORCE_INTERVAL)
         for model, run in zip(models, runs, strict=False):
             if not sought[model.recording]:
                 continue

@@ -228,12 +228,12 @@ class AllCandidatesProblem:
     ) -> EstimationProblem:
         """Estimation problem with free `effects`, its filters relinearised about the torque offsets at the values `at`.
 
-        Filters of held-out recordings are unchanged: see `with_relinearized_held_out_filters`.
+        Filters of held-out recordings are unchanged: see `relinearize_held_out_filters`.
         """
         own = self.with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
-    def with_relinearized_held_out_filters(
+    def relinearize_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Relinearise held-out filters at the fitted values. `own`: from `with_effects_and_relinearized_filters`."""

@@ -252,7 +252,7 @@ def refit_with_effects(
         return None
     own, outcome, finish = best
     values = own.named_values(outcome.x)
-    own = problem.with_relinearized_held_out_filters(own, effects, values)
+    own = problem.relinearize_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
     ranges = {name: high - low for effect in effects for name, (low, high) in effect.prior_ranges.items()}
     most = {name: _UNINFORMATIVE_STD_RATIO * width for name, width in ranges.items()}
@@ -270,7 +270,7 @@ def _evaluated(
     """The problem with effects at known values, and its evaluation there."""
     own = problem.with_effects_and_relinearized_filters(effects, values)
     finish = own.evaluate(own.unknown_vector(values))
-    return problem.with_relinearized_held_out_filters(own, effects, values), finish
+    return problem.relinearize_held_out_filters(own, effects, values), finish
 
 
 def restore_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:

@@ -32,7 +32,7 @@ from yid_ocp.inference.smoother_model import (
     LinearResidualModel,
     SmoothedUnknownGroup,
     SmootherOptions,
-    residual_models_with_unknown_forces,
+    residual_models_with_smoother_unknowns,
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
@@ -332,7 +332,7 @@ def select_and_smooth_unknowns(
     """Select groups of unknown forces, offsets and biases by log evidence at a fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
-        models = residual_models_with_unknown_forces(problem, x, evaluation, limits)
+        models = residual_models_with_smoother_unknowns(problem, x, evaluation, limits)
         sources = tuple(dict.fromkeys(source for model in models for source in model.unknown_groups))
         none = dict.fromkeys(sources, 0.0)
         nothing = _run(models, none)

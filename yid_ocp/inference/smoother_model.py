@@ -260,7 +260,7 @@ class LinearResidualModel:
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 
-def residual_models_with_unknown_forces(
+def residual_models_with_smoother_unknowns(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,

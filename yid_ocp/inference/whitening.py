@@ -196,7 +196,7 @@ def _filter_steps(
         feedback = None
     elif feedback is not None:
         # momenta that the filter follows contain torques of the previous step
-        shift = course.model_functions.recorded_momentum_correction
+        shift = course.model_functions.effect_momentum_shift
         momentum = shift.momentum_derivative_by_previous_torque(course.theta)
         driving = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
         # only errors of the filter's reference angles count; those of momenta average out
@@ -410,7 +410,7 @@ def _with_errors(
     return problem.with_episodes(list(map(without, problem.episodes)), list(map(without, problem.held_out)))
 
 
-def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+def torque_bias_estimates_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
     """Estimate the constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
 
     An entry is None if torques are exact, or without a whitening filter (`problem_with_whitening_at`).

@@ -160,7 +160,7 @@ class JointMotionWithSensitivities:
         return _one_before(self.angles[:-1]), self.angles[:-1]
 
 
-class RecordedMomentumCorrection:
+class EffectMomentumShift:
     """Computes the momentum that effects add to the recorded motion, so that the feedback does not oppose it.
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
@@ -290,7 +290,7 @@ def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> 
 
     The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
     is assumed to be the same in this step and the previous step. `gain` (..., nu, nb) is the feedback gain of the step.
-    `by_torque` (nu, nu) is `RecordedMomentumCorrection.momentum_derivative_by_previous_torque`.
+    `by_torque` (nu, nu) is `EffectMomentumShift.momentum_derivative_by_previous_torque`.
     """
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]

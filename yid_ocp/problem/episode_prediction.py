@@ -139,7 +139,7 @@ class EpisodePredictor:
                 none = np.zeros((nx, len(names) + len(rows)))
                 return InitialStateWithSensitivity(rest.state, none, rest, f"{episode.name}: {rest.message}")
             state = rest.state.copy()
-            by_known = inputs.initial_known_coordinate_derivatives(len(names))
+            by_known = inputs.initial_known_coordinate_sensitivities(len(names))
             by_theta = rest.state_by_theta + rest.state_by_known_coordinates @ by_known
             if inputs.first_torque_sensitivity is not None:
                 by_theta += rest.state_by_torque @ inputs.first_torque_sensitivity
@@ -153,7 +153,7 @@ class EpisodePredictor:
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
         recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
-        if self._follows_momenta and self.model_functions.recorded_momentum_correction.is_active(theta, wanted):
+        if self._follows_momenta and self.model_functions.effect_momentum_shift.is_active(theta, wanted):
             return False
         slopes += self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
@@ -186,7 +186,7 @@ class EpisodePredictor:
         rows = slice(2 * self.system.n_coordinates, None)
         recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
-        shift, measured = self.model_functions.recorded_momentum_correction, episode.measured_driven_angles
+        shift, measured = self.model_functions.effect_momentum_shift, episode.measured_driven_angles
         return inputs.with_effect_momentum_in_reference(shift, recorded, measured, theta, names, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> CorrectedInputs:

@@ -266,7 +266,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if options.arm_tracking_feedback == "proportional":
         loop = proportional_tracking_feedback(step, episode.measured_driven_angles, options.arm_tracking_feedback_gains)
     else:
-        plain = functions.recorded_momentum_correction.theta_without_effects(theta)
+        plain = functions.effect_momentum_shift.theta_without_effects(theta)
         known = episode.smoothed_driven_angles, episode.torque, plain
         loop = lqr_tracking_feedback(step, *known, functions.arms_only_integrator_step)
     return replace(episode, tracking_feedback=loop)

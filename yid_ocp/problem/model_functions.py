@@ -15,8 +15,8 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
+    EffectMomentumShift,
     JointMotionWithSensitivities,
-    RecordedMomentumCorrection,
     compile_driven_arms_only_step,
 )
 from yid_ocp.model.system import System
@@ -45,7 +45,7 @@ class CorrectedInputs:
         """Coordinates (nk,) of driven, then prescribed joints at node 0."""
         return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
 
-    def initial_known_coordinate_derivatives(self, width: int) -> Array:
+    def initial_known_coordinate_sensitivities(self, width: int) -> Array:
         """Derivative (nk, d) of `initial_known_coordinates` with respect to the parameters."""
         by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
@@ -67,7 +67,7 @@ class CorrectedInputs:
 
     def with_effect_momentum_in_reference(
         self,
-        shift: RecordedMomentumCorrection,
+        shift: EffectMomentumShift,
         recorded: JointMotionWithSensitivities,
         measured: Array,
         theta: Array,
@@ -324,7 +324,7 @@ class ModelFunctions:
             lambda _: InitialStateFitter(step, start_parameters)
         )
         self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_arms_only_step(step))
-        self._momentum = CasadiLockedCache[None, RecordedMomentumCorrection](lambda _: RecordedMomentumCorrection(step))
+        self._momentum = CasadiLockedCache[None, EffectMomentumShift](lambda _: EffectMomentumShift(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
@@ -350,7 +350,7 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def recorded_momentum_correction(self) -> RecordedMomentumCorrection:
+    def effect_momentum_shift(self) -> EffectMomentumShift:
         """Correction of the tracking feedback's reference momentum for the effects in the model."""
         return self._momentum(None)
 

@@ -337,7 +337,7 @@ class _Maker:
         """The stage with the inputs of a recording."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
-            feedback, shift = episode.tracking_feedback, self._problem.model_functions.recorded_momentum_correction
+            feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_shift
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
             made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)

@@ -432,7 +432,7 @@ def import_mujoco() -> ModuleType:
     return mujoco
 
 
-def mujoco_model_from_mjcf(text: str) -> Any:
+def mujoco_model_from_mjcf_text(text: str) -> Any:
     """Compile MJCF text to a `mujoco.MjModel`. Raises `ModelError` if MuJoCo rejects it."""
     try:
         return import_mujoco().MjModel.from_xml_string(text)

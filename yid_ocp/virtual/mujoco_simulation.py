@@ -24,7 +24,7 @@ from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
-from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf, mujoco_xml
+from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf_text, mujoco_xml
 
 DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
 _TRACKING_BANDWIDTH = 25.0  # bandwidth of the joint controller [rad/s]; a 10 ms hold leaves it well damped
@@ -157,7 +157,7 @@ def simulate_in_mujoco(
         what, hint = "the motion has other joints than the driven ones", "give a motion of the driven joints"
         raise ModelError(what, where=f"motion of {', '.join(motion.joints) or 'nothing'}", allowed=allowed, hint=hint)
     mujoco = import_mujoco()
-    model = mujoco_model_from_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
+    model = mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
     with _at_work(mujoco, model, injected):
         scene = MujocoScene.from_compiled_model(system, mujoco, model)
@@ -426,7 +426,7 @@ def replay_mismatch_by_channel(
     and `GROUP.POINT` of every point [m]. Raises `ModelError` if the recording lacks the channels that drive the model,
     the model does not settle, or it diverges; `DataError` if MuJoCo is not installed.
     """
-    mujoco, model = import_mujoco(), mujoco_model_from_mjcf(text)
+    mujoco, model = import_mujoco(), mujoco_model_from_mjcf_text(text)
     moved = system.driven or system.prescribed
     joints = recording.joints
     if joints is None or not moved or not set(moved) <= set(joints.names):

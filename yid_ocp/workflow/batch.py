@@ -28,7 +28,7 @@ from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_folder import current_local_time_text
-from yid_ocp.workflow.run_history import estimate_history_to_dict, read_estimates, require_same_model
+from yid_ocp.workflow.run_history import estimate_history_to_dict, read_estimates, require_comparable_runs
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve
 
@@ -191,7 +191,7 @@ def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
     if len(folders) < 2:
         return None
     try:
-        require_same_model(folders)
+        require_comparable_runs(folders)
         return estimate_history_to_dict(assess_drift_and_outlier_runs([read_estimates(folder) for folder in folders]))
     except YidError:
         return None

@@ -335,7 +335,7 @@ def _excitation(
     if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
         options = _choice(run)(JOINT_EFFORT_GROUP_NAME)
         whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
-        weak = [list(joint_checks.inertial_effort_excitation_issues(arm, one, options)) for one in whole]
+        weak = [list(joint_checks.slow_motion_excitation_issues(arm, one, options)) for one in whole]
         if all(weak):  # one informative recording is enough
             found += [doubt for doubts in weak for doubt in doubts]
     return found

@@ -106,7 +106,7 @@ class ProposedConfigChoices:
     torque_bias_std: Mapping[str, float]  # default by joint [N m]; empty if the recording states it or has no effort
 
     @property
-    def is_identified_from_efforts(self) -> bool:
+    def efforts_alone_identify_model(self) -> bool:
         """Whether efforts alone identify the model, as arms are prescribed and no object is observed."""
         seen = any(not group.startswith("imu") for group in self.point_placements)
         return self.arm_mode == "prescribed" and not (self.has_object and seen)

@@ -152,7 +152,7 @@ def _identifiability_result(
     solution: Solution | None,
     information: IdentifiabilityResult | None,
     unknown: IdentifiabilityResult | None,
-    ranking: what_if.ExperimentChangeRanking | None,
+    ranking: what_if.ExperimentChangesByIdentifiableCount | None,
     asked: IdentifiabilityOptions,
 ) -> dict[str, Any]:
     result: dict[str, Any] = {

@@ -38,7 +38,7 @@ _MAPPINGS = {name: kind for name, kind in _KINDS.items() if kind is not None and
 _SINGLE = [name for name, kind in _KINDS.items() if kind is None and name not in _LISTS]
 _FLAGS = {
     "joint_topics": "--joint-topic",
-    "clock_offsets": "--clock-offset",
+    "file_clock_offsets": "--clock-offset",
     "message_fields": "--field",
     "column_meanings": "--columns",
     "point_names": "--points",
@@ -58,7 +58,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
     with stderr_progress_display(arguments) as progress:
         options = {name: value for name, value in said.items() if value is not None} | asked
-        offsets = options.pop("clock_offsets", None)
+        offsets = options.pop("file_clock_offsets", None)
         if len(files) > 1:
             recording = replace(_merged(files, options, offsets, progress), name=Path(arguments.out).stem)
         elif offsets:
@@ -119,8 +119,8 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
     """A tested command that imports files, and issues of its result, or else the missing information."""
     try:
         if len(files) > 1:
-            own = {name: value for name, value in options.items() if name != "clock_offsets"}
-            recording = _merged(files, own, options.get("clock_offsets"), progress)
+            own = {name: value for name, value in options.items() if name != "file_clock_offsets"}
+            recording = _merged(files, own, options.get("file_clock_offsets"), progress)
         else:
             recording = read_any(files[0], progress=progress, **options)
     except DataError as error:

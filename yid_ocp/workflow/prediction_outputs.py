@@ -35,7 +35,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     """
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
-    known = list(zip(problem.episodes, whitening.torque_biases_and_stds_by_recording(problem, x), strict=True))
+    known = list(zip(problem.episodes, whitening.torque_bias_estimates_by_recording(problem, x), strict=True))
     apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
     if apart:
         is_whitened = any(problem.held_out_whitening_filters)

@@ -160,7 +160,7 @@ def _dependent(folders: Sequence[str | Path]) -> str:
     return ""
 
 
-def require_same_model(folders: Sequence[Path]) -> None:
+def require_comparable_runs(folders: Sequence[Path]) -> None:
     """Raise `ConfigError` unless all run folders have the same model and none is the baseline of another."""
     dependent = _dependent(folders)
     if dependent:
@@ -264,7 +264,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     if len(paths) == 2 and _have_same_recordings(paths):
         return _overlay_runs(paths, out, progress)
     estimates = [read_estimates(path) for path in paths]
-    require_same_model(paths)
+    require_comparable_runs(paths)
     progress.begin_stage(f"comparing {len(paths)} runs")
     found = assess_drift_and_outlier_runs(estimates)
     settings = RunSettings(name="history", description="Runs of one model side by side.")

@@ -264,8 +264,8 @@ class ObjectBetweenClamps(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedObjectBuilder(ObjectBuilder):
-    """Base class of objects mounted on a frame of a robot or clamp, or in the world."""
+class FixedRootObjectBuilder(ObjectBuilder):
+    """Base class of objects whose root is fixed to a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("factor on the weight of the object, not on its inertia")

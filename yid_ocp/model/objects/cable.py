@@ -54,7 +54,7 @@ INITIAL_RMS_SPEED_PARAMETER = "start.speed"
 
 
 @dataclass(frozen=True)
-class CableBranchProperties:
+class CableBranchRigidityAndDensity:
     """Nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
 
     bend_rigidity: float = 1.5e-3  # a configuration sets this and the next two under `parameters`
@@ -75,10 +75,10 @@ class CableOptions:
     entry have the `default_branch`. `gravity` is in m/s^2.
     """
 
-    branch_properties: Annotated[Mapping[str, CableBranchProperties], OptionInfo("by branch, parent and children")] = (
-        field(default_factory=dict)
-    )
-    default_branch: CableBranchProperties = field(default_factory=CableBranchProperties)
+    branch_density_and_damping: Annotated[
+        Mapping[str, CableBranchRigidityAndDensity], OptionInfo("by branch, parent and children")
+    ] = field(default_factory=dict)
+    default_branch: CableBranchRigidityAndDensity = field(default_factory=CableBranchRigidityAndDensity)
     radius: Annotated[float, Gt(0), Le(1), OptionInfo("radius of the cylinders for the links' inertia", "m")] = 0.005
     end_clamp_grasp_kind: Annotated[
         Literal["axis", "weld"],
@@ -236,7 +236,7 @@ def _segments(
         carried.append(carried[-1] @ turn)
     segments = []
     for name, chain in cable.vertex_names_by_branch.items():
-        branch = options.branch_properties.get(name, options.default_branch)
+        branch = options.branch_density_and_damping.get(name, options.default_branch)
         if name == cable.parent_segment:
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
@@ -278,14 +278,14 @@ model:
     undeformed_shape_file: undeformed.csv
     end_clamp_grasp_kind: axis
 """,
-        "model.object.branch_properties.NAME": """\
+        "model.object.branch_density_and_damping.NAME": """\
 model:
   object:
     kind: cable
     main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
     child_branch_vertex_names: {side: [p2, s1, s2]}
-    branch_properties:
+    branch_density_and_damping:
       side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     }
@@ -307,10 +307,11 @@ model:
     def topology(self) -> CableTopology:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
         found = CableTopology(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
-        for name in self.branch_properties:
+        for name in self.branch_density_and_damping:
             if name not in found.vertex_names_by_branch:
                 said = unknown_name_error_arguments(name, found.vertex_names_by_branch)
-                raise ModelError(f"there is no branch '{name}'", where=f"model.object.branch_properties.{name}", **said)
+                where = f"model.object.branch_density_and_damping.{name}"
+                raise ModelError(f"there is no branch '{name}'", where=where, **said)
         return found
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectFactory, MountedObjectBuilder
+from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitCommandObject, InitCommandObjectFactory
 from yid_ocp.options import OptionInfo
 
 _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]
@@ -43,7 +43,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
-class _FoamY(MountedObjectBuilder):
+class _FoamY(FixedRootObjectBuilder):
     """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the position of that experiment."""
 
     init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
