@@ -30,7 +30,7 @@ NEUTRAL = {
     "min_log_bayes_factor": 1.92,  # that of a 95 % interval
     "prior_range_margin_in_widths": 1e9,
     "transfer_rtol": 1e9,
-    "transfer_z_max": 1e9,
+    "always_allowed_transfer_z": 1e9,
     "min_explained_fraction": 0.0,
 }
 """Values at which a threshold asks for nothing, or for as little as makes sense."""

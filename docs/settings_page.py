@@ -101,9 +101,9 @@ model:
   effects:
     - {kind: kelvin_voigt, location: T1, values: {tau: 0.02}}
 """,
-    "model.extra_meshes": """\
+    "model.bodies_missing_from_urdf": """\
 model:
-  extra_meshes:
+  bodies_missing_from_urdf:
     - {mesh_file: gripper.stl, parent_frame: left_hand}
     - {box_size: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
 """,
@@ -239,10 +239,10 @@ track:
   options:
     calibration: {fix_pose: true, translation_prior_std: 0.01}    # a hand-eye calibration, known to 1 cm [m]
 """,
-    "track.options.clock": """\
+    "track.options.clock_offset": """\
 track:
   options:
-    clock: {initial_stamp_minus_joint_time: 0.08, search_half_width: 0.05}      # [s]
+    clock_offset: {initial_stamp_minus_joint_time: 0.08, search_half_width: 0.05}      # [s]
 """,
     "plan": """\
 plan:

@@ -16,13 +16,13 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.sensors.joints import EffortSensor
+from yid_ocp.sensors.joints import PrescribedJointEffortSensor
 from yid_ocp.sensors.points import PointSensor
 
 
-def efforts(*joints: str) -> EffortSensor:
+def efforts(*joints: str) -> PrescribedJointEffortSensor:
     """A sensor of one output a joint."""
-    return EffortSensor(joints)
+    return PrescribedJointEffortSensor(joints)
 
 
 def points(*names: str, pose=None, group="points") -> PointSensor:

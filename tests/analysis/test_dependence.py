@@ -23,7 +23,7 @@ from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.model_functions import TimeGridStateValues
+from yid_ocp.problem.model_functions import NodeStateValues
 
 STD = 2e-3
 STEPS = 60
@@ -136,7 +136,7 @@ def rolled_out(problem, rest, theta):
         std = np.nanmedian(samples.std, axis=0)
         effort = np.zeros((STEPS + 1, step.sizes["n"]))
         effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
-        values = TimeGridStateValues.from_trajectory(step, rollout.state[:-1], effort)
+        values = NodeStateValues.from_trajectory(step, rollout.state[:-1], effort)
         found.append(problem.model_functions.compiled_sensor_function(samples.sensor)(values, theta).output / std)
     return found
 

@@ -17,7 +17,7 @@ from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
     MechanicalVariantSensitivityBuilder,
-    PointObservationSchedule,
+    SinglePointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
     measurable_points,
@@ -104,7 +104,8 @@ def sloped():
 
 
 def view(times, std, frame="a"):
-    return PointObservationSchedule("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
+    stds = np.array(std, float) * np.ones((len(times), 3))
+    return SinglePointObservationSchedule("camera", frame, np.array(times), stds)
 
 
 TIMES = [(0.0, {0: 1.0}), (0.5, {1: 1.0}), (0.75, {1: 0.5, 2: 0.5}), (1.6, {3: 0.8, 4: 0.2}), (2.0, {4: 1.0})]

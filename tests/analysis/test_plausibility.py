@@ -15,7 +15,7 @@ from yid_ocp.analysis.clock_checks import (
     _by_clock,
     _clock_error,
     clock_drift_and_overstated_noise_issues,
-    search_clock_offset_and_drift,
+    point_clock_offset_and_drift,
 )
 from yid_ocp.analysis.estimation import _baselines
 from yid_ocp.analysis.joint_checks import (
@@ -23,10 +23,10 @@ from yid_ocp.analysis.joint_checks import (
     _OFFSET_FRACTION,
     RecordedJointsModel,
     _loaded,
-    inertial_effort_excitation_issues,
     inverse_dynamics_effort_issues,
     joint_excitation_issues,
     joint_limit_issues,
+    slow_motion_excitation_issues,
 )
 from yid_ocp.analysis.point_checks import (
     _moved,
@@ -269,12 +269,12 @@ def test_too_little_of_a_recording_says_nothing(arms, runs, drives):
     arm, few = arms[1], runs[1].time_slice(-1.0, float(runs[1].joints.t[8]))
     blind = replace(with_joints(few, position=lambda j: 9.0 * j.position), joints=None)
     deaf = with_joints(runs[1], effort=lambda _: None)
-    for check in (inverse_dynamics_effort_issues, lambda *given: inertial_effort_excitation_issues(*given, USUAL)):
+    for check in (inverse_dynamics_effort_issues, lambda *given: slow_motion_excitation_issues(*given, USUAL)):
         assert [list(check(arm, run)) for run in (few, blind, deaf)] == [[], [], []]
     assert list(joint_limit_issues(arm, with_joints(few, t=lambda j: j.t / 30))) == []
     assert list(joint_limit_issues(arm, blind)) == list(forward_kinematics_issues(arm, blind, usual)) == []
     assert list(joint_excitation_issues([blind, runs[1]], {"else": ("else.damping",)}, USUAL)) == []
-    assert list(inertial_effort_excitation_issues(drives, swung(drives, size=1e-3, **SLOW), USUAL)) == []
+    assert list(slow_motion_excitation_issues(drives, swung(drives, size=1e-3, **SLOW), USUAL)) == []
     runs = (swung(drives, lambda e: 1e3 * e, length=0.005 * (count - 0.5)) for count in (29, 30))
     assert [len(inverse_dynamics_effort_issues(drives, run)) for run in runs] == [0, 2], "thirty samples are enough"
 
@@ -492,9 +492,9 @@ def test_a_search_without_drifts_finds_a_lateness_alone():
         return np.sin(np.multiply.outer(at, rates))
 
     seen = path(t - 0.2 - 0.02 * (t - 5.0))
-    alone = search_clock_offset_and_drift(path, (0.0, 10.0), t, seen)
+    alone = point_clock_offset_and_drift(path, (0.0, 10.0), t, seen)
     assert alone == (pytest.approx(0.2, abs=5e-3), 0.0)
-    both = search_clock_offset_and_drift(path, (0.0, 10.0), t, seen, drifts=True)
+    both = point_clock_offset_and_drift(path, (0.0, 10.0), t, seen, drifts=True)
     assert both == pytest.approx((0.2, 0.02), abs=1e-4)
 
 
@@ -622,7 +622,7 @@ def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
     seen = np.linalg.norm(np.hypot(moving, 6 * 0.04 * v) / 0.05)
     for seed in range(3):
         recording = swung(drives, size=0.03, seed=seed, **{**SLOW, "rate": rate})
-        found = list(inertial_effort_excitation_issues(drives, recording, USUAL))
+        found = list(slow_motion_excitation_issues(drives, recording, USUAL))
         assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
         for doubt in found:
             assert doubt.limit_violation_ratio == pytest.approx(5.0 / seen, rel=0.02)
@@ -631,11 +631,11 @@ def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
 
 def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(drives):
     slow = swung(drives, size=0.03, **SLOW)
-    (unstated,) = inertial_effort_excitation_issues(drives, with_joints(slow, effort_std=lambda _: None), USUAL)
+    (unstated,) = slow_motion_excitation_issues(drives, with_joints(slow, effort_std=lambda _: None), USUAL)
     assert "noise between samples is 0.049 N m" in unstated.what
-    assert list(inertial_effort_excitation_issues(drives, slow, replace(USUAL, std=1e-4))) == []
-    assert len(list(inertial_effort_excitation_issues(drives, slow, replace(USUAL, std=10.0)))) == 1
-    assert list(inertial_effort_excitation_issues(drives, slow, replace(USUAL, use=False))) == []
+    assert list(slow_motion_excitation_issues(drives, slow, replace(USUAL, std=1e-4))) == []
+    assert len(list(slow_motion_excitation_issues(drives, slow, replace(USUAL, std=10.0)))) == 1
+    assert list(slow_motion_excitation_issues(drives, slow, replace(USUAL, use=False))) == []
 
 
 def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):

@@ -240,7 +240,7 @@ def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendul
 
 
 def test_check_refines_links_and_time_step(carried_out, written):
-    beam = "{length: 0.5, mass: 0.3, radius: 0.01, stiffness_given_as_rigidity: true, clamped_at_base: true}"
+    beam = "{length: 0.5, mass: 0.3, radius: 0.01, values_given_as_rigidities: true, clamped_at_base: true}"
     file = written(
         f"model: {{object: {{kind: segments, named_segments: {{beam: {beam}}}}}, damping: 0.001, gravity: [0, 0, 0]}}\n"
         "parameters: {beam.bend: {initial: 0.5}, beam.twist: {initial: 0.5}}\n"

@@ -221,7 +221,7 @@ ANY_NUMBER = {
     "track.options.filters.floor_height",
     "track.options.filters.floor_margin_above_object_foot",
     "track.options.filters.max_depth_behind_robot_base",
-    "track.options.clock.initial_stamp_minus_joint_time",
+    "track.options.clock_offset.initial_stamp_minus_joint_time",
 }
 
 

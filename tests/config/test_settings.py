@@ -13,7 +13,7 @@ from yid_ocp.config.schema import config_json_schema
 from yid_ocp.config.settings import DiagnosisSettings, ProblemSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
-from yid_ocp.model.objects.cable import Cable, CableOptions
+from yid_ocp.model.objects.cable import CableOptions, ClampedCable
 from yid_ocp.problem import ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton
 
@@ -120,7 +120,8 @@ def test_sections_are_what_their_users_take(written):
 
 
 def test_no_section_repeats_the_options_of_another_package():
-    for section, options in ((ProblemSettings, ProblemOptions), (DiagnosisSettings, Thresholds), (Cable, CableOptions)):
+    problem, diagnosis = (ProblemSettings, ProblemOptions), (DiagnosisSettings, Thresholds)
+    for section, options in (problem, diagnosis, (ClampedCable, CableOptions)):
         assert not set(section.__annotations__) & {field.name for field in dataclasses.fields(options)}
 
 

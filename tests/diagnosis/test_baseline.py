@@ -27,7 +27,7 @@ model:
     kind: segments
     mount: {rpy: [0.0, 1.5707963267948966, 0.0]}
     named_segments:
-      beam: {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_given_as_rigidity: true,
+      beam: {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, values_given_as_rigidities: true,
              clamped_at_base: true, joint_axes: y}
 recordings: {estimate: [bare.h5]}
 parameters:

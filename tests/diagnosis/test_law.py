@@ -19,7 +19,7 @@ from yid_ocp.effects.law import (
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MotorOptions, ServoModelOptions
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MotorModelOptions, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow.build import build_system
@@ -115,7 +115,7 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
 
 
 def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
-    servos = ServoModelOptions(motor=MotorOptions("dc"))
+    servos = ServoModelOptions(motor=MotorModelOptions("dc"))
     plain = pendulum_step(urdf_folder, driven=JOINTS, servos=servos)
     law = torque_law_from_tables("elbow", plain.system, tables(quantities=("command",)))
     with_law = compile_step(plain.system.with_effects([law]), H, use_compiler=False)

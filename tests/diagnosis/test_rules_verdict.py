@@ -275,7 +275,7 @@ def of(label, values, stds, effects=(SPRING,)):
 )
 def test_values_agree_within_their_errors_or_a_part_of_their_size(first, second, agrees):
     one, other = (of("spring@elbow", {"k": value}, {"k": std}) for value, std in (first, second))
-    [entry] = _compare(SPRING, one, other, Thresholds(transfer_z_max=3.3))
+    [entry] = _compare(SPRING, one, other, Thresholds(always_allowed_transfer_z=3.3))
     assert entry.is_consistent is agrees
     assert (entry.effect_label, entry.parameter, entry.unit) == ("spring@elbow", "k", "N m")
     assert (entry.estimation_value, entry.held_out_value) == (first[0], second[0])

@@ -29,7 +29,7 @@ def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):
         "force_prior_std_over_load": 0.2,
         "detectable_unknown_chi2_rise": 40.0,
     }
-    usual, other = found(bench), found(bench, residual_window=1.0, min_log_bayes_factor=6.0, **sizes, **few)
+    usual, other = found(bench), found(bench, residual_test_window=1.0, min_log_bayes_factor=6.0, **sizes, **few)
     assert usual.verdict == other.verdict == "effect"
     longest = [max(round(w.end_time - w.start_time, 6) for w in f.nominal_test.windows) for f in (usual, other)]
     assert longest == [0.5, 1.0]

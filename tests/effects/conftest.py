@@ -20,7 +20,7 @@ from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_ob
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import CableOptions, clamped_cable_system
-from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_reading_function
+from yid_ocp.sensors import PointSensor, PrescribedJointEffortSensor, Sensor, sensor_reading_function
 
 POSTURE = np.array([0.3, 0.8, 0.9])
 H = 0.01
@@ -189,5 +189,6 @@ def all_effects() -> Callable[[System], list[EffectBase]]:
 
 @pytest.fixture(scope="session")
 def sensors() -> SimpleNamespace:
-    arm, effort = PointSensor("points_arm", ("w_T2",), ("w_T2",)), EffortSensor(("left_a", "left_b", "left_c"))
+    arm = PointSensor("points_arm", ("w_T2",), ("w_T2",))
+    effort = PrescribedJointEffortSensor(("left_a", "left_b", "left_c"))
     return SimpleNamespace(camera=CAMERA, arm=arm, effort=effort)

@@ -18,7 +18,7 @@ from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_ob
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.problem import ProblemOptions
 from yid_ocp.problem.evaluation import estimated_initial_state_names, initial_internal_state_offset_bounds
-from yid_ocp.sensors import EffortSensor, PointSensor, PositionSensor, sensor_reading_function
+from yid_ocp.sensors import PointSensor, PositionSensor, PrescribedJointEffortSensor, sensor_reading_function
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
 INERTIA = MASS * (LENGTH**2 / 3 + RADIUS**2 / 4)
@@ -376,7 +376,8 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
 def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
     system, names = hinge(), ("left_a",)
     effect = make_effect(kind, "left_a", system, values)
-    seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in (PositionSensor(names), EffortSensor(names))]
+    sensors = PositionSensor(names), PrescribedJointEffortSensor(names)
+    seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in sensors]
     assert seen == pytest.approx([angle, torque])
     channels = zip(("joints.position.left_a", "joints.effort.left_a"), seen, strict=True)
     back = [effect.true_value_from_reading(channel, ca.SX(reading), ca.SX(3.0)) for channel, reading in channels]

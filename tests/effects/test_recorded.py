@@ -17,7 +17,7 @@ from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
-from yid_ocp.sensors import recorded_camera_pose, sensor_reading_function
+from yid_ocp.sensors import measuring_camera_pose, sensor_reading_function
 from yid_ocp.solvers import MultipleShooting
 
 H, STEPS = 0.01, 24
@@ -197,10 +197,10 @@ def test_what_a_recording_holds(driven) -> None:
     assert recorded_signal_kinds([full]) == {"joints.position", "joints.effort", "camera"}
     assert recorded_signal_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
     arm, camera = full.points
-    assert recorded_camera_pose(arm) is None
-    assert recorded_camera_pose(camera) is not None
+    assert measuring_camera_pose(arm) is None
+    assert measuring_camera_pose(camera) is not None
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
-    assert recorded_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
+    assert measuring_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
     assert "nominal_clock" in recorded_signal_kinds([Recording(points=(unposed,))])
 
 

@@ -12,7 +12,7 @@ from yid_ocp.effects import base as places
 from yid_ocp.effects.base import EffectBase
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import FlexibleSegment, System, flexible_object
-from yid_ocp.model.servos_and_springs import MotorOptions, ServoModelOptions
+from yid_ocp.model.servos_and_springs import MotorModelOptions, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
@@ -27,7 +27,7 @@ def beam() -> System:
     """Panda with a beam on its hand, its joints prescribed."""
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names)
-    segment = FlexibleSegment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_given_as_rigidity=True)
+    segment = FlexibleSegment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, values_given_as_rigidities=True)
     item = flexible_object([segment], name="beam")
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
 
@@ -53,7 +53,7 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     table = {row[0]: row for row in rows[2:]}
     described = {kind.strip() for name in table for kind in name.split(",")}
     assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
-    system, options = baxter_foam_y_system(1), ServoModelOptions(motor=MotorOptions("dc", "sts3215"))
+    system, options = baxter_foam_y_system(1), ServoModelOptions(motor=MotorModelOptions("dc", "sts3215"))
     servos = System.build(system.mechanism, driven=system.driven, servos=options, grasps=system.grasps)
     places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, SIGNALS)}
     places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, SIGNALS)}

@@ -11,8 +11,8 @@ from yid_ocp.inference import kalman
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
+    max_torque_bias_change_in_stds,
     problem_with_whitening_at,
-    torque_bias_change_in_stds,
     torque_bias_estimates_by_recording,
 )
 from yid_ocp.integrator.step import compile_step
@@ -207,9 +207,9 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
     again = problem_with_whitening_at(weighted, problem.initial_unknowns)
     np.testing.assert_allclose(again.episodes[0].input_errors.torque_bias, value)
-    moved = torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
+    moved = max_torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
     assert moved == pytest.approx(value[0] / BIAS)
-    assert torque_bias_change_in_stds(weighted.whitening_filters, [None]) == 0.0
+    assert max_torque_bias_change_in_stds(weighted.whitening_filters, [None]) == 0.0
     ((settled, _),) = torque_bias_estimates_by_recording(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
     assert torque_bias_estimates_by_recording(problem, problem.initial_unknowns) == [None]

@@ -21,11 +21,11 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, System, flexible_object, forward_kinematics
 from yid_ocp.model.flexible import edge_to_edge_transport_rotations
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import init_command_object_factories
+from yid_ocp.model.objects.base import init_object_templates
 from yid_ocp.model.objects.foam_y import foam_y_object, foam_y_segments
 from yid_ocp.model.objects.tapered_rod import TaperedRod
 from yid_ocp.model.urdf import mechanism_to_urdf
-from yid_ocp.workflow.build import build_system, divided_link_parameter_scale
+from yid_ocp.workflow.build import build_system, divided_joint_parameter_scale
 
 
 def stiffness(item):
@@ -60,7 +60,7 @@ def test_unequal_links():
 
 def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
     lengths = [0.1, 0.3, 0.2]
-    shared = {"bend": 2.0, "twist": 1.5, "damping": 0.1, "stiffness_given_as_rigidity": True, "link_lengths": lengths}
+    shared = {"bend": 2.0, "twist": 1.5, "damping": 0.1, "values_given_as_rigidities": True, "link_lengths": lengths}
     trunk = FlexibleSegment("A", 0.0, 0.6, 0.01, clamped_at_base=True, **shared)
     branch = FlexibleSegment("B", 0.0, 0.6, 0.01, parent="A", parent_link_index=1, twist_damping=0.3, **shared)
     held = FlexibleSegment("D", 0.0, 0.6, 0.01, parent="A", clamped_at_base=True, **shared)
@@ -89,7 +89,7 @@ def test_branches_at_inner_links():
 
 
 def test_a_flat_beam_that_bends_one_way():
-    clamped = {"stiffness_given_as_rigidity": True, "clamped_at_base": True}
+    clamped = {"values_given_as_rigidities": True, "clamped_at_base": True}
     beam = FlexibleSegment(
         "B", 0.6, 0.3, links=3, cross_section_size=(0.001, 0.08), joint_axes="y", bend=1.2, **clamped
     )
@@ -264,8 +264,8 @@ def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
     system = build_system(run, link_division=2)
     assert system.parameters["rod.taper"].value == 0.4
     assert len(system.segment_layout("rod").link_joints) == 8
-    assert divided_link_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
+    assert divided_joint_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
     given = {"length": LENGTH, "mass": MASS, "radius": 0.006, "tip_radius": 0.003}
-    made = init_command_object_factories()["tapered_rod"].build(given, 4)
+    made = init_object_templates()["tapered_rod"].build(given, 4)
     assert made.settings == replace(rod(4), joint_axes="xy", gravity_fraction=1.0)
     assert set(made.start_values) == {"rod.bend", "rod.damping"}

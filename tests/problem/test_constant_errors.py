@@ -18,7 +18,7 @@ from yid_ocp.problem.measurements import (
     _estimated_constant_errors,
     subtract_estimated_biases,
     whiten_against_sensor_biases,
-    whitened_measurement_sensitivities_to_biases,
+    whitened_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
@@ -126,7 +126,7 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     counted = problem.whitened_held_out_prediction_residual(0, episode, result).residual
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     plain = np.concatenate([samples.residual_and_jacobian(y).residual for samples, y in pairs])
-    slopes = whitened_measurement_sensitivities_to_biases(episode.measurements)
+    slopes = whitened_sensitivities_to_sensor_errors(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

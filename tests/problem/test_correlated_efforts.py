@@ -31,7 +31,7 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     correlation = np.array([[[1.0, 0.8, -0.3], [0.8, 1.0, 0.1], [-0.3, 0.1, 1.0]]] * 2)
     made = measured(efforts("a", "b", "c"), [0, 1], [0.0, 0.0], [[1.0, 2.0, 3.0], [4.0, NAN, 6.0]])
     made = replace(made, noise_correlation=correlation, weight=made.weight * 2.0)
-    mixing = made.residual_decorrelation_matrix.toarray()
+    mixing = made.output_decorrelation_matrix.toarray()
     np.testing.assert_allclose(mixing, mixing.T, atol=1e-12)
     covariance = np.zeros((5, 5))
     covariance[:3, :3] = correlation[0]
@@ -135,7 +135,7 @@ def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     [samples] = (s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     slopes = samples.weight[:, :, None] * np.diag(linear.reference_std[at])
     assert np.array_equal(samples.sensor.effort_joints, JOINTS)
-    seen = samples.residual_decorrelation_matrix @ slopes[samples.positive_weight_mask]
+    seen = samples.output_decorrelation_matrix @ slopes[samples.positive_weight_mask]
     # but for the first and the last step, of which a node sees half
     np.testing.assert_allclose(found, seen.T @ seen, rtol=0.03)
     assert abs(found[0, 1]) > 0.05 * found.diagonal().min()

@@ -285,7 +285,7 @@ def test_smoothed_values_tell_something_new_twice_a_period():
 def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     """The slowest poles' response has fallen to a thousandth then."""
     step = 0.002
-    settling = LowPassFilter(cutoff).settling_time
+    settling = LowPassFilter(cutoff).end_distortion_duration
     sections = scipy.signal.butter(4, cutoff * 2 * step, output="sos")
     impulse = np.zeros(5000)
     impulse[0] = 1.0
@@ -314,7 +314,7 @@ def test_two_passes_are_one_after_the_other():
     t, values = 0.01 * np.arange(301), np.random.default_rng(1).standard_normal((301, 2))
     once, twice = LowPassFilter(5.0), effort_low_pass_filter(5.0)
     np.testing.assert_allclose(twice(t, values)[80:-80], once(t, once(t, values))[80:-80], atol=1e-3)
-    assert (once.settling_time, twice.settling_time) == pytest.approx((0.574, 0.768), abs=1e-3)
+    assert (once.end_distortion_duration, twice.end_distortion_duration) == pytest.approx((0.574, 0.768), abs=1e-3)
     assert (twice.cutoff, twice.passes) == (5.0, 2)
 
 

@@ -9,7 +9,7 @@ from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 
 from yid_ocp.integrator.step import simulate_rollouts
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions, episode_prediction
-from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
+from yid_ocp.problem.episodes import TorqueAndAngleErrorModel, truncate_episode
 from yid_ocp.problem.model_functions import (
     central_difference_velocity,
     central_difference_velocity_adjoint,
@@ -373,7 +373,7 @@ def test_errors_of_inputs_on_finer_steps_are_held_and_the_reference_lies_between
     rng, reference = np.random.default_rng(0), None if reference is None else np.array(reference)
     noise = rng.standard_normal((3, 3, 1))
     one = np.ones(1)
-    errors = InputErrorModel(one, one, one, np.array([0, 1, 1]), 1.0, False, one, *noise, reference)
+    errors = TorqueAndAngleErrorModel(one, one, one, np.array([0, 1, 1]), 1.0, False, one, *noise, reference)
     fine = errors.on_finer_steps(2)
     assert fine.sample_of_step.tolist() == [0, 0, 1, 1, 1, 1]
     np.testing.assert_array_equal(fine.torque_noise[:, 0], np.repeat(noise[0, :, 0], 2))

@@ -114,13 +114,13 @@ def recorded(urdf: Path) -> Recording:
     mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install 'yid-ocp[blind]'")
     from yid_ocp.virtual.joint_motion import MultisineMotion
     from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml
-    from yid_ocp.virtual.mujoco_simulation import MujocoScene, TrackingController, settle_to_equilibrium
+    from yid_ocp.virtual.mujoco_simulation import MujocoModelAndState, TrackingController, settle_to_equilibrium
 
     system, step = holding(urdf, driven=ARM), 2e-4
     own = "".join(f"<{kind} name='{site}{kind}' site='{site}'/>" for site in ("lower", "w_T1") for kind in KINDS)
     text = mujoco_xml(system, time_step=step).replace("</mujoco>", f"<sensor>{own}</sensor></mujoco>")
     model = mujoco_model_from_mjcf_text(text)
-    scene = MujocoScene.from_compiled_model(system, mujoco, model)
+    scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[[model.joint(name).id for name in ARM]] = list(START.values())
     waves = (np.array([[0.05], [0.06]]), np.array([[1.1], [1.7]]), np.zeros((2, 1)), 0.3)

@@ -20,7 +20,13 @@ from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneou
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Effect, NodeStateSymbols
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.sensors import EffortSensor, PointSensor, RecordedChannelKind, Sensor, sensor_reading_function
+from yid_ocp.sensors import (
+    PointSensor,
+    PrescribedJointEffortSensor,
+    RecordedChannelKind,
+    Sensor,
+    sensor_reading_function,
+)
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 LABEL = "drift@left"
@@ -60,7 +66,7 @@ class Drift(Effect):
 
 POSE = homogeneous_transform(rotation_from_rpy(0.3, -0.2, 1.0), [2.0, 0.5, 0.4])
 CAMERA = PointSensor("points_camera", ("joint", "tip"), ("w_T1", "w_T2"), tuple(map(tuple, POSE)))
-EFFORT = EffortSensor(("left_a", "left_b"))
+EFFORT = PrescribedJointEffortSensor(("left_a", "left_b"))
 NAMES = ("T1.length", "drift@left.gain", "camera_scale@camera.scale", "effort_gain@left_b.inverse")
 
 
@@ -146,10 +152,11 @@ def test_points_along_a_segment(system: System) -> None:
 def test_an_effort_sensor_reads_its_joints_in_its_own_order(system: System) -> None:
     effort = np.arange(1.0, system.n_coordinates + 1)
     a, b = (system.mechanism.joint_index(name) for name in ("left_a", "left_b"))
-    assert read(system, EffortSensor(("left_b", "left_a")), effort=effort) == pytest.approx([effort[b], effort[a]])
+    swapped = PrescribedJointEffortSensor(("left_b", "left_a"))
+    assert read(system, swapped, effort=effort) == pytest.approx([effort[b], effort[a]])
 
 
-@pytest.mark.parametrize("sensor", [EffortSensor(("x9",)), PointSensor("points", ("p",), ("x9",))])
+@pytest.mark.parametrize("sensor", [PrescribedJointEffortSensor(("x9",)), PointSensor("points", ("p",), ("x9",))])
 def test_a_joint_or_frame_that_is_not_there_is_refused(sensor: Sensor, system: System) -> None:
     with pytest.raises(ModelError, match="x9"):
         read(system, sensor)

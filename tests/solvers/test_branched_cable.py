@@ -27,7 +27,7 @@ STD, H, STEPS = 1e-3, 0.01, 200
 @pytest.fixture(scope="module")
 def cable():
     """Makes the problem from a start, the same for all free stiffnesses [N m^2]; recorded by the model at the truth."""
-    how = {"radius": 0.005, "stiffness_given_as_rigidity": True, "damping": 2e-4}
+    how = {"radius": 0.005, "values_given_as_rigidities": True, "damping": 2e-4}
     segments = [
         FlexibleSegment("a", 0.3, 0.03, links=4, clamped_at_base=True, **how),
         FlexibleSegment("b", 0.2, 0.02, links=3, parent="a", rest_rotation=rotation_from_rpy(0.64, 0.0, 0.0), **how),
@@ -92,7 +92,7 @@ FINE, COARSE, DURATION = 12, 5, 3.0
 
 def arm_with_cable(links: int, mode: str) -> System:
     """A UR5 that carries 1 m of cable, bending alone."""
-    how = {"stiffness_given_as_rigidity": True, "clamped_at_base": True}
+    how = {"values_given_as_rigidities": True, "clamped_at_base": True}
     how |= {name: CABLE_TRUTH[f"cable.{name}"] for name in ("bend", "damping")}
     cable = flexible_object(
         [FlexibleSegment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable"

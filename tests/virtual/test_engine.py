@@ -32,7 +32,7 @@ from yid_ocp.virtual.experiment import (
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
-    MujocoScene,
+    MujocoModelAndState,
     SimulationOptions,
     SimulationResult,
     settle_to_equilibrium,
@@ -152,9 +152,9 @@ def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) 
         SimulationOptions(**choices)
 
 
-def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoScene:
+def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoModelAndState:
     """The scene with the joints a tenth of a radian from where the grippers meet another system's object."""
-    scene = MujocoScene.from_compiled_model(
+    scene = MujocoModelAndState.from_compiled_model(
         system, mujoco, mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=time_step))
     )
     scene.data.qpos[:] = scene.model.qpos_spring

@@ -21,7 +21,7 @@ from yid_ocp.export.models import export_support_by_effect, export_support_by_pa
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform
-from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorOptions, ServoModelOptions
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorModelOptions, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
@@ -239,7 +239,7 @@ def test_both_engines_move_alike(servo_arm: System, recording: Recording) -> Non
 
 def test_both_engines_move_a_direct_current_motor_alike() -> None:
     """At its duty's limit a motor gives the limit less its counter-voltage, which a clip of the whole would not."""
-    servos = {kind: ServoModelOptions(motor=MotorOptions(kind)) for kind in ("dc", "ideal")}
+    servos = {kind: ServoModelOptions(motor=MotorModelOptions(kind)) for kind in ("dc", "ideal")}
     systems = {kind: moved_by(own, point_frames=[]) for kind, own in servos.items()}
     limited = ("servo_saturation", "lift", {"limit": 1.3})
     made = played(systems["dc"], InjectedEffect(*limited))
@@ -291,7 +291,7 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
 
 def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_limit_are_not() -> None:
     system = moved_by(
-        ServoModelOptions(motor=MotorOptions("dc", "sts3215"), extra_controller_terms=("derivative", "dead_band"))
+        ServoModelOptions(motor=MotorModelOptions("dc", "sts3215"), extra_controller_terms=("derivative", "dead_band"))
     )
     values = VALUES | {"pan.servo_derivative": 0.3}
     pan = mujoco.MjModel.from_xml_string(mujoco_xml(system, values)).actuator("pan")

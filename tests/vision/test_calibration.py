@@ -22,8 +22,8 @@ from yid_ocp.vision.camera_registration import (
     DEPTH_SCALE_INDEX,
     TRANSLATION_SLICE,
     ArmSurface,
-    CalibrationFrame,
     CalibrationState,
+    StampedCloud,
     _CalibrationEquations,
     robust_gradient_and_hessian,
 )
@@ -97,7 +97,7 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
     motion = options.pop("motion", lively)
     times = 1.0 + (np.arange(frames) + rng.uniform(0.1, 0.9, frames)) * duration / frames
     stamps = times + latency + drift * times + options.pop("late", np.zeros(frames))
-    seen = list(map(CalibrationFrame, stamps.tolist(), clouds(robot, times, rng, motion, scale)))
+    seen = list(map(StampedCloud, stamps.tolist(), clouds(robot, times, rng, motion, scale)))
     clock = options.pop("clock", CameraClockOptions())
     pose = told_pose(turn, shift, rng)
     found = calibration.calibrate_camera(
@@ -146,7 +146,7 @@ def test_slopes_of_the_rows_are_derivatives(robot):
     [cloud] = clouds(robot, [1.7], rng)
     state, arm = CalibrationState(POSE, clock_reference_stamp=1.2), arm_of(robot)
     points = state.measured_to_world_points(cloud)
-    glimpse = CalibrationFrame(1.7, cloud[arm.near_moving_surface_off_grasps_mask(points, 1.7, 0.02)][::7])
+    glimpse = StampedCloud(1.7, cloud[arm.near_moving_surface_off_grasps_mask(points, 1.7, 0.02)][::7])
     rows = arm.linearized_surface_distances(state, glimpse, 0.1, along=True)
     moved = {TRANSLATION_SLICE.start: 1e-4, TRANSLATION_SLICE.start + 2: 1e-4, 0: 1e-4, DEPTH_SCALE_INDEX: 1e-4}
     for k, step in {**moved, CLOCK_OFFSET_INDEX: 1e-3, CLOCK_DRIFT_INDEX: 1e-3}.items():
@@ -289,7 +289,7 @@ def test_refused_where_the_arm_does_not_tell(robot):
     assert "as given" in found.message
     away = look_at_pose([1.9, 0.6, 0.8], [4.0, 0.6, 0.8])
     rng = np.random.default_rng(0)
-    nothing = list(map(CalibrationFrame, (1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng)))
+    nothing = list(map(StampedCloud, (1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng)))
     options = ArmBasedCameraCalibrationOptions(fix_pose=True)
     with pytest.raises(DataError, match="in view in 0 frames"):
         calibration.calibrate_camera(
@@ -304,7 +304,7 @@ def test_refused_where_the_camera_sees_through_the_arm(robot):
     """Another motion than the recorded one: nowhere does the arm lie on the clouds."""
     rng = np.random.default_rng(0)
     times = np.linspace(1.0, 4.0, 4)
-    other = list(map(CalibrationFrame, times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9))))
+    other = list(map(StampedCloud, times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9))))
     with pytest.raises(DataError, match="cannot be calibrated"):
         calibration.calibrate_camera(
             arm_of(robot), other, POSE, rng, ArmBasedCameraCalibrationOptions(), CameraClockOptions()

@@ -85,7 +85,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
 
     for place, moving, link, help_ in (
         (lambda t: [0.5, 0.5, 0.5], False, "", "background"),
-        (lambda t: [t + 0.1, 0.0, 0.2], True, "hand", "extra_meshes"),
+        (lambda t: [t + 0.1, 0.0, 0.2], True, "hand", "bodies_missing_from_urdf"),
         (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
         (lambda t: [3.0, 0.3 * t, 0.5], True, "", "box_lower and box_upper"),
     ):

@@ -70,7 +70,7 @@ def test_an_object_of_segments_on_a_robots_hand(built):
         "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
         "    named_segments:\n"
         "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, "
-        "stiffness_given_as_rigidity: true, clamped_at_base: true}\n"
+        "values_given_as_rigidities: true, clamped_at_base: true}\n"
         "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
         "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
     )
@@ -157,7 +157,7 @@ SEGMENTED = (
     "model:\n  object:\n    kind: segments\n    named_segments:\n"
     "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 2}\n"
     "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, "
-    "stiffness_given_as_rigidity: true, separate_twist_damping: true}\n"
+    "values_given_as_rigidities: true, separate_twist_damping: true}\n"
     "parameters:\n  '*.bend': {initial: 5, bounds: [1, 8]}\n  a.twist: {initial: 2}\n  b.damping: {initial: 0.3}\n"
 )
 

@@ -26,10 +26,10 @@ model:
     mount: {xyz: [0.1, 0.2, 0.3], rpy: [0.0, 1.5707963267948966, 0.0]}
     named_segments:
       beam:
-        {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, stiffness_given_as_rigidity: true,
+        {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, values_given_as_rigidities: true,
          clamped_at_base: true, joint_axes: y}
   frames:
-    mark: {parent_frame: w_beam, position_from_recordings: true}
+    mark: {parent_frame: w_beam, position_from_straight_pose: true}
 recordings: {estimate: [beam.h5]}
 sensors: {points: {std: 1.0e-4}}
 parameters:

@@ -27,7 +27,7 @@ from yid_ocp.data import (
     read_recording,
     write_recording,
 )
-from yid_ocp.model.servos_and_springs import MotorOptions
+from yid_ocp.model.servos_and_springs import MotorModelOptions
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.workflow.build import build_system, free_parameter_names
 
@@ -290,7 +290,7 @@ def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, r
     lerobot_dataset(bench / "arm", made.joints)
     assert main(["init", "package:so101", "arm", "--units", "deg", "--out", "run.yaml"]) == 0
     run = load_config("run.yaml")
-    assert run.model.arms.servo.motor == MotorOptions("dc", "sts3215")
+    assert run.model.arms.servo.motor == MotorModelOptions("dc", "sts3215")
     assert run.model.friction is not None
     assert (run.model.friction.law, run.model.friction.joints) == ("load", made.joint_names[:5])  # the gripper is shut
     assert run.parameters["*.servo_gain_factor"].initial == 16

@@ -25,7 +25,7 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import load_problem
 
-CURVED = "stiffness_given_as_rigidity: true, clamped_at_base: true"
+CURVED = "values_given_as_rigidities: true, clamped_at_base: true"
 
 MODEL = """\
 model:

@@ -174,7 +174,7 @@ def timestamp_correction_advice(late: float, drift: float, middle: float) -> str
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
-def search_clock_offset_and_drift(
+def point_clock_offset_and_drift(
     path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
     """Find the clock offset [s] and relative drift for which measured points are nearest to a known path.

@@ -23,7 +23,7 @@ from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
+from yid_ocp.problem.episodes import TorqueAndAngleErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.options import RefinementKind
 from yid_ocp.solvers import GaussNewton
@@ -190,7 +190,7 @@ class _CoarseWeights:
     """Filter of a coarser rollout, for finer steps of which `ratio` average to one coarse torque."""
 
     coarse: ProcessNoiseWhitener
-    input_error_model: InputErrorModel
+    input_error_model: TorqueAndAngleErrorModel
     ratio: int
 
     def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:

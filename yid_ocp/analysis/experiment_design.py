@@ -27,7 +27,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.sensors import recorded_camera_pose
+from yid_ocp.sensors import measuring_camera_pose
 from yid_ocp.sensors.base import missing_noise_level_error
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
@@ -49,7 +49,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 
 @dataclass(frozen=True)
-class PointObservationSchedule:
+class SinglePointObservationSchedule:
     """Sample times and standard deviations of one frame that a point group observes."""
 
     point_group: str
@@ -77,7 +77,7 @@ class UnchangedExperiment:
     def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Points seen by a camera (None without), frame times [s] and typical std [m], or their defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
-        return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
+        return self._sampling(episode, lambda g: measuring_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Points measured by arms (None without), sample times [s] and typical std [m], or their defaults."""
@@ -91,7 +91,7 @@ class UnchangedExperiment:
             return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
         return None, times, std
 
-    def existing_point_observation_schedules(self, episode: Episode) -> list[PointObservationSchedule]:
+    def existing_point_observation_schedules(self, episode: Episode) -> list[SinglePointObservationSchedule]:
         """Observation schedule of every point measured in a recording."""
         found = []
         for group in _used_point_groups(self.problem, episode):
@@ -102,7 +102,7 @@ class UnchangedExperiment:
                 if self.problem.system.mechanism.has_frame(frame):
                     at = group.names.index(point)
                     seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                    found.append(PointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
+                    found.append(SinglePointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def _std(self, group: PointGroup) -> Array:
@@ -192,7 +192,7 @@ class VariantPositionSensitivities:
     feasibility_notes: tuple[str, ...] = ()  # obstacles on a real robot, such as joint limits
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
-    def fisher_information_with_prior(self, views: Sequence[Sequence[PointObservationSchedule]]) -> Array:
+    def fisher_information_with_prior(self, views: Sequence[Sequence[SinglePointObservationSchedule]]) -> Array:
         """Fisher information (nx, nx) of observations plus that of the prior. `views` has one list per recording."""
         total = self.prior_information.copy()
         nx = len(total)
@@ -206,7 +206,7 @@ class VariantPositionSensitivities:
                 total -= own[:nx, nx:] @ scipy.linalg.solve(own[nx:, nx:], own[nx:, :nx], assume_a="pos")
         return total
 
-    def _of(self, episode: int, grid: TimeGrid, view: PointObservationSchedule) -> Array:
+    def _of(self, episode: int, grid: TimeGrid, view: SinglePointObservationSchedule) -> Array:
         key = (episode, view.point_group, view.frame, view.times.tobytes(), view.std.tobytes())
         if key not in self._known:
             inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)

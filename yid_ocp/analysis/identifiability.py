@@ -62,7 +62,7 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that
 
 
 @dataclass(frozen=True)
-class ParameterIdentifiability:
+class ParameterStdsAndVerdict:
     """Value, standard deviations and identifiability verdict of one parameter.
 
     The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). `interval` is
@@ -102,7 +102,7 @@ class IdentifiabilityResult(ReprMixin):
     correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless.
     """
 
-    parameters: Mapping[str, ParameterIdentifiability]
+    parameters: Mapping[str, ParameterStdsAndVerdict]
     parameter_names: tuple[str, ...]  # in the order of the matrices
     correlations: Array  # shape (p, p), NaN in rows of parameters that nothing informs
     fisher_information: Array  # for relative changes, nuisances eliminated, shape (p, p)
@@ -192,7 +192,7 @@ def identifiability(
     for name, value, scale, alone in zip(names, x[view.chosen], view.scale, view.alone, strict=True):
         entry, relative = judged[name], 1.0 / float(alone) if alone > 0 else math.inf
         sizes = entry.std, entry.std / float(scale), relative
-        parameters[name] = ParameterIdentifiability(float(value), entry.unit, *sizes, entry.verdict, entry.interval)
+        parameters[name] = ParameterStdsAndVerdict(float(value), entry.unit, *sizes, entry.verdict, entry.interval)
     return IdentifiabilityResult(parameters, names, correlations, information, directions, nuisances, chi2, profiles)
 
 

@@ -14,8 +14,8 @@ import scipy.interpolate
 
 from yid_ocp.analysis.clock_checks import (
     PositionsAtTimesFunction,
+    point_clock_offset_and_drift,
     robot_held_point_clock_issues,
-    search_clock_offset_and_drift,
     timestamp_correction_advice,
 )
 from yid_ocp.analysis.joint_checks import RecordedJointsModel, known_effect_config_line
@@ -158,14 +158,14 @@ def _changed_times(
         inside = (at >= knots[0]) & (at <= knots[1])
         return _rms(seen[inside] - path(at[inside]))
 
-    late, _ = search_clock_offset_and_drift(path, knots, t, seen)
+    late, _ = point_clock_offset_and_drift(path, knots, t, seen)
     error = left(late, 0.0)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
         return
-    late, drift = search_clock_offset_and_drift(path, knots, t, seen, drifts=True)
+    late, drift = point_clock_offset_and_drift(path, knots, t, seen, drifts=True)
     error = left(late, drift)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words = f"taken {late:+.3g} s from the joints, by a clock that runs {1e3 * drift:+.3g} parts per thousand fast,"

@@ -20,7 +20,7 @@ from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_fr
 from yid_ocp.integrator.step import step_derivatives_along_rollout
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import InputErrorModel
+from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors.joints import PositionSensor
 
@@ -109,7 +109,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
     return np.zeros((0, len(x) + blur.shape[2]))
 
 
-def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorModel, slopes: Array) -> Array:
+def _low_rank_error_sensitivity(course: NominalTrajectory, errors: TorqueAndAngleErrorModel, slopes: Array) -> Array:
     """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors."""
     motion = _Motion(course, errors)
     rng = np.random.default_rng(0)
@@ -134,7 +134,7 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorMod
 class _Motion:
     """Changes of the state by errors of unit standard deviation: initial, per sample, per step, and constant."""
 
-    def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
+    def __init__(self, course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
         shift = course.model_functions.effect_momentum_shift
         momentum = shift.momentum_derivative_by_previous_torque(course.theta)

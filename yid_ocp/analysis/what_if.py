@@ -15,7 +15,7 @@ from yid_ocp.analysis.experiment_design import (
     CAMERA_GROUP,
     MECHANICAL_CHANGE_DESCRIPTIONS,
     MechanicalVariantSensitivityBuilder,
-    PointObservationSchedule,
+    SinglePointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
     measurable_points,
@@ -246,7 +246,7 @@ class _Outcomes:
 
     def _views(
         self, episode: Episode, changes: Sequence[ExperimentChange], layout: VariantPositionSensitivities
-    ) -> list[PointObservationSchedule]:
+    ) -> list[SinglePointObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_point_group_times_and_std(episode)
         arm, arm_times, arm_std = setting.arm_point_group_times_and_std(episode)
@@ -255,8 +255,8 @@ class _Outcomes:
         if rate is not None:
             times = uniform_sample_times(episode.grid, rate)
 
-        def look(frame: str) -> PointObservationSchedule:
-            return PointObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
+        def look(frame: str) -> SinglePointObservationSchedule:
+            return SinglePointObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
 
         # a point that the second arm holds is measured by that arm
         held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
@@ -268,7 +268,7 @@ class _Outcomes:
         views += [look(change.camera_frame) for change in changes if change.camera_frame]
         feels = [*sorted(held - before), *(change.arm_frame for change in changes if change.arm_frame)]
         felt = np.full((len(arm_times), 3), arm_std)
-        return views + [PointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
+        return views + [SinglePointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
 
 
 def _relative_stds_and_gain(layout: VariantPositionSensitivities, information: Array) -> tuple[dict[str, float], float]:

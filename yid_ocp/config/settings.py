@@ -30,7 +30,7 @@ from yid_ocp.planning.joint_paths import PlanOptions
 from yid_ocp.problem.options import ExcessResidualCriteria, ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
-from yid_ocp.virtual.experiment import VirtualArmOptions
+from yid_ocp.virtual.experiment import VirtualArmImperfections
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.surface_meshes import ExtraMesh
 
@@ -50,7 +50,7 @@ _GraspKind = Literal["point", "axis", "weld"]
 class _FrameSettings(MountSettings):
     """An additional named frame on the robot, the object or in the world, such as a tool tip or a marker."""
 
-    position_from_recordings: Annotated[
+    position_from_straight_pose: Annotated[
         bool,
         OptionInfo(
             "whether the dataset `straight` of each recording gives the position of the point of this name, "
@@ -188,7 +188,7 @@ class _ModelSettings:
     ] = None
     gravity: Annotated[_Vector3, OptionInfo("gravity in the world frame", "m/s^2")] = (0.0, 0.0, -9.81)
     measured_points: Annotated[_Names | None, OptionInfo("sensor frames such as T1:40%; default: segment tips")] = None
-    extra_meshes: Annotated[
+    bodies_missing_from_urdf: Annotated[
         tuple[ExtraMesh, ...],
         OptionInfo("bodies that a camera sees and the URDF lacks, such as a table; `track` removes their points"),
     ] = ()
@@ -281,7 +281,7 @@ class ProblemSettings(ProblemOptions):
     use_compiler: Annotated[bool, OptionInfo("whether to compile the step if there is a C compiler")] = True
 
     @property
-    def time_step_or_default(self) -> float:
+    def time_step_or_10_ms(self) -> float:
         """Configured time step [s], or 10 ms for `auto`, which needs a recording to choose the step."""
         return 0.01 if self.time_step == "auto" else self.time_step
 
@@ -435,8 +435,8 @@ class RunSettings:
     diagnosis: Annotated[DiagnosisSettings, OptionInfo("candidates and thresholds of `diagnose`")] = DiagnosisSettings()
     track: Annotated[_TrackSettings, OptionInfo("tracking of points in a camera's frames")] = _TrackSettings()
     plan: Annotated[_PlanSettings, OptionInfo("the motion that `plan` computes")] = _PlanSettings()
-    virtual_arm: Annotated[VirtualArmOptions, OptionInfo("properties of the virtual arms of `blind`")] = field(
-        default_factory=VirtualArmOptions
+    virtual_arm: Annotated[VirtualArmImperfections, OptionInfo("properties of the virtual arms of `blind`")] = field(
+        default_factory=VirtualArmImperfections
     )
     output: Annotated[OutputSettings, OptionInfo("run folders and reports")] = OutputSettings()
     name: str = "run"  # stem of the configuration file

@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period
-from yid_ocp.data.readers.base import merge_on_fastest_clock
+from yid_ocp.data.readers.base import joints_on_fastest_clock
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 
@@ -191,7 +191,7 @@ def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tupl
             what = f"the joint '{joint}' is in {owners[joint]} and in {source}"
             hint = "import them one by one as recordings of their own, or keep other joints with --joints"
             raise DataError(what, where=where, allowed="every joint in one file only", hint=hint)
-    merged, notes = merge_on_fastest_clock(groups, where)
+    merged, notes = joints_on_fastest_clock(groups, where)
     rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
     return merged, notes if len(groups) == 1 else (f"joints: {rates}", *notes)
 

@@ -141,7 +141,7 @@ class DiagnosisBaseline:
 
     def prediction_errors_with_and_without_effects(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> CounterfactualPredictionErrors | None:
+    ) -> EffectRemovalAndAdditionErrors | None:
         """Test found effects on recordings made with and without them, such as before and after a repair.
 
         Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
@@ -162,8 +162,8 @@ class DiagnosisBaseline:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return CounterfactualPredictionErrors(removed, _nothing(present, error.what))
-        return CounterfactualPredictionErrors(removed, _predicted(last, present, then, {**then, **effects}))
+            return EffectRemovalAndAdditionErrors(removed, _nothing(present, error.what))
+        return EffectRemovalAndAdditionErrors(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
@@ -213,7 +213,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class CounterfactualPredictionErrors:
+class EffectRemovalAndAdditionErrors:
     """Prediction errors on reference recordings without the effects, and on diagnosed recordings with the effects."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model

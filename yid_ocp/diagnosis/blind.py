@@ -518,7 +518,7 @@ def true_effects_gap_closure(
         for quantity in effect.definitions:
             reported = true[effect.label].get(quantity.reported_name_and_unit[0])
             if reported is not None:
-                start[f"{effect.label}.{quantity.name}"] = quantity.to_internal(reported)
+                start[f"{effect.label}.{quantity.name}"] = quantity.internal_from_reported_value(reported)
     # whitened as the nominal fit, like all models that it is compared with
     fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
     if fit is None or len(chosen) < len(true):

@@ -339,7 +339,7 @@ _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
     "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),
     "explained": _CalibrationRule("min_explained_fraction", _of("explained"), "named", "least", 0.75),
-    "carried": _CalibrationRule("transfer_z_max", _of("carried"), "named", "most", 3.0),
+    "carried": _CalibrationRule("always_allowed_transfer_z", _of("carried"), "named", "most", 3.0),
 }
 """All rules, by what they look at."""
 _STATISTIC_TEXTS = {

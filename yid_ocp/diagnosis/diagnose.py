@@ -418,7 +418,7 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
     """The null test of a residual after a fit of the given number of parameters."""
     samples, level = null_test.channels_with_residual_indices(problem), limits.significance_level
-    return null_test.residual_chi2_null_test(samples, residual, fitted, level, limits.residual_window)
+    return null_test.residual_chi2_null_test(samples, residual, fitted, level, limits.residual_test_window)
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors, EarlierRunsComparison
+from yid_ocp.diagnosis.baseline import EarlierRunsComparison, EffectRemovalAndAdditionErrors
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
@@ -22,7 +22,7 @@ from yid_ocp.display import ReprLineAndTableRows, ReprMixin, abbreviated_names_t
 from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_by_name, to_json_types
 from yid_ocp.inference import null_test
-from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult, main_gap_locations
+from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult, largest_gap_locations
 from yid_ocp.inference.uncertainty import priors_that_determine_unknown
 
 _EFFECT = "kind location"
@@ -58,7 +58,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
     baseline_comparison: EarlierRunsComparison | None = None
-    counterfactual: CounterfactualPredictionErrors | None = None
+    counterfactual: EffectRemovalAndAdditionErrors | None = None
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
@@ -299,7 +299,7 @@ def _gap(result: DiagnosisResult) -> str:
 
 def _places(result: DiagnosisResult) -> str:
     """Sentence on the gap's locations, with inseparable locations together."""
-    where = [place for place in main_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
+    where = [place for place in largest_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
     named = [f"{' or '.join([p.location, *p.indistinguishable_from])} ({100 * p.gap_share:.0f} %)" for p in where]
     if not named:
         return "These data cannot locate it."
@@ -323,7 +323,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     if result.accepted_effects:
         text.append(f"The probability that this names the cause is {100 * result.probability:.0f} %.")
     if result.verdict == "unknown":
-        explained, enough = 100 * result.explained_fraction, 100 * result.required_explained_fraction(limits)
+        explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
         apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
         reasons = {
             "none": "No effect tried is significant and closes enough of it.",

@@ -186,7 +186,7 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
 
 def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """A history up to the recording's overspeed, without the ends distorted by a filter; None if too short."""
-    until = ends._end_of(history.recording) - effort_low_pass_filter(history.filter_cutoff).settling_time
+    until = ends._end_of(history.recording) - effort_low_pass_filter(history.filter_cutoff).end_distortion_duration
     keep = np.flatnonzero(history.t <= until)
     return None if len(keep) < 10 else history.subset_at_indices(keep)
 
@@ -473,7 +473,7 @@ def _counting(
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(end) and is_effort:
-        hidden |= t > end - effort_low_pass_filter(cutoff).settling_time
+        hidden |= t > end - effort_low_pass_filter(cutoff).end_distortion_duration
     smear = 1 / cutoff if is_effort else 0.0
     for event in own:
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)

@@ -24,9 +24,9 @@ from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_factor
 from yid_ocp.inference.whitening import (
+    max_torque_bias_change_in_stds,
     problem_relinearized_at_torque_bias,
     problem_with_sensor_noise_only,
-    torque_bias_change_in_stds,
 )
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
@@ -318,7 +318,7 @@ def _attempt(
     if found is None or not effects:
         return found
     moving = found[0]
-    if torque_bias_change_in_stds(problem.problem.whitening_filters, moving.whitening_filters) < _RELINEARIZE_Z:
+    if max_torque_bias_change_in_stds(problem.problem.whitening_filters, moving.whitening_filters) < _RELINEARIZE_Z:
         return found
 
     def evaluate(

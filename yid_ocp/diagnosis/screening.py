@@ -29,7 +29,7 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import (
-    ResidualChannel,
+    ChannelResidualIndices,
     channels_with_residual_indices,
     chi2_p_value,
     encoder_noise_residual_factor,
@@ -153,7 +153,7 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannel]) -> Array:
+def _covariance_of_scores(columns: Array, series: Sequence[ChannelResidualIndices]) -> Array:
     """X' Omega X under the noise's known autocorrelation."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
@@ -163,7 +163,7 @@ def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannel]) -> 
     return (total + total.T) / 2
 
 
-def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannel]) -> Array:
+def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ChannelResidualIndices]) -> Array:
     """Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
@@ -178,7 +178,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 
 def _score_candidates(
     point: ProjectedCandidatesLinearization,
-    series: Sequence[ResidualChannel],
+    series: Sequence[ChannelResidualIndices],
     visible: Sequence[CandidateDetectability],
 ) -> tuple[CandidateScore, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
@@ -210,7 +210,7 @@ def _promised(information: Array, slope: Array, room: Array) -> tuple[Array, flo
     return step, float((2 * slope - information @ step) @ step)
 
 
-def _score(signature: _EffectSignature, residual: Array, series: Sequence[ResidualChannel]) -> CandidateScore:
+def _score(signature: _EffectSignature, residual: Array, series: Sequence[ChannelResidualIndices]) -> CandidateScore:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = -(x.T @ residual)
     room = _room(effect)

@@ -34,7 +34,7 @@ class Thresholds(SmootherOptions):
         float, Gt(0), Lt(1), OptionInfo("significance level of a gap, of all residuals or along a candidate")
     ] = 1e-4
     min_samples_per_unknown: Annotated[float, Gt(0), OptionInfo("effective samples needed for every unknown")] = 3.0
-    residual_window: Annotated[float, Gt(0), OptionInfo("length of the windows of the residual", "s")] = (
+    residual_test_window: Annotated[float, Gt(0), OptionInfo("length of the windows of the residual", "s")] = (
         RESIDUAL_WINDOW_SECONDS
     )
     # which candidates are worth a refit
@@ -58,7 +58,7 @@ class Thresholds(SmootherOptions):
     transfer_rtol: Annotated[
         float, Ge(0), OptionInfo("relative difference by which an effect may differ on held-out recordings")
     ] = 0.3
-    transfer_z_max: Annotated[float, Gt(0), OptionInfo("difference that is always allowed [stds]")] = 4.5
+    always_allowed_transfer_z: Annotated[float, Gt(0), OptionInfo("difference that is always allowed [stds]")] = 4.5
     min_explained_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("fraction of the smoother's decrease that effects must reach")
     ] = 0.75

@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, Selected
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
-from yid_ocp.inference.smoother import GapLocation, main_gap_locations
+from yid_ocp.inference.smoother import GapLocation, largest_gap_locations
 from yid_ocp.problem.options import ExcessResidualCriteria
 
 UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
@@ -149,7 +149,7 @@ class Judgement:
         held_out = self.gap_closure.ci_low if self.independent_effect_count == 1 else 0.0
         return max(self.explained_fraction, held_out)
 
-    def required_explained_fraction(self, limits: Thresholds) -> float:
+    def required_total_explained_fraction(self, limits: Thresholds) -> float:
         """Smallest explained fraction of the gap at which the selected effects are accepted.
 
         For k independent effects it is 1 - (1 - `min_explained_fraction`)^k: each must explain that part of the
@@ -161,12 +161,12 @@ class Judgement:
 def _verdict_and_reason(
     said: Judgement, has_gap: bool, are_data_sufficient: bool, limits: Thresholds
 ) -> tuple[str, UnknownVerdictReason]:
-    """The verdict, and the first reason why no effect is accepted. See `required_explained_fraction`."""
+    """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`."""
     if not are_data_sufficient:
         return "insufficient_data", ""
     if not said.selected_effects:
         return ("unknown", "none") if has_gap else ("no_gap", "")
-    if said.fitted_or_held_out_explained_fraction < said.required_explained_fraction(limits):
+    if said.fitted_or_held_out_explained_fraction < said.required_total_explained_fraction(limits):
         return "unknown", "little"
     if said.failed_transfer_checks:
         return "unknown", "stand_in"
@@ -193,7 +193,7 @@ def judge(
     fits: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     if located is not None:
-        places = [place.location for place in main_gap_locations(located.locations)]
+        places = [place.location for place in largest_gap_locations(located.locations)]
         fits, added = select_effects(search, nominal, evidence.screening, places, evidence.has_left_baseline)
     finished("refits")
     carried: tuple[EffectAmplitudeTransferCheck, ...] = ()
@@ -219,7 +219,7 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
         return 0.0
     explained = 0.0 if said.failed_transfer_checks else said.fitted_or_held_out_explained_fraction
     unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
-    margin = math.log((1.0 - said.required_explained_fraction(limits)) / unexplained)
+    margin = math.log((1.0 - said.required_total_explained_fraction(limits)) / unexplained)
     return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
 
 
@@ -267,7 +267,7 @@ def _compare(
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
         apart, spread = entry.estimate_difference_and_std
         # an unknown standard deviation is no evidence against transfer
-        sure = math.isfinite(spread) and apart > limits.transfer_z_max * spread
+        sure = math.isfinite(spread) and apart > limits.always_allowed_transfer_z * spread
         found.append(replace(entry, is_consistent=not sure or apart <= limits.transfer_rtol * size * width[name]))
     return found
 

@@ -39,7 +39,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
         said = unknown_name_error_arguments(location, places) if places else said
         what = f"the effect {kind} is not possible at '{location}'"
         raise ModelError(what, where=f"{kind}@{location}", **said)
-    return base.build_effect(kind, location, system, values or {})
+    return base.effect_at_checked_location(kind, location, system, values or {})
 
 
 def signal_kinds_required_by_any_effect() -> frozenset[str]:

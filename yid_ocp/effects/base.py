@@ -57,7 +57,7 @@ class ParameterDefinition:
         name, _, unit = self.reported_reciprocal.partition(" ")
         return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
 
-    def to_internal(self, value: float) -> float:
+    def internal_from_reported_value(self, value: float) -> float:
         """Convert a nonzero reported value to the internal value, which may be a reciprocal power of it."""
         return value**-self.reciprocal_power if self.reported_reciprocal else value
 
@@ -171,7 +171,7 @@ class EffectBase(Effect):
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
-def build_effect(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
+def effect_at_checked_location(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
     """Build an effect of a registered kind at a location that `make_effect` has checked."""
     cls, label = EFFECTS[kind], f"{kind}@{location}"
     definitions = cls.parameter_definitions(location, system)
@@ -187,7 +187,7 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
             if not (value > 0 or (signed and value < 0)):
                 allowed = f"{'a number other than zero' if signed else 'a positive number'} {unit}"
                 raise ConfigError(f"{name} = {value}", where=label, allowed=allowed)
-            value = definition.to_internal(value)
+            value = definition.internal_from_reported_value(value)
         given[definition.name] = float(value)
     entries = (
         Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral_value), q.unit, q.lower, q.upper, q.description)

@@ -131,7 +131,7 @@ class FeatureExportSupport:
     how: str
 
     @property
-    def is_lost(self) -> bool:
+    def loses_motion_or_force(self) -> bool:
         """Whether the format omits a feature that changes motion or forces. Effects on sensors alone do not count."""
         return self.status == "not representable" and self != _READING
 

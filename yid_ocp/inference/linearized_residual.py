@@ -18,7 +18,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.problem.model_functions import ModelFunctions, TimeGridStateValues
+from yid_ocp.problem.model_functions import ModelFunctions, NodeStateValues
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class NominalTrajectory:
     rollout: Rollout
     measurements: Sequence[SensorMeasurements]
     tracking_feedback: TrackingFeedback | None
-    state_values_at_nodes: TimeGridStateValues
+    state_values_at_nodes: NodeStateValues
     initial_state_by_angles: Array
     initial_state_by_torque: Array
 

@@ -31,7 +31,7 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
 @dataclass(frozen=True)
-class ResidualChannel:
+class ChannelResidualIndices:
     """Sample times of one scalar sensor output, and the samples' indices in the residual vector."""
 
     recording: str
@@ -106,7 +106,7 @@ def chi2_p_value(chi2: float, degrees: float) -> float:
 
 
 def residual_chi2_null_test(
-    series: Sequence[ResidualChannel],
+    series: Sequence[ChannelResidualIndices],
     residual: Array,
     parameters: int,
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
@@ -202,11 +202,11 @@ def bonferroni_corrected_min_test_p_value(tests: Sequence[NullTestResult]) -> fl
 
 
 def _windows(
-    series: Sequence[ResidualChannel], residual: Array, level: float, length: float
+    series: Sequence[ChannelResidualIndices], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
     raw: list[tuple[str, str, float, float]] = []
     p_values: list[float] = []
-    merged: dict[tuple[str, str], list[ResidualChannel]] = {}
+    merged: dict[tuple[str, str], list[ChannelResidualIndices]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
     for (recording, channel), own in merged.items():
@@ -243,9 +243,9 @@ def times_since_recording_start(episode: Episode, samples: SensorMeasurements) -
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
+def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelResidualIndices, ...]:
     """Sample times and residual indices of every scalar sensor output of every recording."""
-    series: list[ResidualChannel] = []
+    series: list[ChannelResidualIndices] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):
             t = times_since_recording_start(episode, samples)
@@ -262,7 +262,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[Residual
                 seen = samples.positive_weight_mask[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
-                    series.append(ResidualChannel(*text, t[seen], place[seen, column], autocorrelation))
+                    series.append(ChannelResidualIndices(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
 
 

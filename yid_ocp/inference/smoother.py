@@ -444,7 +444,7 @@ class GapLocation:
     indistinguishable_from: tuple[str, ...] = ()  # locations that the data cannot distinguish from this one
 
 
-def main_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
+def largest_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
     """Select the first three locations of `where` with over 10 % of the gap, or only the first if none has."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 

@@ -48,7 +48,7 @@ from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_to
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
 
@@ -89,7 +89,7 @@ class WhiteningFilter:
     """Kalman filter that whitens the residual of a recording, linearized along one rollout."""
 
     filter_steps: tuple[_FilterPart, ...]  # all steps, and the last node
-    input_error_model: InputErrorModel  # includes the values of b and w at the linearisation
+    input_error_model: TorqueAndAngleErrorModel  # includes the values of b and w at the linearisation
     initial_covariance: Array  # covariance of (d, w, b) before all measurements, shape (na, na)
     state_mask: BoolArray  # states contained in d, shape (nx,)
     torque_bias_std: Array  # standard deviation of b after all measurements, shape (nu,) [N m]
@@ -154,7 +154,7 @@ class WhiteningFilter:
         return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known, white is not None)
 
 
-def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) -> WhiteningFilter:
+def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> WhiteningFilter:
     """The whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     slopes = ResidualDerivativesByStateAndEffort.from_nominal_trajectory(course)
@@ -179,7 +179,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
 
 def _filter_steps(
     course: NominalTrajectory,
-    errors: InputErrorModel,
+    errors: TorqueAndAngleErrorModel,
     kept: IntArray,
     slopes: ResidualDerivativesByStateAndEffort,
     rows_of_node: Sequence[IntArray],
@@ -237,7 +237,7 @@ def _filter_steps(
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
     """Constant torque errors (nu,) [N m] of the driven joints, estimated from the prediction `result` of an episode."""
     return whitening.whiten_and_estimate_torque_bias(
-        _plain(episode, result)[:, None], result.torque_correction_and_sensitivity
+        _plain(episode, result)[:, None], result.feedback_torque_and_sensitivity
     )[1][:, 0]
 
 
@@ -284,7 +284,7 @@ def _about_smoothed(
     """Episode with smoothed torque errors and, with encoders, the smoothed motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
-    found = before._smooth_input_errors(_plain(episode, result), result.torque_correction_and_sensitivity)
+    found = before._smooth_input_errors(_plain(episode, result), result.feedback_torque_and_sensitivity)
     own = predictor.theta_with_episode_values(episode, theta)
     errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
     errors = _behind_effects(predictor, episode, own, errors)
@@ -299,8 +299,8 @@ def _about_smoothed(
 
 
 def _behind_effects(
-    predictor: EpisodePredictor, episode: Episode, theta: Array, errors: InputErrorModel
-) -> InputErrorModel:
+    predictor: EpisodePredictor, episode: Episode, theta: Array, errors: TorqueAndAngleErrorModel
+) -> TorqueAndAngleErrorModel:
     """The same errors with torque noise referred to the readings, which effects may multiply by a factor."""
     corrections, nu = predictor.model_functions.input_corrections, errors.torque_noise.shape[1]
     read = errors.torque_noise
@@ -402,7 +402,7 @@ def problem_without_input_errors(problem: EstimationProblem) -> EstimationProble
 
 
 def _with_errors(
-    problem: EstimationProblem, changed: Callable[[InputErrorModel], InputErrorModel | None]
+    problem: EstimationProblem, changed: Callable[[TorqueAndAngleErrorModel], TorqueAndAngleErrorModel | None]
 ) -> EstimationProblem:
     def without(episode: Episode) -> Episode:
         return replace(episode, input_errors=episode.input_errors and changed(episode.input_errors))
@@ -468,7 +468,7 @@ def _settled(
     return made
 
 
-def torque_bias_change_in_stds(
+def max_torque_bias_change_in_stds(
     some: Sequence[ProcessNoiseWhitener | None], others: Sequence[ProcessNoiseWhitener | None]
 ) -> float:
     """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""

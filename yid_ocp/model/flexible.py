@@ -52,16 +52,16 @@ class FlexibleSegment:
     link_rest_rotations: Sequence[ArrayLike] | None = None
     """Rest rotation of each later link relative to the previous link (a measured undeformed shape)."""
     bend: float = 3.0
-    """Bending stiffness of every joint [N m/rad]; N m^2 (damping: N m^2 s) if `stiffness_given_as_rigidity`."""
+    """Bending stiffness of every joint [N m/rad]; N m^2 (damping: N m^2 s) if `values_given_as_rigidities`."""
     twist: float = 3.0
     damping: float = 0.05
     """Damping of every joint [N m s/rad]."""
     twist_damping: float | None = None
     """Damping of the twists; default: `damping`."""
-    stiffness_given_as_rigidity: bool = False
+    values_given_as_rigidities: bool = False
     """Whether stiffness = 2/(a + b) times the value, for a joint between links of lengths a and b (2/a if clamped)."""
     clamped_at_base: bool = False
-    """Whether it starts at a rigid wall or clamp, not a parent's link; matters if `stiffness_given_as_rigidity`."""
+    """Whether it starts at a rigid wall or clamp, not a parent's link; matters if `values_given_as_rigidities`."""
     joint_axes: str = "xyz"
     """Rotation axes of each joint, base to tip. About the other axes the segment is rigid."""
     cross_section_size: tuple[float, float] | None = None
@@ -70,7 +70,7 @@ class FlexibleSegment:
     """Whether each link has a length parameter, for markers that move between recordings; masses do not change."""
     clamped_edge_length: float | None = None
     """Length of a flexible edge that a clamp keeps straight before a root segment [m]. With
-    `stiffness_given_as_rigidity`, the first joint includes half of it."""
+    `values_given_as_rigidities`, the first joint includes half of it."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravi
         parent, placement = carrier.joint_index, carrier.placement @ turned
         # rigidities are converted to stiffnesses
         factor = ca.SX(1)
-        if segment.stiffness_given_as_rigidity:
+        if segment.values_given_as_rigidities:
             both = length if before is None else length + before
             factor = (2 if before is not None or segment.clamped_at_base else 1) / both
         links.append(tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_axes))
@@ -254,7 +254,7 @@ def _cross_section(own: Mapping[str, Parameter]) -> tuple[ca.SX, ca.SX, ca.SX]:
 
 
 def _segment_parameters(segment: FlexibleSegment) -> dict[str, Parameter]:
-    per, rate = ("N m^2", "N m^2 s") if segment.stiffness_given_as_rigidity else ("N m/rad", "N m s/rad")
+    per, rate = ("N m^2", "N m^2 s") if segment.values_given_as_rigidities else ("N m/rad", "N m s/rad")
     length = segment.length if segment.link_lengths is None else float(np.sum(segment.link_lengths))
     small, shares = 1e-9, enumerate(_length_shares(segment))
     rows = [("length", length, "m", small, "length of the segment")]

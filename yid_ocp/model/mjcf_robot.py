@@ -23,7 +23,7 @@ _JOINT_TYPES = {2: "prismatic", 3: "revolute"}
 _JOINT_EQUALITY, _WELD_EQUALITY, _SITE_OBJECT, _FREE_JOINT, _WORLD = 2, 1, 6, 0, "world"
 
 
-def parse_mjcf(file: Path) -> SimpleNamespace:
+def mjcf_robot_description(file: Path) -> SimpleNamespace:
     """Read name, links and joints of an MJCF file in the form that `read_urdf` uses. Omitted elements are logged.
 
     Each body becomes a link, and each site a frame. The inertia of a body is its `inertial` element or, without this
@@ -53,7 +53,7 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     """Nonzero constants of an MJCF file's joints, by joint and name. For other files the result is empty.
 
     Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
-    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `parse_mjcf`.
+    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `mjcf_robot_description`.
     """
     if file.suffix.lower() != ".xml" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}

@@ -101,7 +101,7 @@ MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
 
 
 @dataclass(frozen=True)
-class MotorOptions:
+class MotorModelOptions:
     """Settings of a servo's motor. The kind is `ideal` or `dc`; a preset holds published data of a dc motor."""
 
     kind: Annotated[
@@ -140,7 +140,7 @@ class ServoModelOptions:
     has_gravity_compensation: Annotated[
         bool, OptionInfo("whether the controller compensates the robot's weight, so that the servos need not")
     ] = False
-    motor: Annotated[MotorOptions, OptionInfo("motor of every servo")] = MotorOptions()
+    motor: Annotated[MotorModelOptions, OptionInfo("motor of every servo")] = MotorModelOptions()
     extra_controller_terms: Annotated[
         tuple[_FirmwareTerm, ...],
         OptionInfo(

@@ -34,7 +34,7 @@ from yid_ocp.model.mechanism import (
     snap_near_integer_entries,
     transform_from_xyz_rpy,
 )
-from yid_ocp.model.mjcf_robot import parse_mjcf
+from yid_ocp.model.mjcf_robot import mjcf_robot_description
 from yid_ocp.model.parameters import Parameter, Parameters
 
 _UNLIMITED_VALUE = 1e9  # represents "no limit" where URDF requires a number
@@ -195,7 +195,7 @@ def _parsed(file: Path) -> SimpleNamespace:
     try:
         robot = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot()
         if robot.tag == "mujoco":
-            return parse_mjcf(file)
+            return mjcf_robot_description(file)
         _check_numbers(robot, str(file))
         links = [
             SimpleNamespace(name=link.attrib["name"], inertial=_read_inertial(link.find("inertial")))

@@ -249,7 +249,7 @@ def _outcome(
     end = mover.node_indices_after_motion
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
-    course = rows.point_reference_trajectory
+    course = rows.desired_point_trajectory
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
     broken = rows.worst_value_and_bound_by_violated_limit(rows.limited_quantity_values(rollout, shot.w)[0])
     message = shot.message

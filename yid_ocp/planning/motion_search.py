@@ -69,7 +69,7 @@ class PlanResidualAndLimitFunctions:
         self.limit_rows = self._bounded()
 
     @property
-    def point_reference_trajectory(self) -> Array | None:
+    def desired_point_trajectory(self) -> Array | None:
         """Reference position of the point at every node, (N + 1, 3) [m]. None if only the end position counts."""
         if self.options.goal != "path":
             return None
@@ -90,7 +90,7 @@ class PlanResidualAndLimitFunctions:
         assert rollout.effort_sensitivity is not None
         at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
         by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
-        end, course = mover.node_indices_after_motion, self.point_reference_trajectory
+        end, course = mover.node_indices_after_motion, self.desired_point_trajectory
         after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
         by_speed = (by_w[after] - by_w[before]) / h
         parts = [_rows(at[end, :3] - self.target, by_w[end, :3], reached)]

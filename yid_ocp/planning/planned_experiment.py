@@ -317,7 +317,7 @@ def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Raise `ConfigError` if the motion is too short for the low-pass filter of its efforts."""
     joints, low_pass = problem.episodes[0].recording.joints, effort_low_pass_filter(problem.options.path_cutoff)
     step = problem.step.time_step
-    least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
+    least = 2.0 * low_pass.end_distortion_duration + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:
         what = f"a motion of {duration:g} s is too short for efforts low-pass filtered at {low_pass.cutoff:g} Hz"
         allowed = f"plan.duration + plan.hold_duration above {least:.2g} s"

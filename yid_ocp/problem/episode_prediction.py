@@ -22,7 +22,7 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import (
     CorrectedInputs,
     ModelFunctions,
-    TimeGridStateValues,
+    NodeStateValues,
     central_difference_velocity,
     central_difference_velocity_adjoint,
     second_difference_acceleration,
@@ -322,18 +322,18 @@ class EpisodePredictor:
 
         `by_state` (N + 1, nx, d) is the derivative of the trajectory; its first columns are the free parameters.
         """
-        read = _Trajectory(TimeGridStateValues.from_trajectory(self.integrator_step, state), by_state, None, None, None)
+        read = _Trajectory(NodeStateValues.from_trajectory(self.integrator_step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameter_names)
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
-    def state_values_at_nodes(self, rollout: Rollout) -> TimeGridStateValues:
+    def state_values_at_nodes(self, rollout: Rollout) -> NodeStateValues:
         """State values at all nodes of a rollout. Loads are efforts (prescribed joints) or torques (driven joints)."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.actuated_coordinate_indices)] = rollout.torque
         load[-1] = load[-2]
         lam = rollout.multipliers[np.minimum(np.arange(len(load)), len(load) - 2)] / self.integrator_step.time_step
-        return TimeGridStateValues.from_trajectory(self.integrator_step, rollout.state, load, lam)
+        return NodeStateValues.from_trajectory(self.integrator_step, rollout.state, load, lam)
 
     def _delay_in_steps(
         self, samples: SensorMeasurements, theta: Array, wanted: tuple[str, ...]
@@ -460,7 +460,7 @@ class EpisodePredictor:
         self,
         samples: SensorMeasurements,
         pull: Array,
-        values: TimeGridStateValues,
+        values: NodeStateValues,
         theta: Array,
         pulled: dict[str, Array],
     ) -> Array:
@@ -497,7 +497,7 @@ class EpisodePredictor:
 class _Trajectory:
     """Values at all nodes and derivatives of states, efforts, applied torques and multipliers."""
 
-    values: TimeGridStateValues
+    values: NodeStateValues
     by_state: Array | None
     by_effort: Array | None
     by_torque: Array | None
@@ -558,7 +558,7 @@ def _error(
     squares: list[Array] = []
     for samples in seen:
         read = predictor.model_functions.compiled_sensor_function(samples.sensor, names)
-        predicted = read(TimeGridStateValues.from_trajectory(predictor.integrator_step, state), theta).output
+        predicted = read(NodeStateValues.from_trajectory(predictor.integrator_step, state), theta).output
         squares.append(samples.whitened_residual(predicted)[samples.positive_weight_mask] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 

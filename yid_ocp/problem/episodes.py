@@ -62,7 +62,7 @@ class EpisodePrediction:
     torque_correction_sensitivity: Array | None = None  # (N, nu, d)
 
     @property
-    def torque_correction_and_sensitivity(self) -> Array | None:
+    def feedback_torque_and_sensitivity(self) -> Array | None:
         """`torque_correction` and its derivative, if known, as one array (N, nu, 1 + d). None without a correction."""
         if self.torque_correction is None:
             return None
@@ -87,7 +87,7 @@ _MIN_TORQUE_ERROR_FRACTION = 1e-3
 
 
 @dataclass(frozen=True)
-class InputErrorModel:
+class TorqueAndAngleErrorModel:
     """Noise levels and current estimates of the errors of recorded torques and angles that drive a rollout.
 
     A recorded torque has an error w in each step and a constant error b [N m]. A recorded angle has an error v [rad].
@@ -117,14 +117,14 @@ class InputErrorModel:
         return self.recorded_minus_true_torque - self.transmitted_torque_noise
 
     @property
-    def torque_bias_part(self) -> InputErrorModel:
+    def torque_bias_part(self) -> TorqueAndAngleErrorModel:
         """The same error model with the constant torque offset only, without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
-    def on_finer_steps(self, ratio: int) -> InputErrorModel:
+    def on_finer_steps(self, ratio: int) -> TorqueAndAngleErrorModel:
         """The same error model for `ratio` times shorter steps. Torques are held, the reference is interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
@@ -133,7 +133,7 @@ class InputErrorModel:
             made["smoothed_reference"] = np.stack([np.interp(at, nodes, x) for x in known.T], axis=1)
         return replace(self, **made)
 
-    def _truncated_to_steps(self, steps: int) -> InputErrorModel:
+    def _truncated_to_steps(self, steps: int) -> TorqueAndAngleErrorModel:
         """The same error model restricted to the first `steps` steps of the rollout."""
         names = ["sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise"]
         names += [] if self.smoothed_reference is None else ["smoothed_reference"]
@@ -146,7 +146,7 @@ def _recorded_input_errors(
     grid: TimeGrid,
     sensors: Mapping[str, SensorOptions],
     samples: Sequence[SensorMeasurements],
-) -> InputErrorModel | None:
+) -> TorqueAndAngleErrorModel | None:
     """Error levels of the torques and angles that drive a recording's rollout; None without driven joints."""
     joints, driven = recording.joints, system.driven
     if joints is None or joints.effort is None or not driven or system.servos:
@@ -172,7 +172,7 @@ def _recorded_input_errors(
     # a step over several samples averages their noise
     held, shared = std * min(1.0, np.sqrt(period / grid.time_step)), max(1.0, period / grid.time_step)
     none = (np.zeros(len(driven)), *(np.zeros((grid.steps, len(driven))) for _ in range(3)))
-    return InputErrorModel(held, bias, angle, sample.astype(np.int64), shared, encoders, *none)
+    return TorqueAndAngleErrorModel(held, bias, angle, sample.astype(np.int64), shared, encoders, *none)
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ class Episode:
     smoothed_driven_angles: Array
     tracking_feedback: TrackingFeedback | None = None  # for driven joints, with gains at the nominal parameters
     known_parameters: Mapping[str, float] = field(default_factory=dict)  # values that differ among recordings
-    input_errors: InputErrorModel | None = None  # errors of the torques and angles that drive the rollout
+    input_errors: TorqueAndAngleErrorModel | None = None  # errors of the torques and angles that drive the rollout
     fixed_initial_state: PrecomputedInitialState | None = None  # given or fitted to points; else it is an equilibrium
     # index of the estimation episode whose initial state this held-out part of the same recording shares
     initial_state_shared_with: int | None = None

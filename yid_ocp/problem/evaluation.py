@@ -16,13 +16,13 @@ from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model.system import System
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel
 from yid_ocp.problem.measurements import (
     ResidualAndJacobian,
     SensorMeasurements,
     huber_loss_and_residual_factors,
     whiten_against_sensor_biases,
-    whitened_measurement_sensitivities_to_biases,
+    whitened_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import ProblemOptions
 
@@ -34,7 +34,7 @@ class ProcessNoiseWhitener(Protocol):
     """Interface of a fixed-gain Kalman filter that whitens one recording's residual against process noise."""
 
     @property
-    def input_error_model(self) -> InputErrorModel:
+    def input_error_model(self) -> TorqueAndAngleErrorModel:
         """Standard deviations of torque and angle errors, and the errors about which the filter is linearised."""
         ...
 
@@ -124,7 +124,7 @@ def whitened_episode_residual(
 
     Constant sensor errors count as noise (`whiten_against_sensor_biases`). `threshold` is the Huber threshold.
     """
-    by_constants = whitened_measurement_sensitivities_to_biases(episode.measurements)
+    by_constants = whitened_sensitivities_to_sensor_errors(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
     plain = _sensor_whitened_residual(episode.measurements, result)
@@ -132,7 +132,7 @@ def whitened_episode_residual(
     if plain.jacobian is not None:
         columns = np.hstack([columns, plain.jacobian])
     if whitening is not None:
-        kept, push = columns.shape[1], result.torque_correction_and_sensitivity
+        kept, push = columns.shape[1], result.feedback_torque_and_sensitivity
         # constant sensor errors do not drive the motion
         push = None if push is None else np.pad(push, ((0, 0), (0, 0), (0, by_constants.shape[1])))
         innovations, _ = whitening.whiten_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)

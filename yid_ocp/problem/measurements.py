@@ -132,7 +132,7 @@ class SensorMeasurements:
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
-    def residual_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
+    def output_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
         """Matrix R^(-1/2) (nr, nr) that decorrelates the nr normalised residuals. None if outputs are independent.
 
         R is the correlation matrix of the noise; only outputs of one sample are correlated. The whitening is zero-phase
@@ -150,20 +150,20 @@ class SensorMeasurements:
 
     def decorrelate(self, rows: Any) -> Any:
         """Decorrelate rows (nr,) or (nr, d), dense or sparse, already divided by their standard deviations."""
-        return rows if self.residual_decorrelation_matrix is None else self.residual_decorrelation_matrix @ rows
+        return rows if self.output_decorrelation_matrix is None else self.output_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
         """Whitened residual (M, k), prediction minus measurement. It is zero for outputs without measurement."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
-        if self.residual_decorrelation_matrix is not None:
-            plain[self.positive_weight_mask] = self.residual_decorrelation_matrix @ plain[self.positive_weight_mask]
+        if self.output_decorrelation_matrix is not None:
+            plain[self.positive_weight_mask] = self.output_decorrelation_matrix @ plain[self.positive_weight_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
         """Convert a cost's gradient by the residual to a gradient by the prediction, both (M, k) (adjoint)."""
-        if self.residual_decorrelation_matrix is not None:
+        if self.output_decorrelation_matrix is not None:
             pull = pull.copy()
-            pull[self.positive_weight_mask] = self.residual_decorrelation_matrix.T @ pull[self.positive_weight_mask]
+            pull[self.positive_weight_mask] = self.output_decorrelation_matrix.T @ pull[self.positive_weight_mask]
         return np.asarray(pull * self.weight)
 
     def residual_and_jacobian(
@@ -292,7 +292,7 @@ def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
-def whitened_measurement_sensitivities_to_biases(samples: Sequence[SensorMeasurements]) -> Array:
+def whitened_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements]) -> Array:
     """Derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
 
     Derivatives of the residual, prediction minus measurement, have the opposite sign.
@@ -312,7 +312,7 @@ def subtract_estimated_biases(
     samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
 ) -> tuple[SensorMeasurements, ...]:
     """Subtract constant errors and clock offsets, estimated from a prediction (M, k) per sensor, from measurements."""
-    slopes = whitened_measurement_sensitivities_to_biases(samples)
+    slopes = whitened_sensitivities_to_sensor_errors(samples)
     if not slopes.shape[1]:
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)

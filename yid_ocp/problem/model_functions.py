@@ -229,7 +229,7 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 
 @dataclass(frozen=True)
-class TimeGridStateValues:
+class NodeStateValues:
     """Numerical values of `NodeStateSymbols` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m)."""
 
     q: Array
@@ -242,18 +242,18 @@ class TimeGridStateValues:
     @staticmethod
     def from_trajectory(
         step: Step, state: Array, load: Array | None = None, lam: Array | None = None
-    ) -> TimeGridStateValues:
+    ) -> NodeStateValues:
         """Compute the values at all nodes of a trajectory (K, nx). Loads and constraint forces default to zero."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
         rates, h = (central_difference_velocity, second_difference_acceleration), step.time_step
         v, a = (rate(q, nodes, h) for rate in rates)
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
-        return TimeGridStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
+        return NodeStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
 
-    def select_nodes(self, nodes: IntArray) -> TimeGridStateValues:
+    def select_nodes(self, nodes: IntArray) -> NodeStateValues:
         """Select the values at the nodes with the given indices."""
-        return TimeGridStateValues(*(values[nodes] for values in vars(self).values()))
+        return NodeStateValues(*(values[nodes] for values in vars(self).values()))
 
 
 def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
@@ -356,11 +356,11 @@ class ModelFunctions:
 
     def compiled_sensor_function(
         self, sensor: Sensor, names: tuple[str, ...] = ()
-    ) -> Callable[[TimeGridStateValues, Array], _SensorReadings]:
+    ) -> Callable[[NodeStateValues, Array], _SensorReadings]:
         """Compiled function of a sensor's readings at nodes, with derivatives by the parameters `names`."""
         function, columns = self._sensors((sensor, bool(names))), [self.parameter_names.index(name) for name in names]
 
-        def read(at: TimeGridStateValues, theta: Array) -> _SensorReadings:
+        def read(at: NodeStateValues, theta: Array) -> _SensorReadings:
             output, *slopes = function(at.q, at.v, at.a, at.z, at.load, at.lam, theta)
             if names not in ((), self.parameter_names):
                 slopes[-1] = slopes[-1][:, :, columns]

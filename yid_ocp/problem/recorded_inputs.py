@@ -17,7 +17,7 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTO
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_column_indices
+from yid_ocp.sensors import CHANNEL_KINDS, measuring_camera_pose, recorded_joint_column_indices
 from yid_ocp.sensors.base import additional_sensor_channel_kinds
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
@@ -220,10 +220,10 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
         for group in recording.channel_groups:
             of_vectors = [c.group for c in additional_sensor_channel_kinds(group.name) if c.components]
             mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
-        if any(recorded_camera_pose(group) is not None for group in recording.points):
+        if any(measuring_camera_pose(group) is not None for group in recording.points):
             found.add("camera")
         for points in recording.points if recording.joints is not None else ():
-            if recorded_camera_pose(points) is None and not is_point_group_measured_by_arm(points):
+            if measuring_camera_pose(points) is None and not is_point_group_measured_by_arm(points):
                 mounted.add(f"points:{points.name}")
         if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")

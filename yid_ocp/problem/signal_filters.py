@@ -47,7 +47,7 @@ class LowPassFilter:
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 
     @property
-    def settling_time(self) -> float:
+    def end_distortion_duration(self) -> float:
         """Time [s] after which the distortion at the ends of a record has decayed to a thousandth."""
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * _FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay

@@ -12,10 +12,10 @@ from yid_ocp.sensors.base import SensorDataInputs as SensorDataInputs
 from yid_ocp.sensors.base import SensorOptions as SensorOptions
 from yid_ocp.sensors.base import recorded_joint_column_indices as recorded_joint_column_indices
 from yid_ocp.sensors.base import sensor_reading_function as sensor_reading_function
-from yid_ocp.sensors.joints import EffortSensor as EffortSensor
 from yid_ocp.sensors.joints import PositionSensor as PositionSensor
+from yid_ocp.sensors.joints import PrescribedJointEffortSensor as PrescribedJointEffortSensor
 from yid_ocp.sensors.points import PointSensor as PointSensor
-from yid_ocp.sensors.points import recorded_camera_pose as recorded_camera_pose
+from yid_ocp.sensors.points import measuring_camera_pose as measuring_camera_pose
 
 # every file of this folder registers its sensors when it is imported
 for _module in iter_modules(__path__):

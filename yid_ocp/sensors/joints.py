@@ -68,7 +68,7 @@ class PositionSensor(JointSensor):
 
 
 @dataclass(frozen=True)
-class EffortSensor(JointSensor):
+class PrescribedJointEffortSensor(JointSensor):
     """Efforts of named prescribed joints, predicted by discrete inverse dynamics."""
 
     channel = _EFFORT
@@ -127,7 +127,8 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
     is_sample = joints.effort_sampling_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
-    return [filtered_effort_measurements(around, EffortSensor(names), joints.t, effort, std, bias, is_sample=is_sample)]
+    sensor = PrescribedJointEffortSensor(names)
+    return [filtered_effort_measurements(around, sensor, joints.t, effort, std, bias, is_sample=is_sample)]
 
 
 def filtered_effort_measurements(
@@ -167,9 +168,9 @@ def nodes_and_decorrelated_values(
     # recording.
     step, steps = inputs.time_step, len(times) - 1
     apart = max(1, round(float(np.median(np.diff(t))) / step))
-    ends = apart * math.ceil(max(1, math.ceil(low_pass.settling_time / step)) / apart)
+    ends = apart * math.ceil(max(1, math.ceil(low_pass.end_distortion_duration / step)) / apart)
     kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride(step) / apart))
-    span = t[[0, -1]] + low_pass.settling_time * np.array([1, -1])
+    span = t[[0, -1]] + low_pass.end_distortion_duration * np.array([1, -1])
     kept = kept[(times[kept] > span[0] - step) & (times[kept] < span[1] + step)]
     if not len(kept):
         what = f"{steps * step:.3g} s of {noun} are too short for a low-pass filter of {low_pass.cutoff:g} Hz"

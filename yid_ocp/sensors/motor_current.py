@@ -13,8 +13,8 @@ from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    RecordedChannelGroup,
     RecordedChannelKind,
+    RecordedExtraSensor,
     SensorData,
     SensorDataInputs,
     expand_to_joint_values,
@@ -55,7 +55,7 @@ def _read_motor_currents(around: SensorDataInputs) -> list[SensorData]:
     return [found for group in groups if (found := _currents(around, group)) is not None]
 
 
-def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorData | None:
+def _currents(around: SensorDataInputs, group: RecordedExtraSensor) -> SensorData | None:
     key, where = f"{group.name}.{_CURRENT.quantity}", f"recording '{around.recording.name}': {group.name}"
     choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
     if choice.use is False or not names or around.recording.joints is None:

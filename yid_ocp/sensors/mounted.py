@@ -15,8 +15,8 @@ from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    RecordedChannelGroup,
     RecordedChannelKind,
+    RecordedExtraSensor,
     Sensor,
     SensorData,
     SensorDataInputs,
@@ -69,7 +69,7 @@ def _read_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[S
     return found
 
 
-def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: RecordedChannelGroup, key: str) -> SensorData:
+def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: RecordedExtraSensor, key: str) -> SensorData:
     choice, tree = around.sensor_usage(key), around.system.mechanism
     where, channel, names = f"{around.recording.name}: {group.name}", kind.channel, group.names
     frames = tuple(choice.frame_by_recorded_name.get(name, name) for name in names)

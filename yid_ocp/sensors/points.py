@@ -90,7 +90,7 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
         std = group.std[inside][:, columns].reshape(value.shape)
     else:
         raise missing_noise_level_error(f"group '{group.name}'", where, group.name, "m")
-    sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), recorded_camera_pose(group))
+    sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), measuring_camera_pose(group))
     change = _clock_offset_std(around, sensor, group, choice) * _rates(group.t[inside], value)
     return SensorData(sensor, group.t[inside], value, std, change_by_clock=change if np.any(change) else None)
 
@@ -118,7 +118,7 @@ def _rates(t: Array, values: Array) -> Array:
     return rates
 
 
-def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
+def measuring_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
     """Pose (4, 4) of the camera that measured a point group. None if no camera measured it.
 
     A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Without a pose, the camera is

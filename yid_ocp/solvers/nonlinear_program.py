@@ -255,7 +255,7 @@ class _VectorBlock:
 
 
 @dataclass
-class ProgramVectorLayout:
+class ProgramInputLayout:
     """Layout of a program's variables or parameters in successive blocks, with values and bounds."""
 
     size: int = 0

@@ -45,7 +45,7 @@ from yid_ocp.solvers.nonlinear_program import (
     LocalVariableFunction,
     MappedFunctionTerm,
     NonlinearProgram,
-    ProgramVectorLayout,
+    ProgramInputLayout,
     ResidualTerm,
 )
 
@@ -241,7 +241,7 @@ class _Maker:
         self._problem, self._compiled = problem, compiled
         self._step, self._sizes = problem.step, problem.step.sizes
         self._names = problem.unknowns.free_parameter_names
-        self._w, self._p = ProgramVectorLayout(), ProgramVectorLayout()
+        self._w, self._p = ProgramInputLayout(), ProgramInputLayout()
         system = problem.system
         free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
         theta = ca.SX(fixed)

@@ -75,11 +75,11 @@ class ArmSensorNoise:
     point_std: float = 1e-3
     records_effort_std: bool = True
     position_resolution: float = 0.0  # step of the encoders, which count after the noise; none at zero [rad]
-    lost_sample_fraction: float = 0.0  # fraction of joint samples that are lost, never the first or last two
+    lost_joint_sample_fraction: float = 0.0  # fraction of joint samples that are lost, never the first or last two
 
 
 @dataclass(frozen=True, kw_only=True)
-class VirtualArmOptions:
+class VirtualArmImperfections:
     """Properties of the arms in virtual experiments of `blind` that their description lacks, such as friction.
 
     The nominal model contains the friction law, with free amplitudes, and uncertain link masses.
@@ -96,7 +96,7 @@ class VirtualArmOptions:
     period_jitter_std: Annotated[
         float, Ge(0), Le(2e-3), OptionInfo("standard deviation of the controller's and recorder's tick times", "s")
     ] = 5e-4
-    lost_sample_fraction: Annotated[float, Ge(0), Le(0.2), OptionInfo("fraction of joint samples that are lost")] = 0.01
+    lost_joint_sample_fraction: Annotated[float, Ge(0), Le(0.2), OptionInfo("fraction of lost joint samples")] = 0.01
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def _joints(
     velocity = _noisy(run.v[:, driven], noise.velocity_std, streams["velocity"])
     effort = _noisy(run.effort, 0.0 if system.servos else white, streams["effort"]) + offset
     kept = np.ones(len(run.t), bool)
-    kept[2:-2] = streams["clock"].random(len(run.t) - 4) >= noise.lost_sample_fraction
+    kept[2:-2] = streams["clock"].random(len(run.t) - 4) >= noise.lost_joint_sample_fraction
     joints = JointGroup(tuple(system.driven), run.t[kept], position[kept], velocity=velocity[kept])
     joints = replace(joints, position_std=noise.position_std, velocity_std=noise.velocity_std)
     if noise.position_resolution:

@@ -160,7 +160,7 @@ def simulate_in_mujoco(
     model = mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
     with _at_work(mujoco, model, injected):
-        scene = MujocoScene.from_compiled_model(system, mujoco, model)
+        scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
         start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
         scene.data.qpos[:] = model.qpos_spring
         scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
@@ -182,7 +182,7 @@ def simulate_in_mujoco(
 
 
 @dataclass(frozen=True, eq=False)
-class MujocoScene:
+class MujocoModelAndState:
     """A MuJoCo model with its state, and the ids of joints, moved joints and points."""
 
     mujoco: ModuleType
@@ -193,13 +193,13 @@ class MujocoScene:
     point_site_ids: list[int]
 
     @staticmethod
-    def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoScene:
+    def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoModelAndState:
         """Make the scene of a compiled model. It moves the driven joints, or else the prescribed joints."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
         moved = order[list(system.actuated_coordinate_indices or system.prescribed_coordinate_indices)]
-        return MujocoScene(mujoco, model, mujoco.MjData(model), order, moved, sites)
+        return MujocoModelAndState(mujoco, model, mujoco.MjData(model), order, moved, sites)
 
 
 @contextlib.contextmanager
@@ -216,7 +216,7 @@ def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | 
         mujoco.set_mjcb_passive(None)
 
 
-def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
+def settle_to_equilibrium(scene: MujocoModelAndState, damping: Array) -> Array:
     """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
 
     `damping` replaces the joint damping while the scene settles, because it can decide which of several equilibria is
@@ -238,7 +238,7 @@ def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
     return balance
 
 
-def _settling_model(scene: MujocoScene, damping: Array) -> Any:
+def _settling_model(scene: MujocoModelAndState, damping: Array) -> Any:
     """A copy of the model with more damping of the joints that are not driven."""
     held = copy.copy(scene.model)
     held.dof_damping[:] = damping
@@ -246,7 +246,7 @@ def _settling_model(scene: MujocoScene, damping: Array) -> Any:
     return held
 
 
-def _lost(scene: MujocoScene) -> bool:
+def _lost(scene: MujocoModelAndState) -> bool:
     kinds = scene.mujoco.mjtWarning
     return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _INSTABILITY_WARNINGS)
 
@@ -258,7 +258,7 @@ class TrackingController:
     Before the motion the scene is at equilibrium, held by the torques `balance` (nu,) [N m].
     """
 
-    def __init__(self, scene: MujocoScene, motion: JointMotion, balance: Array) -> None:
+    def __init__(self, scene: MujocoModelAndState, motion: JointMotion, balance: Array) -> None:
         self._scene, self._motion = scene, motion
         self._free = copy.copy(scene.model)
         self._free.opt.disableflags |= int(scene.mujoco.mjtDisableBit.mjDSBL_EQUALITY)
@@ -289,7 +289,7 @@ class TrackingController:
 class _ServoCommander:
     """Controller that commands position servos along a motion about the scene's present joint angles."""
 
-    def __init__(self, scene: MujocoScene, motion: JointMotion) -> None:
+    def __init__(self, scene: MujocoModelAndState, motion: JointMotion) -> None:
         self._scene, self._motion = scene, motion
         self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
 
@@ -299,7 +299,7 @@ class _ServoCommander:
         return commands
 
 
-def _initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
+def _initialize_actuator_history(scene: MujocoModelAndState, commands: Array) -> None:
     """Set the commands of all actuators and fill the history of delayed actuators with them."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
@@ -308,7 +308,7 @@ def _initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
         scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
 
 
-def _settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Array) -> None:
+def _settle_under_servo_commands(scene: MujocoModelAndState, damping: Array, commands: Array) -> None:
     """Bring the scene to equilibrium under constant servo commands, with `damping` increased meanwhile."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
@@ -321,7 +321,7 @@ def _settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: A
     _initialize_actuator_history(scene, commands)
 
 
-def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
+def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
     """Let a scene settle with the model `held`, and yield its largest velocity [rad/s] every 0.1 s.
 
     With short steps, a gripper that is not at its grasped point can throw a fine chain about, because the time constant
@@ -352,7 +352,7 @@ def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
 
 
 def _play(
-    scene: MujocoScene,
+    scene: MujocoModelAndState,
     controller: TrackingController | _ServoCommander,
     simulation: SimulationOptions,
     frames: IntArray,
@@ -442,7 +442,7 @@ def replay_mismatch_by_channel(
         raise ModelError(what, where=where, allowed="recorded efforts", hint="import them too")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
     effort = None if joints.effort is None else joints.effort[:, columns]
-    scene = MujocoScene.from_compiled_model(system, mujoco, model)
+    scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[scene.moved_joint_ids] = position[:_START].mean(axis=0)
     if system.servos:
@@ -484,12 +484,12 @@ class _Played:
     points: Array
 
 
-def _step_times(scene: MujocoScene, end: float) -> Array:
+def _step_times(scene: MujocoModelAndState, end: float) -> Array:
     step = scene.model.opt.timestep
     return np.asarray(np.arange(round(end / step)) * step)
 
 
-def _played(scene: MujocoScene, end: float, control: Callable[[int, float], Array | None]) -> _Played:
+def _played(scene: MujocoModelAndState, end: float, control: Callable[[int, float], Array | None]) -> _Played:
     """Step up to a time. `control` sets inputs by step and time, and can return values of the moved joints."""
     mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
     times = _step_times(scene, end)
@@ -504,7 +504,7 @@ def _played(scene: MujocoScene, end: float, control: Callable[[int, float], Arra
     return _Played(times, values, points)
 
 
-def _driven(scene: MujocoScene, path: _Path, t: Array, effort: Array | None) -> _Played:
+def _driven(scene: MujocoModelAndState, path: _Path, t: Array, effort: Array | None) -> _Played:
     assert effort is not None
     mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
     start = np.array(data.qpos[at])
@@ -526,7 +526,7 @@ def _driven(scene: MujocoScene, path: _Path, t: Array, effort: Array | None) -> 
     return _played(scene, t[-1], control)
 
 
-def _commanded(scene: MujocoScene, system: System, t: Array, commands: Array) -> _Played:
+def _commanded(scene: MujocoModelAndState, system: System, t: Array, commands: Array) -> _Played:
     _settle_under_servo_commands(scene, np.array(scene.model.dof_damping), commands[0])
     times = _step_times(scene, t[-1])
     held = commands[np.searchsorted(t, times + 1e-9, side="right") - 1]

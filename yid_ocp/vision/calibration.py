@@ -28,9 +28,9 @@ from yid_ocp.vision.camera_registration import (
     ROTATION_SLICE,
     TRANSLATION_SLICE,
     ArmSurface,
-    CalibrationFrame,
     CalibrationState,
     RobustCostDerivatives,
+    StampedCloud,
     SurfaceObservationFractions,
     candidate_calibration_states,
     pooled_surface_observation_fractions,
@@ -232,7 +232,7 @@ def calibration_without_estimation(pose: Array, options: CameraClockOptions, rea
 
 def calibrate_camera(
     arm: ArmSurface,
-    frames: Sequence[CalibrationFrame],
+    frames: Sequence[StampedCloud],
     pose: Array,
     rng: np.random.Generator,
     options: ArmBasedCameraCalibrationOptions,
@@ -252,7 +252,7 @@ def calibrate_camera(
     except _UntoldError as reason:
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_without_estimation(pose, clock, str(reason))
-        known = "track.options.calibration.fix_pose: true and track.options.clock.search_half_width: 0"
+        known = "track.options.calibration.fix_pose: true and track.options.clock_offset.search_half_width: 0"
         hint = f"{reason.hint}; with pose and clock known, set {known}"
         what, allowed = f"the camera cannot be calibrated by the arm: {reason}", "frames that show the moving arm"
         raise DataError(what, where=source, allowed=allowed, hint=hint) from None
@@ -286,7 +286,7 @@ class _Calibrator:
         std = [*pose, _DEPTH_SCALE_PRIOR_STD, _DEPTH_OFFSET_PRIOR_STD, offset, _DRIFT_PRIOR_STD]
         return np.diag(np.array(std) ** -2)
 
-    def run(self, frames: Sequence[CalibrationFrame]) -> CameraCalibration:
+    def run(self, frames: Sequence[StampedCloud]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
         if len(glimpses) < _MIN_FRAMES:
             needed = f"it is in view in {len(glimpses)} frames, {_MIN_FRAMES} are needed"
@@ -313,7 +313,7 @@ class _Calibrator:
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < _MAX_CLOCK_OFFSET_STD:
             told = f"it moves too little to determine the clock offset: its std is {1e3 * std:.0f} ms"
-            known = "set track.options.clock.initial_stamp_minus_joint_time, and search_half_width: 0"
+            known = "set track.options.clock_offset.initial_stamp_minus_joint_time, and search_half_width: 0"
             raise _UntoldError(told, f"record a livelier motion, or {known}")
         used_state = state
         if self.options.fix_pose:
@@ -323,7 +323,7 @@ class _Calibrator:
         words += f"; from {len(chosen)} frames, with {100 * presence.there:.0f} % of the arm's surface in the clouds"
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
-    def _about_the_arm(self, glimpse: CalibrationFrame) -> CalibrationFrame | None:
+    def _about_the_arm(self, glimpse: StampedCloud) -> StampedCloud | None:
         """The points around the arm, as seen by the specified camera; None if the arm is out of view."""
         own = self.told.world_to_measured_points(self.arm.visible_surface_points_and_parts(self.told, glimpse.stamp)[0])
         points = glimpse.points[glimpse.points[:, 2] > 0]
@@ -332,15 +332,15 @@ class _Calibrator:
         at, towards = points[:, :2] / points[:, 2:], own[:, :2] / own[:, 2:]
         low, high = towards.min(axis=0) - _VIEW_MARGIN, towards.max(axis=0) + _VIEW_MARGIN
         kept = points[((at > low) & (at < high)).all(axis=1)]
-        return CalibrationFrame(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
+        return StampedCloud(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
-    def _start(self, glimpses: Sequence[CalibrationFrame]) -> CalibrationState:
+    def _start(self, glimpses: Sequence[StampedCloud]) -> CalibrationState:
         """The state at which most of the arm's surface coincides with measured points."""
         few = []
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
             drawn = self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)
-            few.append(CalibrationFrame(stamp, drawn))
+            few.append(StampedCloud(stamp, drawn))
         tried = candidate_calibration_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
@@ -356,8 +356,8 @@ class _Calibrator:
         return best
 
     def _rounds(
-        self, state: CalibrationState, frames: list[CalibrationFrame], reach: float, along: bool, cap: int, rounds: int
-    ) -> tuple[CalibrationState, Callable[[CalibrationState], RobustCostDerivatives], list[CalibrationFrame]]:
+        self, state: CalibrationState, frames: list[StampedCloud], reach: float, along: bool, cap: int, rounds: int
+    ) -> tuple[CalibrationState, Callable[[CalibrationState], RobustCostDerivatives], list[StampedCloud]]:
         """The state after some steps on a limited number of points per frame, the cost of states, and these points."""
         chosen = []
         for glimpse in frames:
@@ -367,7 +367,7 @@ class _Calibrator:
             if len(near) > cap:
                 near = self.rng.choice(near, cap, replace=False)
             if len(near) >= MIN_ARM_POINTS_PER_FRAME:
-                chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
+                chosen.append(StampedCloud(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _MIN_FRAMES:
             hint = "check the specified pose and the unit of the clouds"
             raise _UntoldError("what the camera sees does not lie on it", hint)

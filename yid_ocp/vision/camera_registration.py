@@ -123,7 +123,7 @@ class CalibrationState:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationFrame:
+class StampedCloud:
     """One frame: its stamp [s] and its points (N, 3) [m] in the camera's frame."""
 
     stamp: float
@@ -201,7 +201,7 @@ class ArmSurface:
         return _SurfaceMatches(chosen, error[chosen], normal[chosen], rate, part[chosen], local)
 
     def linearized_surface_distances(
-        self, state: CalibrationState, frame: CalibrationFrame, reach: float, along: bool
+        self, state: CalibrationState, frame: StampedCloud, reach: float, along: bool
     ) -> _CalibrationEquations:
         """Distances of a frame's points from the arm's surface, linearised in the camera state."""
         points, t = state.measured_to_world_points(frame.points), float(state.stamps_to_joint_clock(frame.stamp))
@@ -285,7 +285,7 @@ def _at_least(least: Array, matrix: Array) -> Array:
 
 
 def candidate_calibration_states(
-    arm: ArmSurface, frames: Sequence[CalibrationFrame], specified: CalibrationState, search: float, count: int
+    arm: ArmSurface, frames: Sequence[StampedCloud], specified: CalibrationState, search: float, count: int
 ) -> list[CalibrationState]:
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
@@ -317,7 +317,7 @@ def candidate_calibration_states(
 
 
 def _add_costs(
-    total: Array, arm: ArmSurface, told: CalibrationState, glimpse: CalibrationFrame, delays: Array, cells: IntArray
+    total: Array, arm: ArmSurface, told: CalibrationState, glimpse: StampedCloud, delays: Array, cells: IntArray
 ) -> None:
     """Add the costs of the arm's points, `delays` [s] earlier and shifted by cells, to `total` (delays, cells)."""
     from scipy.ndimage import distance_transform_edt  # slow to import; only needed to search for the camera's pose
@@ -370,7 +370,7 @@ class SurfaceObservationFractions:
 
 
 def pooled_surface_observation_fractions(
-    arm: ArmSurface, frames: Sequence[CalibrationFrame], state: CalibrationState, within: float
+    arm: ArmSurface, frames: Sequence[StampedCloud], state: CalibrationState, within: float
 ) -> SurfaceObservationFractions:
     """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, relative_message_time_function
+from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, time_since_first_message_function
 from yid_ocp.errors import DataError
 from yid_ocp.vision.frame_folder import STAMP_FILE, metres_per_unit, read_frame_folder
 from yid_ocp.vision.frames import CameraIntrinsics, FrameSequence, PointColourArray, validated_camera_pose
@@ -66,7 +66,7 @@ def _frames(bag: OpenBag, topic: str) -> tuple[list[BagMessage], Array]:
         of_joints = [c for c in bag.reader.connections if c.msgtype == JOINT_STATE_MESSAGE_TYPE]
         firsts = chain.from_iterable(islice(bag.reader.messages([connection]), 1) for connection in of_joints)
         joints = [BagMessage(connection.topic, logged, _stamp(bag, data), None) for connection, logged, data in firsts]
-    return frames, np.array(list(map(relative_message_time_function(frames, joints), frames)))
+    return frames, np.array(list(map(time_since_first_message_function(frames, joints), frames)))
 
 
 def _stamp(bag: OpenBag, data: bytes) -> int:

@@ -134,7 +134,7 @@ def foreign_objects_from_clusters(
         text += f"in {len(group)} of {len(clusters)} frames: "
         boxed = "leave it out with track.options.filters.box_lower and box_upper"
         if link:
-            text += f"give its shape under model.extra_meshes with parent_frame: {link}"
+            text += f"give its shape under model.bodies_missing_from_urdf with parent_frame: {link}"
         elif moving:
             text += boxed if beside else "take it out of view"
             text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""

@@ -77,7 +77,7 @@ class SceneDescription:
     system: System
     robot_urdf: str | Path | None = None  # URDF with the robot's meshes (`package:baxter`); None for the object alone
     parameter_values: Mapping[str, float] | None = None  # includes lengths and radii; default nominal
-    extra_meshes: Sequence[ExtraMesh] = ()  # meshes other than robot and object
+    bodies_missing_from_urdf: Sequence[ExtraMesh] = ()  # meshes other than robot and object
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,7 +341,7 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
     """
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
-        where = f"model: extra_meshes: {number}"
+        where = f"model: bodies_missing_from_urdf: {number}"
         given = [kind for kind in _EXTRA_MESH_SHAPES if getattr(entry, kind) is not None]
         if len(given) != 1:
             what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "keep or add one shape"

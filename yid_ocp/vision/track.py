@@ -26,7 +26,7 @@ from yid_ocp.vision.calibration import (
     calibration_without_estimation,
     frame_stamp_delay,
 )
-from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
+from yid_ocp.vision.camera_registration import ArmSurface, StampedCloud
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
@@ -129,7 +129,7 @@ class FrameTracker:
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
         tree = system.numeric_mechanism(values)
-        meshes = surface_meshes.extra_meshes_by_joint(scene.extra_meshes, tree)
+        meshes = surface_meshes.extra_meshes_by_joint(scene.bodies_missing_from_urdf, tree)
         if scene.robot_urdf is not None:
             robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in robot):
@@ -197,9 +197,9 @@ class FrameTracker:
         return SharedFrameEstimates(calibration, sizes, background)
 
     def _calibration(self) -> CameraCalibration:
-        options = self.options
+        options, pose = self.options, self.sequence.camera_pose
         if self.arm_surface is None:
-            return calibration_without_estimation(self.sequence.camera_pose, options.clock, "no robot to compare")
+            return calibration_without_estimation(pose, options.clock_offset, "no robot to compare")
         glimpses = []
         for i in self.calibration_frames:
             try:
@@ -207,21 +207,21 @@ class FrameTracker:
             except DataError:
                 continue  # the second pass reports the reason
             thinned = point_cloud.voxel_averages(points, options.filters.voxel_size).points
-            glimpses.append(CalibrationFrame(float(self.sequence.stamps[i]), thinned))
+            glimpses.append(StampedCloud(float(self.sequence.stamps[i]), thinned))
         rng = np.random.default_rng(options.seed)
-        pose, source = self.sequence.camera_pose, self.sequence.source
-        return calibrate_camera(self.arm_surface, glimpses, pose, rng, options.calibration, options.clock, source)
+        source, clock = self.sequence.source, options.clock_offset
+        return calibrate_camera(self.arm_surface, glimpses, pose, rng, options.calibration, clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.joint_time_span is None or not usable:
             return
-        stamps, offset = self.sequence.stamps[list(usable)], self.options.clock.initial_stamp_minus_joint_time
+        stamps, offset = self.sequence.stamps[list(usable)], self.options.clock_offset.initial_stamp_minus_joint_time
         first, last = float(stamps.min()) - offset, float(stamps.max()) - offset
-        (begin, end), reach = self.joint_time_span, self.options.clock.search_half_width
+        (begin, end), reach = self.joint_time_span, self.options.clock_offset.search_half_width
         if first > end + reach or last < begin - reach:
             spans = f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {begin:.3f} s to {end:.3f} s"
-            hint = f"set track.options.clock.initial_stamp_minus_joint_time ({first + offset - begin:.3f} s if they "
-            hint += "started together)"
+            hint = f"set track.options.clock_offset.initial_stamp_minus_joint_time ({first + offset - begin:.3f} s if "
+            hint += "they started together)"
             what, where = f"the clocks differ: {spans}", self.sequence.source
             raise DataError(what, where=where, allowed="times that overlap", hint=hint)
 

@@ -31,9 +31,9 @@ from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.version import installed_versions, package_source_hash
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmOptions
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmImperfections
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
-from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, score_slices, write_slice
+from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, score_whole_ensemble, write_slice
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
@@ -137,7 +137,7 @@ def run_blind(
         "answers": answers,
         "best": best,
     }
-    return score_slices([write_slice(found, proof.folder)], proof.folder, runs, progress)
+    return score_whole_ensemble([write_slice(found, proof.folder)], proof.folder, runs, progress)
 
 
 @dataclass(frozen=True)
@@ -333,14 +333,14 @@ class _ExperimentVariation:
     has_prescribed_arms: bool = False
     friction: FrictionLawName = "coulomb"  # if the settings vary the law
 
-    def simulation_overrides(self, arm: VirtualArmOptions) -> tuple[str, ...]:
+    def simulation_overrides(self, arm: VirtualArmImperfections) -> tuple[str, ...]:
         # settings of the object and its sensors do not apply without it
         bare = ("model.object=null", "model.grasp={}", "model.measured_points=null", "sensors={}", "parameters={}")
         mass = f"model.arms.relative_link_mass_std={arm.max_relative_link_mass_error}"
         own = (mass, *bare) if self.is_without_object else (mass,)
         return own if arm.friction_law == "none" else (*own, "model.friction=null")
 
-    def diagnosis_overrides(self, driven: Sequence[str], arm: VirtualArmOptions) -> list[str]:
+    def diagnosis_overrides(self, driven: Sequence[str], arm: VirtualArmImperfections) -> list[str]:
         own = [text for text in self.simulation_overrides(arm) if text != "model.friction=null"]
         if arm.friction_law != "none":
             law = self.friction if arm.friction_law == "varied" else arm.friction_law
@@ -387,7 +387,7 @@ class _BlindExperiment:
         return load_config(self.config_file, overrides)
 
     @property
-    def _virtual_arm(self) -> VirtualArmOptions:
+    def _virtual_arm(self) -> VirtualArmImperfections:
         return load_config(self.config_file).virtual_arm
 
     def _recording_conditions(self) -> blind.SyntheticRecordingConditions:
@@ -395,7 +395,7 @@ class _BlindExperiment:
         arm, step = self._virtual_arm, DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor
         noise = ArmSensorNoise(
             position_resolution=2 * math.pi / arm.encoder_counts_per_turn if arm.encoder_counts_per_turn else 0.0,
-            lost_sample_fraction=arm.lost_sample_fraction,
+            lost_joint_sample_fraction=arm.lost_joint_sample_fraction,
         )
         if varied.has_torque_noise:
             noise = replace(noise, effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)

@@ -82,14 +82,14 @@ def score_joined_slices(
             for case, value in values.items():
                 write_strict_json(folder / name / f"{case}.json", {"name": case, "value": value})
     runs = [load_config(folder / "configs" / f"{name}.yaml") for name in first["configs"]]
-    return score_slices(found, folder, runs, progress)
+    return score_whole_ensemble(found, folder, runs, progress)
 
 
 def _labels(part: Mapping[str, Any]) -> list[blind.CaseGroundTruth]:
     return [blind.CaseGroundTruth.from_dict(own) for own in part["labels"]]
 
 
-def score_slices(
+def score_whole_ensemble(
     parts: Sequence[Mapping[str, Any]], folder: Path, runs: Sequence[RunSettings], progress: Progress
 ) -> CommandOutcome[None]:
     """Score the diagnoses of blind validation cases against their true labels, and write the result."""

@@ -93,7 +93,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.joint_springs.items()},
             servos=arms.servo if mode == "servo" else None,
         )
-    if any(said.position_from_recordings for said in model.frames.values()) and run.recordings.estimate:
+    if any(said.position_from_straight_pose for said in model.frames.values()) and run.recordings.estimate:
         # marker positions if no recording is specified
         [places] = marker_positions_from_reference_pose(run, system, read_recordings_of_role(run, count=1)).values()
         system = replace(system, parameters=system.parameters.with_nominal_values(places))
@@ -111,7 +111,7 @@ def build_step(run: RunSettings, system: System | None = None) -> Step:
     said = run.problem
     system = build_system(run) if system is None else system
     return compile_step(
-        system, said.time_step_or_default, said.force_split, said.constraint_force_at, use_compiler=said.use_compiler
+        system, said.time_step_or_10_ms, said.force_split, said.constraint_force_at, use_compiler=said.use_compiler
     )
 
 
@@ -199,7 +199,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     chosen, entries = settings_by_parameter_name(run, system.parameters), []
     for entry in system.parameters:
         if entry.name in chosen:
-            given, factor = chosen[entry.name], divided_link_parameter_scale(run, entry.name, link_division)
+            given, factor = chosen[entry.name], divided_joint_parameter_scale(run, entry.name, link_division)
             lower, upper = (entry.lower, entry.upper) if given.bounds is None else (factor * b for b in given.bounds)
             value = entry.value if given.initial is None else factor * given.initial
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
@@ -336,7 +336,7 @@ def free_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
     return [name for name, said in settings_by_parameter_name(run, parameters).items() if said.free]
 
 
-def divided_link_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
+def divided_joint_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
     """Factor on an elastic joint's parameter that keeps the object's stiffness when links are divided."""
     item = run.model.object
     return 1 if item is None else item.link_division_parameter_factor(name, link_division)
@@ -379,8 +379,8 @@ def _with_extra_frames(
         owner = next((i for i, item in enumerate(made) if parent and item.mechanism.has_frame(parent)), None)
         if owner is not None:
             tree = made[owner].mechanism
-        elif said.position_from_recordings:
-            what = f"'{name}' has `position_from_recordings`, but its parent is not a frame of the object"
+        elif said.position_from_straight_pose:
+            what = f"'{name}' has `position_from_straight_pose`, but its parent is not a frame of the object"
             allowed = "a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%"
             raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame")
         else:
@@ -388,9 +388,9 @@ def _with_extra_frames(
             if parent is not None and not tree.has_frame(parent):
                 known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
                 raise unknown_name_error(run, "frame", parent, known, *where, "parent_frame")
-        pose = np.eye(4) if said.position_from_recordings else transform_from_xyz_rpy(said.xyz, said.rpy)
+        pose = np.eye(4) if said.position_from_straight_pose else transform_from_xyz_rpy(said.xyz, said.rpy)
         tree = tree.with_added_frame(name, parent, pose)
-        if said.position_from_recordings or said.position_std > 0:
+        if said.position_from_straight_pose or said.position_std > 0:
             tree = _with_estimable_position(tree, name, str(parent))
         if owner is None:
             carrier = tree
@@ -413,15 +413,15 @@ def marker_positions_from_reference_pose(
 ) -> dict[str, dict[str, float]]:
     """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
 
-    Empty if no frame has `position_from_recordings`. Raises `ConfigError` if the object is not fixed in the world, or
+    Empty if no frame has `position_from_straight_pose`. Raises `ConfigError` if the object is not fixed in the world or
     a marker is not a point of a recording, and `DataError` if a recording has no `straight` positions.
     """
-    names = [name for name, said in run.model.frames.items() if said.position_from_recordings]
+    names = [name for name, said in run.model.frames.items() if said.position_from_straight_pose]
     if not names:
         return {}
     if run.model.object is not None and not run.model.object.is_root_fixed_in_world:
-        what = "the mount of the object moves, so `position_from_recordings` does not determine its position"
-        where = ("model", "frames", names[0], "position_from_recordings")
+        what = "the mount of the object moves, so `position_from_straight_pose` does not determine its position"
+        where = ("model", "frames", names[0], "position_from_straight_pose")
         hint, allowed = f"set model.frames.{names[0]}.xyz instead", "an object whose mount is fixed in the world"
         raise run.config_error(what, *where, allowed=allowed, hint=hint)
     q = ca.SX.sym("q", system.n_coordinates)
@@ -434,7 +434,7 @@ def marker_positions_from_reference_pose(
     for recording in recordings:
         group = recording.points[0].names if recording.points else ()
         if recording.marker_reference_pose is None:
-            hint = f"record them, or give model.frames.{names[0]}.xyz in place of position_from_recordings: true"
+            hint = f"record them, or give model.frames.{names[0]}.xyz in place of position_from_straight_pose: true"
             what = "the recording has no marker positions of the straight object"
             allowed = "positions of the points of its first group, shape (np, 3) [m]"
             raise DataError(what, where=f"recording '{recording.name}': straight", allowed=allowed, hint=hint)

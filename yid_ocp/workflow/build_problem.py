@@ -119,7 +119,7 @@ def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel 
         return None
 
     names = system.parameters.names
-    factors = {name: float(build.divided_link_parameter_scale(run, name, 2)) for name in names}
+    factors = {name: float(build.divided_joint_parameter_scale(run, name, 2)) for name in names}
     return DividedLinksModel(partial(_divided_links_step, run), factors)
 
 

@@ -24,7 +24,7 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.report.animation import Animation, animation_of_trajectories, recording_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
-from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
+from yid_ocp.workflow.build import build_step, build_system, divided_joint_parameter_scale, urdf_reader_options
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_grasp_gaps_at_start
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_settings_command
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
@@ -197,7 +197,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
     """Lowest natural frequencies with twice the links (`links`), and with half and a quarter of the `time_step`."""
     system = build_system(run)
-    h = run.problem.time_step_or_default if problem is None else problem.step.time_step
+    h = run.problem.time_step_or_10_ms if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
         message = "joint positions are unknown: the configuration names no recording"
@@ -225,7 +225,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     if count is not None:
         other = build_system(run, link_division=2)
         known = zip(system.parameters.names, theta, strict=True)
-        values = {name: x * divided_link_parameter_scale(run, name, 2) for name, x in known if name in other.parameters}
+        values = {own: x * divided_joint_parameter_scale(run, own, 2) for own, x in known if own in other.parameters}
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         rows = [_row(count, own), _row(2 * count, finer)]
         _warn(warnings, "the links go", "", rows)

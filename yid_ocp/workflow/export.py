@@ -175,7 +175,8 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
-    _refuse_losses(form, is_lossy, supports, parameters, [own.name for own in full.grasps] if grasp.is_lost else [])
+    lost_grasps = [own.name for own in full.grasps if grasp.loses_motion_or_force]
+    _refuse_losses(form, is_lossy, supports, parameters, lost_grasps)
     manifest: dict[str, Any] = {
         "format": EXPORT_MANIFEST_FORMAT,
         "file": out.name,
@@ -209,7 +210,7 @@ def _refuse_losses(
     grasps: Sequence[str],
 ) -> None:
     """Refuse a file that lacks effects, estimates or grasps of the model, unless losses are accepted."""
-    lost = [label for label, entry in effects.items() if entry.is_lost]
+    lost = [label for label, entry in effects.items() if entry.loses_motion_or_force]
     for name, entry in parameters.items():
         is_own = name.rpartition(".")[0] not in effects
         is_lost = entry["estimated"] and is_own and entry["status"] == "not representable"

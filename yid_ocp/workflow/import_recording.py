@@ -18,7 +18,7 @@ from yid_ocp.data.merge import merge_recordings
 from yid_ocp.data.readers import preview_file, read_any, reader_option_names
 from yid_ocp.data.readers.base import (
     MOTOR_CURRENT_UNITS,
-    SelectionAndUnitOptions,
+    JointPointAndUnitOptions,
     convert_to_si_and_validate,
     guess_units,
     parse_quantity_units,
@@ -175,7 +175,7 @@ def _merged(
         raise DataError(what, where=", ".join(files), allowed=allowed, hint="rename one of them")
     parts = [replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)]
     merged = merge_recordings(parts, offsets)
-    return convert_to_si_and_validate(merged, ", ".join(files), SelectionAndUnitOptions(**late))
+    return convert_to_si_and_validate(merged, ", ".join(files), JointPointAndUnitOptions(**late))
 
 
 def recording_contents_summary(recording: Recording) -> dict[str, Any]:

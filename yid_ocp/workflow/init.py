@@ -18,7 +18,7 @@ from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitCommandObject, init_command_object_factories, parse_comma_separated_numbers
+from yid_ocp.model.objects.base import ObjectWithInitialValues, init_object_templates, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import options_by_key
@@ -73,9 +73,9 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject | None:
+def _object_from_arguments(arguments: argparse.Namespace) -> ObjectWithInitialValues | None:
     """The described object, if any. `ConfigError`, with the option, if a number is missing or impossible."""
-    templates, word = init_command_object_factories(), arguments.object
+    templates, word = init_object_templates(), arguments.object
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
             if getattr(arguments, name):
@@ -227,7 +227,7 @@ _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 def _config_text(
     robot: str,
     about: str,
-    item: InitCommandObject | None,
+    item: ObjectWithInitialValues | None,
     proposal: ProposedConfigChoices,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
@@ -278,7 +278,7 @@ def _wrapped_list(values: Iterable[str], column: int) -> str:
     return "[" + f",\n{' ' * column}".join(entry.rstrip(", ") for entry in rows) + "]"
 
 
-def _of_object(item: InitCommandObject, proposal: ProposedConfigChoices) -> dict[str, Any]:
+def _of_object(item: ObjectWithInitialValues, proposal: ProposedConfigChoices) -> dict[str, Any]:
     """Initial dampings of an object, frames of points whose places are uncertain, and further frames for sensors."""
     tips = [f"w_{segment.name}" for segment in item.settings.segment_definitions()]
     of_points = [places for group, places in proposal.point_placements.items() if "." not in group]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.estimation import (
-    ChosenCableMemoryFit,
+    FitWithOrWithoutCableMemory,
     channels_worse_than_naive_prediction,
     choose_cable_memory_fit,
     prediction_errors_and_units,
@@ -75,7 +75,7 @@ run_from_arguments = make_settings_command(run_solve, "live")
 
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
-) -> ChosenCableMemoryFit:
+) -> FitWithOrWithoutCableMemory:
     """Estimate with the run's solver, and choose between the fits with and without a cable's shape memory."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria

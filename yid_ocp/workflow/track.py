@@ -228,7 +228,7 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
 
 
 def _camera_scene(run: RunSettings, system: System) -> SceneDescription:
-    return SceneDescription(system, run.model.robot, extra_meshes=run.model.extra_meshes)
+    return SceneDescription(system, run.model.robot, bodies_missing_from_urdf=run.model.bodies_missing_from_urdf)
 
 
 def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames_path"]) -> FrameSequence:

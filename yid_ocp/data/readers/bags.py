@@ -121,7 +121,7 @@ class OpenBag:
         )
 
 
-def relative_message_time_function(
+def time_since_first_message_function(
     messages: Sequence[BagMessage], origins: Sequence[BagMessage] | None = None
 ) -> Callable[[BagMessage], float]:
     """Return a function for a message's time [s] since the first of `origins` (default: of `messages`)."""
@@ -146,7 +146,7 @@ class _Contents:
 
 
 @dataclass(frozen=True)
-class BagOptions(base.SelectionAndUnitOptions):
+class BagOptions(base.JointPointAndUnitOptions):
     """Options of `read_bag`: topics, joints and points, with their names in the recording, and units.
 
     Messages that lack one of the `joints` are skipped. `joints` is required if the messages of a topic differ in their
@@ -198,7 +198,7 @@ def read_bag(
         raise bag.file.no_usable_topics_error("the bag has no joint states and no points", allowed)
     places = [message for entries in seen.values() for _, message in entries]
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]
-    seconds = relative_message_time_function(used_messages)
+    seconds = time_since_first_message_function(used_messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     points = []
     for frame, entries in seen.items():
@@ -453,7 +453,7 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
-    together, notes = base.merge_on_fastest_clock(made, where)
+    together, notes = base.joints_on_fastest_clock(made, where)
     for entry in groups:
         if entry.command:
             group = _joint_group(entry, seconds, f"{where}: {entry.topic}")

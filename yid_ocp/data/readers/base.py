@@ -125,7 +125,7 @@ def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, 
 
 
 @dataclass(frozen=True)
-class SelectionAndUnitOptions:
+class JointPointAndUnitOptions:
     """Options that readers share: selection and names of joints and points, and the file's units."""
 
     joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
@@ -137,7 +137,7 @@ class SelectionAndUnitOptions:
     gear_ratios: Mapping[str, float] | None = None
 
 
-def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
+def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAndUnitOptions) -> Recording:
     """Convert the recording `raw` to SI units, select joints and points, and validate the result.
 
     Raises `DataError` for an unknown joint, point, quantity or unit, for a current without torque constants, or if
@@ -196,7 +196,7 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
         raise DataError(what, where=where, allowed="a name of its own for each point", hint=hint)
 
 
-def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, where: str) -> Array:
+def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, where: str) -> Array:
     """N m per recorded unit of every joint, shape (nj,)."""
     constants, gear_ratios = options.torque_constants or {}, options.gear_ratios or {}
     for word, given in (("torque_constants", constants), ("gear_ratios", gear_ratios)):
@@ -260,7 +260,7 @@ def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
 _MAX_INTERPOLATED_PERIODS = 5.0  # longest interpolated gap in periods of its source
 
 
-def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
+def joints_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
     """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of

@@ -62,7 +62,7 @@ def read_c3d(
     group = PointGroup("points", *marked, None, point_sensor_name, point_frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
-    options = base.SelectionAndUnitOptions(point_names=point_names, units={**own, **(units or {})})
+    options = base.JointPointAndUnitOptions(point_names=point_names, units={**own, **(units or {})})
     return base.convert_to_si_and_validate(raw, str(path), options)
 
 

@@ -45,7 +45,7 @@ _LISTED = 5  # numbers of bad lines in a note
 
 
 @dataclass(frozen=True)
-class CsvOptions(base.SelectionAndUnitOptions):
+class CsvOptions(base.JointPointAndUnitOptions):
     """Options of `read_csv`: meaning of columns, columns to keep, delimiter, header and clock.
 
     `column_meanings` gives that of columns that `read_csv` does not recognise by name: `t`, `channel:joint`,

@@ -74,7 +74,7 @@ def read_lerobot_episode(
     `.torque`, `.effort` or `.current`, it is position, velocity and effort. `action` is the commanded position. Times
     are frame index / frame rate, a nominal clock. `units` must state the unit of angles (often degrees) if they cannot
     be radians, or if LeRobot never records this robot in radians. `notes` lists images and other features. The other
-    options are those of `SelectionAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
+    options are those of `JointPointAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
     `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode, or if
     `validated_recording` refuses the result.
     """
@@ -89,7 +89,7 @@ def read_lerobot_episode(
     if "position" not in (units or {}):
         _check_are_radians(group, dataset, where)
     return base.convert_to_si_and_validate(
-        raw, where, base.SelectionAndUnitOptions(joints, None, units, torque_constants, gear_ratios)
+        raw, where, base.JointPointAndUnitOptions(joints, None, units, torque_constants, gear_ratios)
     )
 
 

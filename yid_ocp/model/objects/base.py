@@ -127,7 +127,7 @@ class CableTopology:
 
 
 @dataclass(frozen=True)
-class InitCommandObject:
+class ObjectWithInitialValues:
     """An object from the command line of `init`, with initial values of its free parameters."""
 
     settings: ObjectBuilder  # without its mount
@@ -138,7 +138,7 @@ class InitCommandObject:
 
 
 @dataclass(frozen=True)
-class InitCommandObjectFactory:
+class InitObjectTemplate:
     """Default link number and builder of an object that `init --object` can name.
 
     `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
@@ -146,7 +146,7 @@ class InitCommandObjectFactory:
     """
 
     default_links: int  # per segment
-    build: Callable[[Mapping[str, Any], int], InitCommandObject]
+    build: Callable[[Mapping[str, Any], int], ObjectWithInitialValues]
     # further names that `--number NAME=VALUE` accepts, with their meanings
     further_numbers: Mapping[str, str] = field(default_factory=dict)
     has_branches: bool = False
@@ -199,7 +199,7 @@ class ObjectBuilder:
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
     default_link_refinement: ClassVar[bool] = False
-    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {}  # words of `init --object`
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("kind of object")]
@@ -231,7 +231,7 @@ class ObjectBuilder:
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Factor on a per-joint parameter that preserves segment stiffness if links are divided; else 1."""
         owner, _, quantity = parameter.rpartition(".")
-        per_joint = {segment.name for segment in self.segment_definitions() if not segment.stiffness_given_as_rigidity}
+        per_joint = {segment.name for segment in self.segment_definitions() if not segment.values_given_as_rigidities}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
@@ -287,6 +287,6 @@ class FixedRootObjectBuilder(ObjectBuilder):
 OBJECT_KINDS: Registry[type[ObjectBuilder]] = Registry("kind")
 
 
-def init_command_object_factories() -> dict[str, InitCommandObjectFactory]:
+def init_object_templates() -> dict[str, InitObjectTemplate]:
     """Templates of flexible objects by the value of `init --object` that selects them."""
-    return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_factories.items()}
+    return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

@@ -255,7 +255,7 @@ def _segments(
             twist=branch.twist_rigidity,
             damping=branch.bend_damping,
             twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
-            stiffness_given_as_rigidity=True,
+            values_given_as_rigidities=True,
             has_length_parameter_per_link=options.has_edge_lengths_per_recording,
         )
         segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
@@ -265,7 +265,7 @@ def _segments(
 
 @OBJECT_KINDS.register("cable")
 @dataclass(frozen=True, kw_only=True)
-class Cable(CableOptions, ObjectBuilder):
+class ClampedCable(CableOptions, ObjectBuilder):
     """A branched cable held by clamps at two ends. The clamps follow measured points; recordings give edge lengths."""
 
     settings_examples: ClassVar[Mapping[str, str]] = {

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitCommandObject, InitCommandObjectFactory
+from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitObjectTemplate, ObjectWithInitialValues
 from yid_ocp.options import OptionInfo
 
 _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]
@@ -34,9 +34,9 @@ def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObje
     return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
     names = [f"{segment.name}.{quantity}" for segment in foam_y_segments() for quantity in ("bend", "twist")]
-    return InitCommandObject(
+    return ObjectWithInitialValues(
         _FoamY(links=links), dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]", True
     )
 
@@ -46,9 +46,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 class _FoamY(FixedRootObjectBuilder):
     """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the position of that experiment."""
 
-    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
-        "foam_y": InitCommandObjectFactory(4, _init_object)
-    }
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {"foam_y": InitObjectTemplate(4, _init_object)}
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: foam_y": """\
 model:

@@ -13,7 +13,7 @@ from yid_ocp.files import attributes_by_name
 from yid_ocp.model.flexible import FlexibleSegment
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitCommandObject, InitCommandObjectFactory
+from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitObjectTemplate, ObjectWithInitialValues
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -23,7 +23,7 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlexibleSegmentSettings:
+class SegmentGeometrySettings:
     """Settings of one segment of rigid links. Stiffness and damping are set in `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed with link_lengths", "m")] = None
@@ -45,7 +45,7 @@ class FlexibleSegmentSettings:
     ] = None
     rpy: Annotated[_Vector3, OptionInfo("rest rotation relative to the parent's link or mount", "rad")] = _NO_TURN
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
-    stiffness_given_as_rigidity: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
+    values_given_as_rigidities: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
     has_length_parameter_per_link: Annotated[bool, OptionInfo("whether each link has its own length parameter")] = False
@@ -58,9 +58,9 @@ class FlexibleSegmentSettings:
             raise ModelError(what, where=where, allowed="length or link_lengths [m]", hint=hint)
         n = link_division
         # a rigidity does not depend on the number of links, a stiffness per joint does
-        factor = 1 if self.stiffness_given_as_rigidity else n
+        factor = 1 if self.values_given_as_rigidities else n
         lengths, index = self.link_lengths, self.parent_link_index
-        same = "mass radius parent stiffness_given_as_rigidity clamped_at_base joint_axes cross_section_size"
+        same = "mass radius parent values_given_as_rigidities clamped_at_base joint_axes cross_section_size"
         options = attributes_by_name(self, f"{same} has_length_parameter_per_link")
         return FlexibleSegment(
             name,
@@ -77,28 +77,28 @@ class FlexibleSegmentSettings:
         )
 
 
-def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> FlexibleSegmentSettings:
+def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> SegmentGeometrySettings:
     """A segment for `init`. A flat one bends only across its thinner side."""
     section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
-    return FlexibleSegmentSettings(stiffness_given_as_rigidity=True, clamped_at_base=more.get("parent") is None, **more)
+    return SegmentGeometrySettings(values_given_as_rigidities=True, clamped_at_base=more.get("parent") is None, **more)
 
 
-def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitCommandObject:
+def _init_object(word: str, segments: Mapping[str, SegmentGeometrySettings]) -> ObjectWithInitialValues:
     item = _SegmentedObject(named_segments=segments)
     start = base.initial_parameters_with_comments(item.segment_definitions(), _RIGIDITY_RATIO[word])
-    return InitCommandObject(item, start)
+    return ObjectWithInitialValues(item, start)
 
 
-def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _cable(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
     length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_AND_MASS_DESCRIPTIONS)
     section = _section(numbers)
     segment = _init_segment(links, length, mass, None if section else radius, cross_section_size=section)
     return _init_object("cable", {"cable": segment})
 
 
-def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _beam(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
     sizes = {name: base.SIZE_AND_MASS_DESCRIPTIONS[name] for name in ("length", "mass")}
     length, mass = base.required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
@@ -109,7 +109,7 @@ def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section_size=section)})
 
 
-def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _tree(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
     if numbers.get("branch"):
         return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
     if not numbers.get("branches"):
@@ -134,9 +134,9 @@ def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
     return x, y
 
 
-def _grown(branches: Sequence[tuple[str, FlexibleSegmentSettings]]) -> dict[str, FlexibleSegmentSettings]:
+def _grown(branches: Sequence[tuple[str, SegmentGeometrySettings]]) -> dict[str, SegmentGeometrySettings]:
     """Branches by name, after a check for unique names and for parents that precede their children."""
-    made: dict[str, FlexibleSegmentSettings] = {}
+    made: dict[str, SegmentGeometrySettings] = {}
     for name, branch in branches:
         if name in made:
             what, allowed = f"two branches are called '{name}'", "a name of its own for each branch"
@@ -149,7 +149,7 @@ def _grown(branches: Sequence[tuple[str, FlexibleSegmentSettings]]) -> dict[str,
     return made
 
 
-def _branch(text: str, links: int) -> tuple[str, FlexibleSegmentSettings]:
+def _branch(text: str, links: int) -> tuple[str, SegmentGeometrySettings]:
     said, equals, numbers = text.partition("=")
     name, at, parent = said.partition("@")
     count = len(numbers.split(","))
@@ -170,10 +170,10 @@ class _SegmentedObject(FixedRootObjectBuilder):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
-    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
-        "cable": InitCommandObjectFactory(8, _cable),
-        "beam": InitCommandObjectFactory(6, _beam),
-        "tree": InitCommandObjectFactory(4, _tree, has_branches=True),
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
+        "cable": InitObjectTemplate(8, _cable),
+        "beam": InitObjectTemplate(6, _beam),
+        "tree": InitObjectTemplate(4, _tree, has_branches=True),
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: segments": """\
@@ -191,13 +191,13 @@ model:
     kind: segments
     named_segments:
       beam: {length: 0.52, mass: 0.33, cross_section_size: [0.001, 0.08], links: 8, joint_axes: y, \
-stiffness_given_as_rigidity: true, clamped_at_base: true}
+values_given_as_rigidities: true, clamped_at_base: true}
 """,
     }
 
     kind: Annotated[Literal["segments"], OptionInfo("kind of object")] = "segments"
     mount: Annotated[base.MountSettings, OptionInfo("pose of the root")] = field(default_factory=base.MountSettings)
-    named_segments: Annotated[Mapping[str, FlexibleSegmentSettings], OptionInfo("segments by name, parents first")] = (
+    named_segments: Annotated[Mapping[str, SegmentGeometrySettings], OptionInfo("segments by name, parents first")] = (
         field(default_factory=dict)
     )
 

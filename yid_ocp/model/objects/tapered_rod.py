@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitCommandObject, InitCommandObjectFactory
+from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitObjectTemplate, ObjectWithInitialValues
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -21,12 +21,12 @@ _SEGMENT = "rod"
 _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
     length, mass, radius, tip = base.required_object_numbers(
         "a tapered rod", numbers, base.SIZE_AND_MASS_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitCommandObject(item, base.initial_parameters_with_comments(item.segment_definitions(), 1.0))
+    return ObjectWithInitialValues(item, base.initial_parameters_with_comments(item.segment_definitions(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
@@ -39,8 +39,8 @@ class TaperedRod(FixedRootObjectBuilder):
     """
 
     default_link_refinement = True
-    init_factories: ClassVar[Mapping[str, InitCommandObjectFactory]] = {
-        "tapered_rod": InitCommandObjectFactory(8, _init_object, _FURTHER_NUMBERS)
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
+        "tapered_rod": InitObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: tapered_rod": """\
@@ -62,7 +62,7 @@ parameters:
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
         """Build the rod as one segment with the radius of its base. `build` then tapers the links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
-        rod = FlexibleSegment(_SEGMENT, *sizes, damping=damping, stiffness_given_as_rigidity=True, clamped_at_base=True)
+        rod = FlexibleSegment(_SEGMENT, *sizes, damping=damping, values_given_as_rigidities=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
