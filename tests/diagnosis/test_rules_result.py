@@ -125,9 +125,10 @@ def test_candidates_are_listed_with_what_was_added_first():
     assert finding(screening=chance).to_dict()["statistics"]["candidate"] == 1.0
     # of an unknown gap, refits before scores
     made = finding(
-        "unknown", single_effect_models=(fit([OFFSET]),), screening=screening([score(FRICTION), score(OFFSET)])
+        "unknown", single_effect_models=(fit([OFFSET]), fit([third])), screening=screening([score(FRICTION, 0.1)])
     )
-    assert [entry["kind"] for entry in _ranked_candidates(made, made)] == ["offset", "friction"]
+    told = [(entry["kind"], entry["p_value"]) for entry in _ranked_candidates(made, made)]
+    assert told == [("offset", 1.0), ("third", 1.0), ("friction", 0.1)], "what has no score is not sure of anything"
 
 
 def test_rejected_candidates_say_what_they_close_and_why_they_are_none():

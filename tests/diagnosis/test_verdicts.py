@@ -115,15 +115,16 @@ def test_a_model_that_is_right_has_no_gap(bench):
 @pytest.mark.usefixtures("without_law")
 def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench, friction, verdict, steps):
     """Steps four times as long as those of the recordings; refits of the finer step have names of their own."""
-    own = {"joint_coulomb@elbow": friction} if friction else {}
+    own = {f"joint_coulomb@{joint}": friction for joint in ("shoulder", "elbow") if friction}
     recordings = [bench.recording(own, seed, duration=3.0) for seed in (1, 2)]
     coarse, names = Bench(bench.system, step_with_time_step(bench.step, 0.04)), []
     known = NominalSolutionAndRefitStore(
-        store=SimpleNamespace(get=lambda name: None, put=lambda name, fit: names.append(name))
+        store=SimpleNamespace(stored_refit=lambda name: None, put=lambda name, fit: names.append(name))
     )
     candidates = ["joint_coulomb", "effort_offset"]
     finding = diagnose(coarse.problem(recordings[:1]), candidates, recordings[1:], known_fits=known)
     assert (finding.verdict, finding.stated_and_finer_time_step) == (verdict, steps)
+    assert {effect.label for effect in finding.accepted_effects} == set(own)
     told = finding.to_dict()
     assert ("The discretisation error of 0.04 s steps looks like a gap" in told["summary"]) is (steps is not None)
     assert ("the nominal model at 0.02 s" in names) is (steps is not None)

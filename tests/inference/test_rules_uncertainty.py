@@ -70,6 +70,8 @@ def stiffness(value, std, said):
         # its bound is far away, and within reach
         (50.0, 1.0, "identifiable", (None, 51.0), "weak", math.inf),
         (98.0, 2.0, "weak", (95.0, None), "weak", 2.0),
+        (10.0, 1.0, "identifiable", (None, 11.0), "weak", 10.0 / 1.959963984540054),
+        (90.0, 2.0, "weak", (85.0, None), "weak", 10.0 / 1.959963984540054),
     ],
 )
 def test_no_verdict_and_no_spread_contradicts_a_profile(value, std, said, interval, expected, spread):
@@ -577,3 +579,6 @@ def test_a_mass_that_scales_with_a_motor_is_known_by_the_motors_priors(own_part,
     assert determined_by(4, 0) == named
     assert determined_by(5, 0) == named[:1]
     assert determined_by(4, 3) == determined_by(4, 0, priors[:0]) == []
+    # in whatever unit
+    data *= (units := np.array([1.0, 1.0, 1e-12, 1.0, 1.0]))
+    assert determined_by(4, 0, priors * units) == named
