@@ -36,6 +36,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 ARMS = {"single": 1, "dual": 2}
 STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 
+gc.disable()  # until all is imported: see `pytest_collection_finish`
 hypothesis.settings.register_profile("tests", deadline=None, max_examples=20, derandomize=True)
 hypothesis.settings.load_profile("tests")
 
@@ -80,6 +81,7 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

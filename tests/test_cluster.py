@@ -24,7 +24,11 @@ from yid_ocp.parallel.resumable_tasks import _dask_executor as connected
 from yid_ocp.version import software_fingerprint
 from yid_ocp.workflow.blind import run_blind
 
-distributed = pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
+
+@pytest.fixture(scope="module", autouse=True)
+def distributed():
+    """The package, which takes half a second to import."""
+    return pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
 
 
 def tasks(marks: Path, count: int = 12) -> list[Task]:
@@ -33,17 +37,17 @@ def tasks(marks: Path, count: int = 12) -> list[Task]:
 
 
 @pytest.fixture(scope="module")
-def scheduler():
+def scheduler(distributed):
     """Address of a scheduler with two workers of one thread each, and the cluster itself."""
     where = {"dashboard_address": None, "host": "127.0.0.1", "scheduler_kwargs": {"allowed_failures": 1}}
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **where) as cluster:
         cluster.wait_for_workers(2, timeout=60)
         address = cluster.scheduler_address
-        yield SimpleNamespace(address=address, cluster=cluster, config=WorkerConfig(None, address))
+        yield SimpleNamespace(package=distributed, address=address, cluster=cluster, config=WorkerConfig(None, address))
 
 
 def processes(scheduler: Any) -> list[int]:
-    with distributed.Client(scheduler.address, set_as_default=False) as client:
+    with scheduler.package.Client(scheduler.address, set_as_default=False) as client:
         return list(client.run(os.getpid).values())
 
 
@@ -120,7 +124,7 @@ def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeyp
         pass
 
 
-def test_workers_of_several_threads_are_refused():
+def test_workers_of_several_threads_are_refused(distributed):
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
         pytest.raises(ParallelWorkError, match="2 tasks at once in one process"),
@@ -151,7 +155,7 @@ def test_a_scheduler_file_will_do(scheduler, tmp_path):
 
 
 @pytest.mark.parametrize(("failures", "refused"), [(2, False), (3, True)])
-def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, monkeypatch, failures, refused):
+def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, distributed, monkeypatch, failures, refused):
     """Dask asserts that it runs after ten seconds."""
     real, asked = distributed.Client, []
 

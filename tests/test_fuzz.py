@@ -14,14 +14,14 @@ from yid_ocp.errors import DataError
 from yid_ocp.vision.frames import import_open3d
 
 pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
-try:
-    import_open3d()
-except DataError as error:
-    pytest.skip(str(error), allow_module_level=True)
 
 
 @pytest.fixture(scope="module")
 def fuzz(benchmark_module):
+    try:
+        import_open3d()
+    except DataError as error:
+        pytest.skip(str(error))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))  # its workers find it by its name
         yield benchmark_module("fuzz")

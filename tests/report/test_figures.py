@@ -8,8 +8,6 @@ import casadi as ca
 import numpy as np
 import plotly.graph_objects as go
 import pytest
-import trimesh
-from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -176,6 +174,8 @@ def test_meshes_are_read_again_where_a_file_changed(single_arm, tmp_path, monkey
 
     def width(edge: float | None = None) -> float:
         if edge is not None:
+            import trimesh  # half a second
+
             trimesh.creation.box([edge, 0.1, 0.1]).export(tmp_path / "box.stl")
         [(flat, _)] = animations_to_dict([animation_of_trajectories("a", [told])], str(robot))["meshes"].values()
         return np.ptp(np.reshape(flat, (-1, 3)), axis=0).max() / 1e4
@@ -216,6 +216,8 @@ def test_what_acts_is_where_it_acts(single_arm):
 @pytest.fixture
 def drawn(monkeypatch):
     """Figures that were saved."""
+    from matplotlib.figure import Figure  # half a second
+
     saved, save = [], Figure.savefig
     monkeypatch.setattr(
         Figure, "savefig", lambda self, *given, **more: (saved.append(self), save(self, *given, **more))

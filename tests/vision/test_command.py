@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 from yid_ocp.cli import build_argument_parser, main
 from yid_ocp.config.reader import load_config
@@ -50,6 +49,8 @@ def whole(config):
 
 
 def test_track_makes_a_recording_that_solve_reads(whole, small, system):
+    from matplotlib.image import imread  # half a second
+
     assert whole.code == 0, whole.err
     assert "3 of 3 frames are good" in whole.out
     assert "w_T1" in whole.out
