@@ -207,7 +207,7 @@ def to_lossless_plain_data(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def attributes_by_name(value: Any, names: str) -> dict[str, Any]:
+def attributes_to_dict(value: Any, names: str) -> dict[str, Any]:
     """Return attributes of `value` listed in `names` (blank-separated), by name. `key=name` stores one under `key`."""
     pairs = [name.partition("=") for name in names.split()]
     return {key: getattr(value, name or key) for key, _, name in pairs}

@@ -15,7 +15,7 @@ from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.files import attributes_by_name
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
@@ -167,7 +167,7 @@ def _checked_solution_and_step_stability(
 
 def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | None:
     names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
-    return None if growth is None else attributes_by_name(growth, names)
+    return None if growth is None else attributes_to_dict(growth, names)
 
 
 _MEMORY_SUFFIX = ".memory"

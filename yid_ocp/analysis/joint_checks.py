@@ -70,19 +70,19 @@ class RecordedJointsModel:
         return tuple(mechanism.joints[mechanism.joint_index(name)] for name in self.joint_names)
 
     @property
-    def joint_configuration_indices(self) -> tuple[int, ...]:
+    def system_configuration_indices(self) -> tuple[int, ...]:
         """Indices of the joints in the system's configuration vector."""
         return tuple(self.system.mechanism.joint_index(name) for name in self.joint_names)
 
     def is_frame_determined_by_angles(self, frame: str) -> bool:
         """Whether a frame's position follows from the recorded angles alone."""
         tree = self.system.mechanism
-        return {*tree.ancestor_joint_indices(tree.frame(frame).joint_index)} <= {*self.joint_configuration_indices}
+        return {*tree.ancestor_joint_indices(tree.frame(frame).joint_index)} <= {*self.system_configuration_indices}
 
     @cached_property
     def _has_no_unknown_descendants(self) -> bool:
         """Whether no joint with unknown angle is attached to the recorded joints."""
-        ancestors, known = self.system.mechanism.ancestor_joint_indices, set(self.joint_configuration_indices)
+        ancestors, known = self.system.mechanism.ancestor_joint_indices, set(self.system_configuration_indices)
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
@@ -125,14 +125,14 @@ class RecordedJointsModel:
         by_v = rigid.lagrangian_by_v
         effort = ca.jtimes(by_v, full[0], full[1]) + ca.jtimes(by_v, full[1], full[2]) - rigid.lagrangian_by_q
         placed = ca.vertcat(*(self._placed(x) for x in known))
-        effort = ca.substitute(effort[list(self.joint_configuration_indices)], ca.vertcat(*full), placed)
+        effort = ca.substitute(effort[list(self.system_configuration_indices)], ca.vertcat(*full), placed)
         by = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self.unknown_load_parameters))
         parts = effort, ca.jacobian(effort, by)
         return ca.Function("effort", known, [ca.densify(self._numbers(part)) for part in parts])
 
     def _placed(self, known: ca.SX) -> ca.SX:
         full = ca.SX.zeros(self.system.n_coordinates)
-        for row, i in enumerate(self.joint_configuration_indices):
+        for row, i in enumerate(self.system_configuration_indices):
             full[i] = known[row]
         return full
 

@@ -215,7 +215,7 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
 
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
     """Distances from a frame to joint origins along the unknown part of its chain, root first; None without any."""
-    mechanism, known = system.mechanism, set() if arm is None else set(arm.joint_configuration_indices)
+    mechanism, known = system.mechanism, set() if arm is None else set(arm.system_configuration_indices)
     entry = mechanism.frame(frame)
     chain = [i for i in mechanism.ancestor_joint_indices(entry.joint_index) if i not in known]
     if not chain or any(mechanism.joints[i].kind == "prismatic" for i in chain):

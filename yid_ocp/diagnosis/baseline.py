@@ -51,7 +51,7 @@ class _ParameterShift:
 
 
 @dataclass(frozen=True)
-class EarlierRunsComparison:
+class ParameterShiftsSinceBaseline:
     """Comparison of a fit with baseline runs: their agreement, and the shift of every parameter."""
 
     is_baseline_explained: bool  # whether the model explained the earlier runs' recordings
@@ -110,7 +110,7 @@ class DiagnosisBaseline:
         known, chi2, degrees = pool_estimates_and_chi2(runs)
         return DiagnosisBaseline(known, chi2_p_value(chi2, degrees), without)
 
-    def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> EarlierRunsComparison | None:
+    def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> ParameterShiftsSinceBaseline | None:
         """Compute the shifts of a fit's parameters from its baseline prior. None if there are no runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
@@ -132,7 +132,7 @@ class DiagnosisBaseline:
                 p = float(2 * scipy.special.ndtr(-abs(score)))
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, fit.std[name])
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
-        return EarlierRunsComparison(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
+        return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
     def fit_parameters_differ_significantly(self, fit: RefittedModel, limits: Thresholds) -> bool:
         """Whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""

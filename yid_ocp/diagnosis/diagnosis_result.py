@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.diagnosis.baseline import EarlierRunsComparison, EffectRemovalAndAdditionErrors
+from yid_ocp.diagnosis.baseline import EffectRemovalAndAdditionErrors, ParameterShiftsSinceBaseline
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
@@ -20,7 +20,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, abbreviated_names_text
 from yid_ocp.effects import EffectBase
-from yid_ocp.files import attributes_by_name, to_json_types
+from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult, largest_gap_locations
 from yid_ocp.inference.uncertainty import priors_that_determine_unknown
@@ -57,7 +57,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     is_split_in_blocks: bool
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
-    baseline_comparison: EarlierRunsComparison | None = None
+    baseline_comparison: ParameterShiftsSinceBaseline | None = None
     counterfactual: EffectRemovalAndAdditionErrors | None = None
     next_experiment: str = ""
     summary: str = ""
@@ -105,12 +105,12 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     def to_dict(self) -> dict[str, Any]:
         """Convert the result to a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
         judged, since, baseline = judgement_to_dict(self, self, self.gap_locations), self.baseline_comparison, None
-        after = _errors(self.final_model) | attributes_by_name(self.remaining_test, "chi2_per_dof p_value")
-        left = [attributes_by_name(place, _PLACE) for place in self.remaining_gap_locations]
+        after = _errors(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
+        left = [attributes_to_dict(place, _PLACE) for place in self.remaining_gap_locations]
         reason = "; ".join(check.both_estimates_text for check in self.failed_transfer_checks)
         rejected = self.selected_effects if self.unknown_reason == "stand_in" else ()
         if since is not None:
-            shifts = {e.name: attributes_by_name(e, f"{_SHIFT} changed=has_changed") for e in since.parameter_shifts}
+            shifts = {e.name: attributes_to_dict(e, f"{_SHIFT} changed=has_changed") for e in since.parameter_shifts}
             baseline = {"parameters": shifts}
         found = {
             "format": "yid-diagnosis/2",
@@ -120,7 +120,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             "reason": self.unknown_reason,
             "law": None if self.law is None else self.law.to_dict(),
             "rejected_candidates": [
-                {**attributes_by_name(e.effect, _EFFECT), **_closure(e.cumulative_closure), "reason": reason}
+                {**attributes_to_dict(e.effect, _EFFECT), **_closure(e.cumulative_closure), "reason": reason}
                 for e in rejected
             ],
             "events": [event.to_dict() for event in self.events.disturbances],
@@ -141,16 +141,16 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
     """Convert the rule-based, scored part of a diagnosis to a JSON-compatible dictionary."""
     added = judged.accepted_selections
-    before = _errors(seen.nominal_model) | attributes_by_name(seen.nominal_held_out_test, "chi2_per_dof p_value")
+    before = _errors(seen.nominal_model) | attributes_to_dict(seen.nominal_held_out_test, "chi2_per_dof p_value")
     rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
     found = {
         "verdict": judged.verdict,
         "probability": judged.probability,
         "gap": {"before": before, **_closure(judged.gap_closure if added else UNDEFINED_GAP_CLOSURE)},
-        "where": [attributes_by_name(place, _PLACE) for place in where],
+        "where": [attributes_to_dict(place, _PLACE) for place in where],
         "which": _ranked_candidates(judged, seen),
-        "effects": [attributes_by_name(entry.effect, _EFFECT) for entry in added],
-        "confusable": [[attributes_by_name(effect, _EFFECT) for effect in own] for own in rivals],
+        "effects": [attributes_to_dict(entry.effect, _EFFECT) for entry in added],
+        "confusable": [[attributes_to_dict(effect, _EFFECT) for effect in own] for own in rivals],
     }
     return dict(to_json_types(found))
 
@@ -202,9 +202,9 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     for effect, reported in found:
         score = scores.get(effect.label, CandidateScore(effect, {}, 0.0, 0.0, 1.0))
         entry = {
-            **attributes_by_name(effect, _EFFECT),
-            "parameters": {name: attributes_by_name(own, "value std unit") for name, own in reported.items()},
-            **attributes_by_name(score, "score=lm_statistic p_value"),
+            **attributes_to_dict(effect, _EFFECT),
+            "parameters": {name: attributes_to_dict(own, "value std unit") for name, own in reported.items()},
+            **attributes_to_dict(score, "score=lm_statistic p_value"),
             "probability": probabilities.get(effect.label, 0.0),
             **_closure(closures.get(effect.label, UNDEFINED_GAP_CLOSURE)),
         }

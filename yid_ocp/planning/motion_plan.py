@@ -35,7 +35,7 @@ _CONVERGED_TOLERANCE_FRACTION = 0.1  # change after halving, as a fraction of th
 
 
 @dataclass(frozen=True)
-class ParameterCovariance:
+class EstimatedParameterCovariance:
     """Covariance matrix of uncertain model parameters, in the order of `parameter_names`."""
 
     parameter_names: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ def plan_motion_to_target(
     step: Step,
     options: PlanOptions,
     theta: Array | None = None,
-    known: ParameterCovariance | None = None,
+    known: EstimatedParameterCovariance | None = None,
     progress: Progress = NULL_PROGRESS,
 ) -> TargetMotionPlan:
     """Plan a motion of a step's prescribed joints that brings a point to a target.
@@ -81,7 +81,7 @@ def plan_motion_to_target(
     if system.driven or not system.prescribed:
         what, hint = "the model has no prescribed joint", "set model.robot, and model.arms.mode: prescribed"
         raise ConfigError(what, where="plan", allowed="a robot whose arms are prescribed", hint=hint)
-    known = ParameterCovariance() if known is None else known
+    known = EstimatedParameterCovariance() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
     progress.begin_stage("finding where the motion begins and ends")
     start = solve_start_equilibrium(step, values, _posture(system, options, values))
@@ -170,7 +170,7 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
             raise ConfigError(what, where="plan.box", allowed=f"{low[row]:.4g} to {high[row]:.4g} m", hint=hint)
 
 
-def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> TargetMotionPlan:
+def _attempt(rows: PlanResidualAndLimitFunctions, known: EstimatedParameterCovariance) -> TargetMotionPlan:
     """Find the best motion of one duration, refined with shorter time steps to resolve residual motion."""
     options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
     lower, upper = mover.coefficient_bounds()
@@ -205,7 +205,9 @@ def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array)
     return bool(np.all(np.array([place / reached, speed / rest]) <= _CONVERGED_TOLERANCE_FRACTION))
 
 
-def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) -> list[PlanResidualAndLimitFunctions]:
+def _scenarios(
+    rows: PlanResidualAndLimitFunctions, known: EstimatedParameterCovariance
+) -> list[PlanResidualAndLimitFunctions]:
     """The same motion with parameters off by one std, along the axes that move the point's equilibrium most."""
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
@@ -228,7 +230,7 @@ def _scenarios(rows: PlanResidualAndLimitFunctions, known: ParameterCovariance) 
     return found
 
 
-def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: ParameterCovariance) -> Array:
+def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: EstimatedParameterCovariance) -> Array:
     """Derivative of the point's final position, at each final node, by the uncertain parameters, (nodes, 3, count)."""
     mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.node_indices_after_motion
     rollout = mover.simulate_path(w, names=known.parameter_names)
@@ -238,7 +240,7 @@ def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: Paramete
 
 
 def _outcome(
-    rows: PlanResidualAndLimitFunctions, shot: TargetMotionCoefficients, known: ParameterCovariance
+    rows: PlanResidualAndLimitFunctions, shot: TargetMotionCoefficients, known: EstimatedParameterCovariance
 ) -> TargetMotionPlan:
     mover = rows.simulator
     rollout, std = mover.simulate_path(shot.w), None

@@ -9,7 +9,7 @@ from typing import Any
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodsComparisonResult, compare_methods
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import Progress
-from yid_ocp.files import attributes_by_name
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import SOLVERS, Iterate, Status
@@ -64,11 +64,11 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
 def _compare_result(problem: EstimationProblem, comparison: MethodsComparisonResult) -> dict[str, Any]:
     methods = {}
     for run in comparison.method_results:
-        own = attributes_by_name(run, "whitened_cost wall_seconds cpu_seconds peak_memory_mib")
+        own = attributes_to_dict(run, "whitened_cost wall_seconds cpu_seconds peak_memory_mib")
         own["disagreements"] = comparison.disagreements[run.method]
         methods[run.method] = solution_to_result_dict(problem, run.solution, run.held_out_predictions) | own
     names = "reference=reference_method agree=is_consistent explained=explanations disturbed=has_process_noise"
-    return {"format": "yid-compare/1", "methods": methods, **attributes_by_name(comparison, names)}
+    return {"format": "yid-compare/1", "methods": methods, **attributes_to_dict(comparison, names)}
 
 
 run_from_arguments = make_settings_command(_run_compare)

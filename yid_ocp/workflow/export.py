@@ -27,7 +27,7 @@ from yid_ocp.export.signals import (
     export_recording_csv_files,
     ros_signals_from_recording,
 )
-from yid_ocp.files import attributes_by_name, file_sha256, to_json_types, write_strict_json, write_text
+from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
@@ -263,7 +263,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         return {"status": "not done", "reason": error.what}
     channels = {}
     for name, mismatch in after.items():
-        own = attributes_by_name(mismatch, "unit noise=noise_rms after=rmse")
+        own = attributes_to_dict(mismatch, "unit noise=noise_rms after=rmse")
         channels[name] = own | {"before": before[name].rmse, "fall": _fall([(before[name], mismatch)])}
     return {
         "status": "done",

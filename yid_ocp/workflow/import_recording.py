@@ -25,7 +25,7 @@ from yid_ocp.data.readers.base import (
 )
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.files import attributes_by_name
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.options import mapping_value_type, options_by_key
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
 from yid_ocp.sensors import SensorOptions
@@ -82,7 +82,7 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
             progress.begin_stage(f"reading {file}")
             contents = preview_file(file, progress)
             keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
-            sources = [attributes_by_name(own, keys) for own in contents.sources]
+            sources = [attributes_to_dict(own, keys) for own in contents.sources]
             options = {**contents.reader_options, **asked}
             found.append({"sources": sources, "options": contents.reader_options, "notes": contents.notes})
             lines = third_party_file_summary_lines(contents)

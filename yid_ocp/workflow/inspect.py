@@ -19,7 +19,7 @@ from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.display import Progress
 from yid_ocp.errors import ModelError
 from yid_ocp.export.equations import export_step_functions
-from yid_ocp.files import attributes_by_name
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepResidualsAndJacobians
@@ -98,11 +98,11 @@ def _run_inspect(
             },
             "equations": step_diagnostics.step_complexity_summary(step),
             "blocks": {
-                kind: [attributes_by_name(block, "name meaning names=full_names") for block in own if block.labels]
+                kind: [attributes_to_dict(block, "name meaning names=full_names") for block in own if block.labels]
                 for kind, own in blocks.items()
             },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
-            "dependence": {entry.parameter: attributes_by_name(entry, _DEPENDENCE_KEYS) for entry in dependences},
+            "dependence": {entry.parameter: attributes_to_dict(entry, _DEPENDENCE_KEYS) for entry in dependences},
             "linearisation": {
                 "at": point.description,
                 "norms": {name: float(np.linalg.norm(matrix)) for name, matrix in matrices.items()},
@@ -212,7 +212,7 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
 def _entry_result(entry: EquationOrDerivativeFormula, symbols: NamedStepEquations, at: Array) -> dict[str, Any]:
     names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
     value = entry.numeric_value(symbols.all_variable_symbols, at)
-    return attributes_by_name(entry, names) | {"operations": entry.formula.n_operations, "value": value}
+    return attributes_to_dict(entry, names) | {"operations": entry.formula.n_operations, "value": value}
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:

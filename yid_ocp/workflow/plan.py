@@ -18,10 +18,10 @@ from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_record
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
-from yid_ocp.files import attributes_by_name
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
-from yid_ocp.planning.motion_plan import ParameterCovariance, TargetMotionPlan, plan_motion_to_target
+from yid_ocp.planning.motion_plan import EstimatedParameterCovariance, TargetMotionPlan, plan_motion_to_target
 from yid_ocp.problem.measurements import recording_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter
@@ -102,13 +102,13 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
 
 def identified_parameters_with_covariance(
     run: RunSettings, step: Step
-) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
+) -> tuple[Array, EstimatedParameterCovariance, dict[str, Any]]:
     """Parameters, their covariance and their source: a run folder of `solve`, or the settings."""
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run_folder is None:
         values = {name: parameters[name].value for name in free_parameter_names(run, parameters)}
-        return theta, ParameterCovariance(), {"run": None, "parameters": values}
+        return theta, EstimatedParameterCovariance(), {"run": None, "parameters": values}
     result, folder = _read_parameter_run(run, ("solve",))
     _require_same_effects(run, result["parameters"], parameters.names)
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
@@ -121,7 +121,7 @@ def identified_parameters_with_covariance(
     certain = tuple(names[i] for i in usable)
     lost = sorted(name for name in found if result["parameters"][name]["free"] and name not in certain)
     source = {"run": str(folder), "parameters": found, "uncertainty_unknown": lost}
-    return theta, ParameterCovariance(certain, np.nan_to_num(covariance[np.ix_(usable, usable)])), source
+    return theta, EstimatedParameterCovariance(certain, np.nan_to_num(covariance[np.ix_(usable, usable)])), source
 
 
 def _plan_as_recording(run: RunSettings, found: _Plan) -> Recording:
@@ -166,7 +166,7 @@ def _share(values: Array, limit: float) -> float | None:
 
 def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
     names = "place=target_position error=max_position_error swing=max_residual_speed off_path=max_path_deviation"
-    own = attributes_by_name(found, f"{names} std=end_position_std evaluations=n_evaluations")
+    own = attributes_to_dict(found, f"{names} std=end_position_std evaluations=n_evaluations")
     asked = {"point": run.plan.point, "tolerance": run.plan.position_tolerance}
     return own | asked | {"time_step": found.simulator.step.time_step}
 
@@ -232,14 +232,14 @@ def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> 
     rest = "unseen=unobservable_parameters open=unidentifiable_directions"
     starts = "first=initial_criterion value=final_criterion judged=configured_criterion finished=is_converged"
     return {
-        **attributes_by_name(run.plan, "inform=parameters_to_identify separate=effects_to_discriminate"),
-        "parameters": {name: attributes_by_name(own, stds) for name, own in found.parameter_precisions.items()},
+        **attributes_to_dict(run.plan, "inform=parameters_to_identify separate=effects_to_discriminate"),
+        "parameters": {name: attributes_to_dict(own, stds) for name, own in found.parameter_precisions.items()},
         "distances": [
             {"effect": first, "explained_by": second, "before": before, "after": after}
             for (first, second), (before, after) in found.effect_distances.items()
         ],
-        "starts": [attributes_by_name(start, f"{starts} rounds=n_iterations") for start in found.start_results],
-        **attributes_by_name(found, f"best=best_start_index limits_reached=active_limits {rest}"),
+        "starts": [attributes_to_dict(start, f"{starts} rounds=n_iterations") for start in found.start_results],
+        **attributes_to_dict(found, f"best=best_start_index limits_reached=active_limits {rest}"),
     }
 
 

@@ -24,7 +24,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recording
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, YidError
-from yid_ocp.files import attributes_by_name, file_sha256, is_file, read_input_json
+from yid_ocp.files import attributes_to_dict, file_sha256, is_file, read_input_json
 from yid_ocp.model.objects import ObjectBuilder
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import ChannelPrediction
@@ -281,14 +281,14 @@ def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
     for entry in found.parameter_drifts:
         known = zip(entry.run_names, entry.values, entry.std, strict=True)
         values = {name: {"value": value, "std": std} for name, value, std in known}
-        own = attributes_by_name(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
+        own = attributes_to_dict(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
         parameters[entry.name] = own | {"values": values}
     names = "name=run_name chi2 degrees=degrees_of_freedom p_value worst=worst_parameter"
     names += " explains=is_fit_adequate distrusted=is_outlier"
     return {
         "format": "yid-history/1",
-        **attributes_by_name(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
-        "runs": [attributes_by_name(entry, names) for entry in found.run_outlier_tests],
+        **attributes_to_dict(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
+        "runs": [attributes_to_dict(entry, names) for entry in found.run_outlier_tests],
         "parameters": parameters,
     }
 
@@ -323,7 +323,7 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     pairs.sort(key=lambda pair: "estimate" in roles[pair[0].recording])
     channels = [
         {
-            **attributes_by_name(own, "recording channel unit"),
+            **attributes_to_dict(own, "recording channel unit"),
             "held_out": "estimate" not in roles[own.recording],
             "rmse": {labels[0]: own.rmse, labels[1]: other.rmse},
             "difference": replace(other, t=own.t, predicted=other.predicted_at(own.t), measured=own.predicted).rmse,

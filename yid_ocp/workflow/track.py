@@ -21,7 +21,7 @@ from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.display import Progress
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.files import (
-    attributes_by_name,
+    attributes_to_dict,
     dataclass_from_plain_data,
     file_sha256,
     json_sha256,
@@ -152,7 +152,7 @@ def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, An
     names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
     known = {"distance": "mean_distance", "covered": "visible_length_coverage", "contested": "contested_fraction"}
     found = {key: fit and getattr(fit, name) for key, name in known.items()}
-    return found | attributes_by_name(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
+    return found | attributes_to_dict(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
 
 
 def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:
@@ -339,7 +339,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     try:
         return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).estimate_shared_values()))
     except DataError as error:
-        return {"refused": attributes_by_name(error, "what where allowed hint")}
+        return {"refused": attributes_to_dict(error, "what where allowed hint")}
 
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:

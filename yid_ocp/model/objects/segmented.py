@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.files import attributes_by_name
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.model.flexible import FlexibleSegment
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.objects import base
@@ -61,7 +61,7 @@ class SegmentGeometrySettings:
         factor = 1 if self.values_given_as_rigidities else n
         lengths, index = self.link_lengths, self.parent_link_index
         same = "mass radius parent values_given_as_rigidities clamped_at_base joint_axes cross_section_size"
-        options = attributes_by_name(self, f"{same} has_length_parameter_per_link")
+        options = attributes_to_dict(self, f"{same} has_length_parameter_per_link")
         return FlexibleSegment(
             name,
             self.length if self.length is not None else float(sum(lengths or ())),
