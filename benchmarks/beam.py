@@ -1,12 +1,12 @@
 """Identify a beam from a recorded run with ever more links, and carry its rigidity on to infinitely many.
 
-    python benchmarks/beam.py [CONFIG] [--segment beam] [--links 2 4 8 16]
+    python benchmarks/beam.py [CONFIG] [--segment beam] [--divisions 1 2 4 8 16]
 
-A chain of equal links with twice the stiffness at its clamped first joint is a beam of some other rigidity, by a
-difference that falls with the square of the number of links: EI_n = EI + c/n^2 is fitted to the last two. From EI
-follow Young's modulus, with the second moment of area of the section, and the first frequency of a clamped beam,
-f = 1.8751^2 / (2 pi L^2) sqrt(EI L / m). Standard deviations are those of the fit with the most links;
-they know nothing of what the model misses.
+Every link of the configuration is divided into this many. A chain of equal links with twice the stiffness at its
+clamped first joint is a beam of some other rigidity, by a difference that falls with the square of the number of links:
+EI_n = EI + c/n^2 is fitted to the last two. From EI follow Young's modulus, with the second moment of area of the
+section, and the first frequency of a clamped beam, f = 1.8751^2 / (2 pi L^2) sqrt(EI L / m). Standard deviations are
+those of the data; they know nothing of what the model misses.
 """
 
 from __future__ import annotations
@@ -34,16 +34,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config", nargs="?", default=CONFIG, type=Path)
     parser.add_argument("--segment", default="beam")
-    parser.add_argument("--links", nargs="+", type=int, default=[2, 4, 8, 16])
+    parser.add_argument(
+        "--divisions", nargs="+", type=int, default=[1, 2, 4, 8, 16], help="links for each link of CONFIG"
+    )
     chosen = parser.parse_args(arguments)
     run, name = load_config(chosen.config), chosen.segment
     table = Table(
         "links", "EI [N m^2]", "± std", "E [GPa]", "first frequency [Hz]", "damping [N m^2 s]", "cost", "time"
     )
     found: list[tuple[int, float]] = []
-    for links in chosen.links:
+    for division in chosen.divisions:
         start = time.perf_counter()
-        problem = build_problem(run, build_step(run, build_system(run, links)))
+        system = build_system(run, division)
+        links = len(system.segment_layout(name).link_joints)
+        problem = build_problem(run, build_step(run, system))
         solution = solve(problem, run.solver)
         size = {key: solution.parameters[f"{name}.{key}"].value for key in ("length", "mass", "size_x", "size_y")}
         bend, damping = solution.parameters[f"{name}.bend"], solution.parameters[f"{name}.damping"]
