@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
+import scipy.linalg.lapack
 
 from yid_ocp.arrays import Array
 
@@ -41,7 +42,7 @@ class _SumOfSquares:
     def damped_step(self, damping: float) -> Array:
         scale = np.sqrt(damping) * np.maximum(np.linalg.norm(self.jacobian, axis=0), 1e-9)
         stacked, target = np.vstack([self.jacobian, np.diag(scale)]), np.append(self.residual, np.zeros(len(scale)))
-        return np.asarray(-np.linalg.lstsq(stacked, target, rcond=None)[0])
+        return np.asarray(-scipy.linalg.lapack.dgels(stacked, target)[1][: len(scale)])  # the damping gives full rank
 
 
 _Model = TypeVar("_Model", LocalQuadraticModel, _SumOfSquares)

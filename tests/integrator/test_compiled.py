@@ -20,7 +20,6 @@ from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 
 needs_compiler = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
-as_shipped = pytest.mark.usefixtures("shipped_optimization")
 
 
 @pytest.fixture
@@ -29,7 +28,7 @@ def step(parts, urdf_folder):
 
 
 @needs_compiler
-@as_shipped
+@pytest.mark.usefixtures("shipped_optimization")
 def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     case = parts.make_case(*parts.closed_loop(urdf_folder))
     model = case.step.model
@@ -61,7 +60,6 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
 
 
 @needs_compiler
-@as_shipped
 def test_structs_are_laid_out_as_in_the_kernel(step):
     """A field at another place would be read as another array."""
     structs = compiled._Struct.__subclasses__()

@@ -77,16 +77,15 @@ class InitialStateFitter:
         # compliant coordinates follow their load and have no initial state
         idle = {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
         self._free = [i for i in range(system.n_coordinates) if i not in set(self._known) | idle]
-        self._sensor: CasadiLockedCache[Sensor, ca.Function] = CasadiLockedCache(
-            lambda sensor: sensor_reading_function(step.system, sensor, self.fitted_parameters)
-        )
+        self._reading = CasadiLockedCache[Sensor, ca.Function](self._reading_function)
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self.fitted_parameters))
         kinematics = forward_kinematics(system.mechanism, e.q1)
         apart = (grasp.holder_minus_held_axis_directions(kinematics) for grasp in system.grasps)
         aligned = ca.vertcat(ca.SX(0, 1), *apart)
         internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
         held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
-        outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
+        slopes = ca.horzcat(ca.jacobian(held, e.q1)[:, self._free], ca.jacobian(held, chosen))
+        outputs = [ca.densify(held), ca.densify(slopes)]
         self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)
         names = [spring.joint_name for spring in system.elastic_joints]
         at = [system.mechanism.joint_index(name) for name in names]
@@ -168,6 +167,13 @@ class InitialStateFitter:
             own[INITIAL_RMS_SPEED_PARAMETER] = _speed(frames[first], frames[then], (then - first) * step.time_step)
         return PrecomputedInitialState(state, own)
 
+    def _reading_function(self, sensor: Sensor) -> ca.Function:
+        """Function of a sensor's readings and their derivatives by the free coordinates and the fitted parameters."""
+        e = self.step.equations
+        read = sensor_reading_function(self.step.system, sensor, self.fitted_parameters)(q=e.q1, theta=e.theta)
+        slopes = ca.horzcat(read["by_q"][:, self._free], read["by_theta"])
+        return ca.Function("points", [e.q1, e.theta], [ca.densify(read["y"]), ca.densify(slopes)])
+
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
         """Angle of each joint with a preset, and the torque of its spring there if the object is in equilibrium.
 
@@ -230,22 +236,17 @@ class InitialStateFitter:
         """Residual of a fit and its derivative by the free coordinates and the fitted parameters."""
         step, free, wanted = self.step, self._free, task.wanted
         nz, m = step.sizes["nz"], step.sizes["m"]
-        residuals, jacobians = [], []
-
-        def joined(by_q: ca.DM, by_theta: ca.DM) -> Array:
-            return np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
-
+        residuals, jacobians, width = [], [], len(free) + wanted
         for group, row in task.measured:
-            read = self._sensor(group.sensor)(q=q, theta=theta)
+            reading, slopes = self._reading(group.sensor)(q, theta)
             weight = group.weight[row] / task.softness
             value = np.where(weight > 0, group.value[row], 0.0)
-            residuals.append(weight * (np.array(read["y"]).ravel() - value))
-            jacobians.append(weight[:, None] * joined(read["by_q"], read["by_theta"]))
+            residuals.append(weight * (reading.full().ravel() - value))
+            jacobians.append(weight[:, None] * slopes.full()[:, :width])
         if m:
-            gap, *slopes = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
-            wide = joined(*slopes)
-            residuals.append(np.array(gap).ravel() / (_CONSTRAINT_STD * task.softness))
-            jacobians.append(wide / (_CONSTRAINT_STD * task.softness))
+            gap, slopes = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
+            residuals.append(gap.full().ravel() / (_CONSTRAINT_STD * task.softness))
+            jacobians.append(slopes.full()[:, :width] / (_CONSTRAINT_STD * task.softness))
         residuals.append(((q - task.rest) * task.prior)[free])
         jacobians.append(np.hstack([np.diag(task.prior[free]), np.zeros((len(free), wanted))]))
         return np.concatenate(residuals), np.vstack(jacobians)
