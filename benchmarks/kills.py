@@ -56,7 +56,7 @@ recordings: {{estimate: [{data}/joints.h5]}}
 track:
   frames_path: {data}/frames
   n_drawn_frames: 1
-  options: {{calibration: {{fix_pose: true}}, clock: {{search_half_width: 0}}}}
+  options: {{calibration: {{fix_pose: true}}, clock_offset: {{search_half_width: 0}}}}
 """
 Random = np.random.Generator
 
