@@ -167,9 +167,8 @@ class FrameTracker:
         """Estimate what all frames share, from some of them: camera calibration, tube dimensions and background."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
-        scene = self.empty_scene
-        seen = [] if scene is None else [self._finite(scene, i)[0] for i in range(len(scene))]
-        clouds = [calibration.camera_state.measured_to_world_points(points) for points in seen]
+        scene, to_world = self.empty_scene, calibration.camera_state.measured_to_world_points
+        clouds = [] if scene is None else [to_world(self._finite(scene, i)[0]) for i in range(len(scene))]
         background = BackgroundPoints.from_point_clouds(clouds, filters.voxel_size, noise)
         looks = [look for i in self._asked if (look := self._look(i, calibration, background)[1]) is not None]
         last: list[tuple[ShapeFitter, FrameShapeFit]] = []
