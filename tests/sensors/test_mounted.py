@@ -255,11 +255,11 @@ def test_stiffness_is_found_from_a_wrist_in_mujoco_and_from_a_synthetic_one(
 
 def test_noise_of_encoders_is_noise_of_what_the_sensor_weighs(urdf: Path, recorded: Recording) -> None:
     """The acceleration of the tool is worked out from angles; of the filter's gains the covariance is made."""
-    loud = replace(recorded, joints=replace(recorded.joints, position_std=1e-3))
-    samples = [
-        problem(step_of(urdf), r, "T1.bend", path_cutoff=10.0).episodes[0].measurements for r in (recorded, loud)
-    ]
-    quiet, noisy = ({s.sensor.group_name: s for s in of} for of in samples)
+    loud, coarse = ({"position_std": 1e-3, "position_resolution": 0.0}, {"position_resolution": 12**0.5 * 1e-3})
+    three = [replace(recorded, joints=replace(recorded.joints, **said)) for said in ({}, loud, coarse)]
+    samples = (problem(step_of(urdf), r, "T1.bend", path_cutoff=10.0).episodes[0].measurements for r in three)
+    quiet, noisy, stepped = ({s.sensor.group_name: s for s in of} for of in samples)
+    np.testing.assert_allclose(stepped["wrist.force"].std, noisy["wrist.force"].std)
     assert quiet["wrist.force"].noise_correlation is None
     assert noisy["wrist.force"].noise_correlation is not None
     assert np.all(noisy["wrist.force"].std > quiet["wrist.force"].std)

@@ -258,9 +258,11 @@ def _smoothed_effort_noise(
     An error of the acceleration of one joint, from encoder noise, changes the torques of all inertially coupled joints.
     With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. It is None if encoder noise is unknown.
     """
-    value_gain, _, second_gain = around.effort_filter.noise_gains_of_value_and_rates(period)
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None
+    # motor currents and encoders have different clocks
+    gains = around.effort_filter.noise_gains_of_value_and_rates
+    value_gain, second_gain = gains(period)[0], gains(float(np.median(np.diff(joints.t))))[2]
     angle = np.zeros(len(names))
     if is_noise_std_stated(joints, JOINT_POSITION_GROUP_NAME, encoders):
         angle = joint_angle_noise_std(joints, names, encoders, around.recording.name)

@@ -24,7 +24,12 @@ from yid_ocp.sensors.base import (
     missing_noise_level_error,
     sensor_reading_function,
 )
-from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, nodes_and_decorrelated_values
+from yid_ocp.sensors.joints import (
+    JOINT_POSITION_GROUP_NAME,
+    is_noise_std_stated,
+    joint_angle_noise_std,
+    nodes_and_decorrelated_values,
+)
 
 _Kind = TypeVar("_Kind", bound="MountedSensor")
 
@@ -120,12 +125,11 @@ def _with_encoder_noise(
     The responses to errors of angles, velocities and accelerations are linearised at standstill.
     """
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
-    known = None if joints is None else encoders.std if encoders.std is not None else joints.position_std
     names = () if joints is None else tuple(name for name in around.system.prescribed if name in joints.names)
     alone = np.broadcast_to(own, (len(times), len(own)))
-    if known is None or joints is None or not names:
+    if joints is None or not names or not is_noise_std_stated(joints, JOINT_POSITION_GROUP_NAME, encoders):
         return alone, None
-    angle = expand_to_joint_values(known, joints.names, names, f"sensors.{JOINT_POSITION_GROUP_NAME}.std")
+    angle = joint_angle_noise_std(joints, names, encoders, around.recording.name)
     if not np.any(angle > 0):
         return alone, None
     system = around.system
