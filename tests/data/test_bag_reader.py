@@ -167,11 +167,11 @@ def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
 
 
 def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
-    refused(write_bag(tmp_path, "mcap", two_arms(effort=False)), "/left has no effort, but another topic")
+    refused(write_bag(tmp_path, "mcap", two_arms(effort=False)), "/left has no effort, but others")
     (tmp_path / "twice").mkdir()
     one = joint_state(("a",), START, position=[1.0])
     path = write_bag(tmp_path / "twice", "mcap", [("/x", START, one), ("/y", START, one)])
-    assert "--joint-topic" in refused(path, "joint 'a' is on /x and on /y")
+    assert "--joint-topic" in refused(path, "joint 'a' is in /x and in /y")
 
 
 def test_a_gap_of_one_topic_stays_a_gap_and_commands_are_held_until_the_next(tmp_path: Path) -> None:

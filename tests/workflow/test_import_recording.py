@@ -91,6 +91,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "no such file": ("run.csv", None, "", "no such file"),
     "an unknown format": ("run.xlsx", "x", "", "no reader for '.xlsx' files"),
     "no name to write to": ("run.csv", GOOD, "--out", "the option --out is missing"),
+    "the name of the file that is read": ("run.csv", GOOD, "--out run.csv", "the file name is 'run.csv'"),
     "an HDF5 that is none": ("run.h5", "x" * 99, "", "not an HDF5 file"),
     "a column that is not there": ("run.csv", GOOD, "--columns q_b=skip", "no column 'q_b'"),
     "more meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t,position:a,skip", "no column '3'"),

@@ -464,10 +464,13 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     assert init(*CABLE, files=["bag.csv"]) == 2
     told = capsys.readouterr().err
     assert "none of the recorded joints is in the URDF: shoulder" in told
+    (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
+    write_recording(moved(SHORT), bench / "one.h5")
+    assert init(*CABLE, files=["one.h5", "bag.csv"]) == 2
+    assert "joint 'pitch' of one is not recorded" in capsys.readouterr().err
     assert "--joints shoulder=roll" in told
     assert not (bench / "bag.h5").exists()
     (bench / "run.yaml").write_text("kept: true\n")
-    write_recording(moved(SHORT), bench / "one.h5")
     assert init(*CABLE) == 2
     assert "already exists" in capsys.readouterr().err
     assert (bench / "run.yaml").read_text() == "kept: true\n"

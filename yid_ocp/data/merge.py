@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period
+from yid_ocp.data.channel_checks import QUALITY_LIMITS, mean_sample_rate, median_sample_period
 from yid_ocp.data.readers.base import joints_on_fastest_clock
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
@@ -85,6 +85,8 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     (begin, end), (start, stop) = _span(first), _span(other)
     overlap = min(end, stop) - max(begin, start)
     shared = overlap >= _MIN_SHARED_FRACTION * min(end - begin, stop - start)
+    for recording in (first, other) if shared else ():
+        _check_time_unit(recording, max(begin, start), min(end, stop))
     said = f"{first.name} and {other.name} are taken as on one clock: they have {overlap:.4g} s in common"
     seen, joints = _seen_path(other), first.joints
     best = at_zero = None
@@ -111,6 +113,17 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     why = "the recording times do not overlap; with this offset the points follow the joint angles best "
     why += f"({best.explained:.1%} of the motion), to some hundredths of a second, which are left to `check`"
     return begin - start - best.lag, why
+
+
+def _check_time_unit(recording: Recording, begin: float, end: float) -> None:
+    """Raise `DataError` if nearly none of many samples is in the common time, as of a file in milliseconds."""
+    total = max(len(group.t) for group in recording.all_groups)
+    inside = max(np.count_nonzero((group.t >= begin) & (group.t <= end)) for group in recording.all_groups)
+    if total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples:
+        name = recording.name
+        what = f"{inside} of {total} samples of {name} are in the {end - begin:.4g} s that it shares with the others"
+        hint = "import a file of another unit on its own, as with --units t=ms, and list its .h5 in place of the file"
+        raise DataError(what, where=name, allowed="files of one run with one unit of time", hint=hint)
 
 
 def _motion_lag(
@@ -149,6 +162,8 @@ def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) ->
     from scipy import signal  # slow to import
 
     (x, x_start), (y, y_start) = a, b
+    if not (len(x) and len(y)):  # shorter than a period of the other
+        return 0.0
     lags = signal.correlation_lags(len(y), len(x))
     ones_x, ones_y = np.ones(len(x)), np.ones(len(y))
     count, sum_x, sum_y, sum_xx, sum_yy, sum_xy = (
@@ -185,13 +200,8 @@ def _with_times_shifted(recording: Recording, shift: float) -> Recording:
 def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup | None, tuple[str, ...]]:
     if not groups:
         return None, ()
-    owners: dict[str, str] = {}
-    for source, joint in ((source, joint) for source, group in groups for joint in group.names):
-        if owners.setdefault(joint, source) != source:
-            what = f"the joint '{joint}' is in {owners[joint]} and in {source}"
-            hint = "import them one by one as recordings of their own, or keep other joints with --joints"
-            raise DataError(what, where=where, allowed="every joint in one file only", hint=hint)
-    merged, notes = joints_on_fastest_clock(groups, where)
+    hint = "import one CSV on its own without these columns (--columns NAME=skip), and list its .h5 in its place"
+    merged, notes = joints_on_fastest_clock(groups, where, hint)
     rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
     return merged, notes if len(groups) == 1 else (f"joints: {rates}", *notes)
 

@@ -461,10 +461,8 @@ def _validate_points(group: PointGroup, where: str) -> None:
 
 
 def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
-    largest, hint = (
-        float(np.abs(positions).max(initial=0.0)),
-        "if the unit is millimetres, convert the values to metres",
-    )
+    largest = float(np.abs(positions).max(initial=0.0))
+    hint = "if the unit is millimetres, convert the values to metres"
     what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
     raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
 

@@ -338,7 +338,9 @@ class _Hold:
 
     def give(self, q: Any, system: System) -> Any:
         """Distance of the driven joints from their targets."""
-        return self.given[: len(self.held)] - q[list(system.actuated_coordinate_indices)]
+        driven = list(system.actuated_coordinate_indices)
+        # casadi's q[[]] of a single coordinate is a row
+        return self.given[: len(driven)] - q[driven] if driven else np.zeros(0)
 
 
 def _damped_newton(

@@ -123,8 +123,8 @@ def propose_config_choices(
 ) -> ProposedConfigChoices:
     """Propose choices for a configuration from a robot and its recordings, all of which need joints.
 
-    Raises `ConfigError` if no recorded joint is in the URDF or a frame does not exist; other errors are as in
-    `read_urdf`.
+    Raises `ConfigError` if no recorded joint is in the URDF, a later recording lacks a joint of the first, or a frame
+    does not exist; other errors are as in `read_urdf`.
 
     Parameters
     ----------
@@ -164,6 +164,10 @@ def propose_config_choices(
     carrying = [tree.frame(name).joint_index for name in (*held, *(() if standing else (holder,)))]
     needed = {j for end in carrying for j in tree.ancestor_joint_indices(end)}
     joints = tuple(tree.joint_names[j] for j in sorted(needed)) if branches else tree.joint_names
+    for other in recordings:
+        for name in (name for name in joints if name not in other.joint_names):
+            what, hint = f"joint '{name}' of {first.name} is not recorded", "record it too, or leave the recording out"
+            raise ConfigError(what, where=other.name, allowed=f"the joints {', '.join(joints)}", hint=hint)
     mode, why = _mode(first, recorded, bool(held), has_object=bool(branches))
     moving = ""
     for recording in recordings:

@@ -453,7 +453,8 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
-    together, notes = base.joints_on_fastest_clock(made, where)
+    hint = "choose topics: --joint-topic TOPIC, once for each"
+    together, notes = base.joints_on_fastest_clock(made, where, hint)
     for entry in groups:
         if entry.command:
             group = _joint_group(entry, seconds, f"{where}: {entry.topic}")

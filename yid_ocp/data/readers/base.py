@@ -260,22 +260,24 @@ def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
 _MAX_INTERPOLATED_PERIODS = 5.0  # longest interpolated gap in periods of its source
 
 
-def joints_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
+def joints_on_fastest_clock(
+    groups: Sequence[tuple[str, JointGroup]], where: str, hint: str
+) -> tuple[JointGroup, tuple[str, ...]]:
     """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
-    its periods around it. Raises `DataError` if two sources share a joint, differ in channels, or share no time.
+    its periods around it. Raises `DataError`, with `hint`, if sources share a joint, differ in channels, or share no
+    time.
     """
     if len(groups) == 1:
         return groups[0][1], ()
-    _check_separate(groups, where)
+    _check_separate(groups, where, hint)
     name, clock = max(groups, key=lambda source: len(source[1].t) / max(np.ptp(source[1].t), 1e-12))
     kept = np.all([_can_interpolate(group.t, clock.t) for _, group in groups], axis=0)
     if not kept.any():
         listed = "; ".join(f"{name}: {group.t[0]:.6g} to {group.t[-1]:.6g} s" for name, group in groups)
-        what = f"the joint states of the topics were never recorded at the same time: {listed}"
-        hint = "choose one of the topics: --joint-topic TOPIC"
-        raise DataError(what, where=where, allowed="topics whose times overlap", hint=hint)
+        what = f"the joints were never recorded at the same time: {listed}"
+        raise DataError(what, where=where, allowed="joints whose times overlap", hint=hint)
     t = clock.t[kept]
 
     def joined(channel: str) -> Array:
@@ -303,16 +305,15 @@ def _can_interpolate(known: Array, t: Array) -> BoolArray:
     return np.asarray(inside & (gap <= _MAX_INTERPOLATED_PERIODS * period + 1e-12))
 
 
-def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str) -> None:
-    choose = "choose topics: --joint-topic TOPIC, once for each"
+def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str, hint: str) -> None:
     owner: dict[str, str] = {}
     for source, joint in ((source, joint) for source, group in groups for joint in group.names):
         if owner.setdefault(joint, source) != source:
-            what = f"the joint '{joint}' is on {owner[joint]} and on {source}"
-            raise DataError(what, where=where, allowed="every joint on one topic", hint=choose)
+            what = f"the joint '{joint}' is in {owner[joint]} and in {source}"
+            raise DataError(what, where=where, allowed="every joint in one of them only", hint=hint)
     every = {channel for _, group in groups for channel in group.values_by_channel}
     for source, group in groups:
         lacking = sorted(every - set(group.values_by_channel))
         if lacking:
-            what = f"{source} has no {lacking[0]}, but another topic of joint states has it"
-            raise DataError(what, where=where, allowed="the same channels on every topic", hint=choose)
+            what, allowed = f"{source} has no {lacking[0]}, but others have it", "the same channels in all of them"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
