@@ -37,7 +37,7 @@ from yid_ocp.problem.options import MultivariateGaussianPrior
 
 _N_KNOTS = 12
 _MAX_PLACES = 3  # largest number of gap locations at which a law is estimated
-_MAX_REFITS = 5  # the torque over time included
+_MAX_REFITS = 3  # the torque over time included
 _ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # curvature weights; the evidence chooses among them
 _RIDGE_STD_RATIO = 3.0  # std of a value at a knot, apart from its curvature, over the torques there
 _MIN_KNOT_RANGE = 1e-3  # smallest range of knots if hardly any range is visited [unit of the quantity]
