@@ -231,7 +231,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "nominal_model": fit(lost=loss(2.0, 2.2)),
         "single_effect_models": (alone,),
         "selected_effects": (added(of, fitted=alone),),
-        "gap_closure": closed(),
+        "gap_closure": None,  # by all effects, if not what the last one has
         "remaining_test": outcome(p=1e-8, chi2=2.1) if verdict == "unknown" else outcome(p=0.4, chi2=1.02),
         "remaining_gap_locations": (),
         "next_experiment": "Repeat.",
@@ -241,7 +241,11 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "stage_seconds": {"nominal_model": 1.0},
         "unknown_reason": "none" if verdict == "unknown" else "",
     }
-    return DiagnosisResult(**(usual | changed))
+    found = usual | changed
+    if total := found.pop("gap_closure"):
+        last = [replace(entry, cumulative_closure=total) for entry in found["selected_effects"][-1:]]
+        found["selected_effects"] = (*found["selected_effects"][:-1], *last)
+    return DiagnosisResult(**found)
 
 
 def measurements(channels, node, fraction, value, weight, span=(0, 100), **sensor) -> SensorMeasurements:

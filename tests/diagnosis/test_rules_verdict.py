@@ -153,7 +153,8 @@ def judged(changed):
     said = {"gap": True, "added": (added(ONE),), "enough": True, "total": CERTAIN, "explained": 1.0, "carried": True}
     said |= changed
     checks = () if said["carried"] else (carried(),)
-    found = Judgement("", "", (), said["added"], said["total"], said["explained"], checks, 0.0)
+    effects = tuple(replace(entry, cumulative_closure=said["total"]) for entry in said["added"])
+    found = Judgement("", "", (), effects, said["explained"], checks, 0.0)
     return _verdict_and_reason(found, said["gap"], said["enough"], LIMITS)
 
 
@@ -172,7 +173,8 @@ def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
 
 def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_more():
     def sure(explained, effects=ALIKE, checks=()):
-        return _probability(Judgement("", "", (), effects, closed(0.4, 0.0, 0.5), explained, checks, 0.0), LIMITS)
+        effects = tuple(replace(entry, cumulative_closure=closed(0.4, 0.0, 0.5)) for entry in effects)
+        return _probability(Judgement("", "", (), effects, explained, checks, 0.0), LIMITS)
 
     assert sure(1.0, ()) == 0.0
     assert 0.9 < sure(1.0) < 1.0
@@ -185,7 +187,7 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
 
 def test_equivalent_effects_share_the_probability_of_their_set():
     entry = replace(added(ONE, [OTHER]), shares=(0.7, 0.3))
-    said = Judgement("confusable", "", (), (entry, added(THIRD)), CERTAIN, 1.0, (), 0.9)
+    said = Judgement("confusable", "", (), (entry, added(THIRD)), 1.0, (), 0.9)
     expected = {ONE.label: 0.63, OTHER.label: 0.27, THIRD.label: 0.9}
     assert said.candidate_probabilities == pytest.approx(expected)
 

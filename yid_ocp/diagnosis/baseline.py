@@ -24,6 +24,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, failed_rollout_error, nearest_name_question
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
@@ -31,6 +32,8 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers import Status
 
+_SHIFT = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
+_SHIFT += " changed=has_changed"
 _MIN_INFORMED_FRACTION = 0.05
 """Relative reduction of a prior's variance below which the data do not inform a parameter."""
 
@@ -63,6 +66,10 @@ class ParameterShiftsSinceBaseline:
         """Parameters that have changed significantly, smallest p-value first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
         return tuple(sorted(changed, key=lambda entry: entry.p_value))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert the shifts to the entry `baseline` of `yid-diagnosis/2`."""
+        return {"parameters": {entry.name: attributes_to_dict(entry, _SHIFT) for entry in self.parameter_shifts}}
 
 
 def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:

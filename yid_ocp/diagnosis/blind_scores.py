@@ -24,7 +24,6 @@ from yid_ocp.diagnosis.screening import (
     ConfusabilityMatrix,
     ScreeningResult,
 )
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
@@ -543,7 +542,7 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
         search = RefitContext(cast(Any, None), limits, NULL_PROGRESS, record=case.record, is_finished=True)
         judged = judge(search, case.evidence, case.locate)
     except UnrecordedRefitError:
-        judged = Judgement(_NOT_JUDGED, "", (), (), UNDEFINED_GAP_CLOSURE, 1.0, (), 0.0)
+        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0)
     where = () if case.located_gap is None else case.located_gap.locations
     if judged.accepted_selections:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])

@@ -15,7 +15,13 @@ from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import EffectSearchResults, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, bic_difference, held_out_gap_closure
+from yid_ocp.diagnosis.select import (
+    UNDEFINED_GAP_CLOSURE,
+    GapClosure,
+    bic_difference,
+    held_out_gap_closure,
+    total_gap_closure,
+)
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, abbreviated_names_text
@@ -27,7 +33,6 @@ from yid_ocp.inference.uncertainty import priors_that_determine_unknown
 
 _EFFECT = "kind location"
 _PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
-_SHIFT = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range without a message
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
@@ -71,16 +76,15 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprLineAndTableRows:
-        said, closed = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects)], self.gap_closure
-        if self.accepted_effects and math.isfinite(closed.fraction):
-            said.append(f"{100 * closed.fraction:.3g} % of the held-out gap closed")
+        closed = total_gap_closure(self.accepted_selections)
+        said = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects), closed.text]
         rows = [("candidate", "parameters", "closure alone", "p")]
         for entry in _ranked_candidates(self, self)[:8]:
             values = ((name, own["value"], own["unit"]) for name, own in entry["parameters"].items())
             known = ", ".join(f"{name} = {value:.3g} {unit}" for name, value, unit in values if value is not None)
             alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
             rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
-        return ReprLineAndTableRows(", ".join(said), rows)
+        return ReprLineAndTableRows(", ".join(filter(None, said)), rows)
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
@@ -104,21 +108,18 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the result to a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
-        judged, since, baseline = judgement_to_dict(self, self, self.gap_locations), self.baseline_comparison, None
+        judged = judgement_to_dict(self, self, self.gap_locations)
         after = _errors(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE) for place in self.remaining_gap_locations]
         reason = "; ".join(check.both_estimates_text for check in self.failed_transfer_checks)
         rejected = self.selected_effects if self.unknown_reason == "stand_in" else ()
-        if since is not None:
-            shifts = {e.name: attributes_to_dict(e, f"{_SHIFT} changed=has_changed") for e in since.parameter_shifts}
-            baseline = {"parameters": shifts}
         found = {
             "format": "yid-diagnosis/2",
             **judged,
             "gap": {**judged["gap"], "after": after, "held_out": self.held_out_names},
             "remaining": {"p_value": after["p_value"], "where": left},
             "reason": self.unknown_reason,
-            "law": None if self.law is None else self.law.to_dict(),
+            "law": _part_to_dict(self.law),
             "rejected_candidates": [
                 {**attributes_to_dict(e.effect, _EFFECT), **_closure(e.cumulative_closure), "reason": reason}
                 for e in rejected
@@ -131,11 +132,16 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             "steps": [{"added": e.effect.label, **_errors(e.refitted_model)} for e in self.selected_effects],
             "unseen": [v.effect.label for v in self.screening.detectability if not v.is_detectable],
             "untried": self.untried,
-            "baseline": baseline,
-            "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
+            "baseline": _part_to_dict(self.baseline_comparison),
+            "counterfactual": _part_to_dict(self.counterfactual),
             "seconds": self.stage_seconds,
         }
         return dict(to_json_types(found))
+
+
+def _part_to_dict(part: ParameterShiftsSinceBaseline | EffectRemovalAndAdditionErrors | GapLaw | None) -> Any:
+    """An optional part as a dictionary, or None."""
+    return part and part.to_dict()
 
 
 def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
@@ -146,7 +152,7 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
     found = {
         "verdict": judged.verdict,
         "probability": judged.probability,
-        "gap": {"before": before, **_closure(judged.gap_closure if added else UNDEFINED_GAP_CLOSURE)},
+        "gap": {"before": before, **_closure(total_gap_closure(added))},
         "where": [attributes_to_dict(place, _PLACE) for place in where],
         "which": _ranked_candidates(judged, seen),
         "effects": [attributes_to_dict(entry.effect, _EFFECT) for entry in added],
@@ -164,7 +170,7 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
         "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
-        "candidate": min(1.0, bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores)),
+        "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
         "closure_low": result.gap_closure.ci_low,
         "explained": result.explained_fraction,
@@ -217,12 +223,13 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     for rivals in (entry.equivalent_effects for entry in result.accepted_selections):
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
-        if len(aspects) > 1:
-            return f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording."
-        if len(places) > 1:
-            return f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."
-        if len(rivals) > 1:
-            return f"Vary {aspects[0]} over a wider range."
+        advice = (
+            (aspects, f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording."),
+            (places, f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."),
+            (rivals, f"Vary {aspects[0]} over a wider range."),
+        )
+        if told := [text for several, text in advice if len(several) > 1]:
+            return told[0]
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
     alone = _listed("Move ", place, " alone, slowly and fast, and hold it still in several configurations.")
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
@@ -281,19 +288,21 @@ def _p_value_relation(p_value: float) -> str:
 def _gap(result: DiagnosisResult) -> str:
     """Sentence on whether there is a gap."""
     tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
-    fitted, other = (f"{t.chi2_per_dof:.3g}" if math.isfinite(t.chi2_per_dof) else "not known" for t in tests)
+    fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
     sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
-    if result.verdict == "insufficient_data":
-        unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-        samples, needed = tests[0].degrees_of_freedom, result.thresholds.min_samples_per_unknown * unknowns
-        said = f"{samples:.0f} effective samples for {unknowns} unknowns (at least {needed:.0f} are needed)"
-        return f"The data are insufficient: {said}; {sum(seen)} of {len(seen)} candidates are detectable."
-    if result.verdict == "no_gap":
-        return f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)})."
+    unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
+    samples, needed = tests[0].degrees_of_freedom, result.thresholds.min_samples_per_unknown * unknowns
+    said = f"{samples:.0f} effective samples for {unknowns} unknowns (at least {needed:.0f} are needed)"
+    texts = {
+        "insufficient_data": f"The data are insufficient: {said}; {sum(seen)} of {len(seen)} candidates are detectable.",
+        "no_gap": f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).",
+    }
+    if result.verdict in texts:
+        return texts[result.verdict]
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_limits):
         return f"The gap is real ({sizes}; p {_p_value_relation(p_value)})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
-    small = f"not along what {best.effect.label} would do (p {_p_value_relation(min(p_value, 1.0))})"
+    small = f"not along what {best.effect.label} would do (p {_p_value_relation(p_value)})"
     return f"As a whole the recordings are explained to within their noise ({sizes}), but {small}."
 
 
@@ -320,25 +329,28 @@ def _causes(result: DiagnosisResult) -> list[str]:
         text.append(f"{names} {verb} {part}.")
     for own, *others in (entry.equivalent_effects for entry in result.accepted_selections):
         text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
-    if result.accepted_effects:
-        text.append(f"The probability that this names the cause is {100 * result.probability:.0f} %.")
-    if result.verdict == "unknown":
-        explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
-        apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
-        reasons = {
-            "none": "No effect tried is significant and closes enough of it.",
-            "little": f"This explains {explained:.3g} % of what unknown forces explain; {enough:.3g} % is required.",
-            "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
-        }
-        text.append(reasons[result.unknown_reason])
-        scores = result.screening.candidate_scores
-        best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
-        alike = [s for s in scores if s.effect.kind in best and not s.effect.is_local]
-        places = [s.effect.location for s in alike if s.p_value * len(scores) < limits.gap_significance_level]
-        if len(places) > 1:
-            advice = "add it to the model at all of them (`model.effects`, or `yid-ocp friction` for friction)"
-            text.append(f"{best[0]} is significant at {abbreviated_names_text(places)}: {advice}.")
+    explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
+    apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
+    reasons = {
+        "": f"The probability that this names the cause is {100 * result.probability:.0f} %.",
+        "none": "No effect tried is significant and closes enough of it.",
+        "little": f"This explains {explained:.3g} % of what unknown forces explain; {enough:.3g} % is required.",
+        "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
+    }
+    text.append(reasons[result.unknown_reason])
+    if result.unknown_reason:
+        text.append(_several_places(result))
     return text
+
+
+def _several_places(result: DiagnosisResult) -> str:
+    """Sentence on the places where the kind of the best single effect is significant, if there are several."""
+    scores, level = result.screening.candidate_scores, result.thresholds.gap_significance_level
+    best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
+    alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
+    places = abbreviated_names_text([s.effect.location for s in alike])
+    advice = "add it to the model at all of them (`model.effects`, or `yid-ocp friction` for friction)"
+    return f"{best[0]} is significant at {places}: {advice}." if len(alike) > 1 else ""
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:

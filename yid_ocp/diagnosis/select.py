@@ -37,6 +37,11 @@ class GapClosure:
     ci_low: float
     ci_high: float
 
+    @property
+    def text(self) -> str:
+        """Text of the fraction; empty if there is no gap."""
+        return f"{100 * self.fraction:.3g} % of the held-out gap closed" if math.isfinite(self.fraction) else ""
+
 
 UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 
@@ -50,6 +55,11 @@ class SelectedEffect:
     cumulative_closure: GapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
+
+
+def total_gap_closure(added: Sequence[SelectedEffect]) -> GapClosure:
+    """Closure of the whole gap by all of some selected effects. Undefined without effects."""
+    return [UNDEFINED_GAP_CLOSURE, *(entry.cumulative_closure for entry in added)][-1]
 
 
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
@@ -276,9 +286,8 @@ def select_effects(
         before = current
         rivals = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == base]
         chosen = chosen.replaced(better, [*rivals, *untried])
-        closed = _closed_fraction(nominal.held_out_loss, better.held_out_loss)
-        said = "" if math.isnan(closed) else f": {100 * closed:.3g} % of the held-out gap closed"
-        search.progress.begin_stage(f"explained by {join_effect_labels(better.effects)}{said}")
+        closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
+        search.progress.begin_stage(f"explained by {join_effect_labels(better.effects)}: {closed.text}".rstrip(": "))
     chosen = _reconsidered(search, nominal, chosen, before)
     if len(chosen.fit.effects) == 1:
         # its last fit may differ from its first one

@@ -13,7 +13,7 @@ from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, SelectedEffect, leaves_noise, select_effects
+from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, leaves_noise, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
@@ -102,10 +102,14 @@ class Judgement:
     unknown_reason: UnknownVerdictReason
     single_effect_models: tuple[RefitStatistics, ...]  # refits of the first round, best first
     selected_effects: tuple[SelectedEffect, ...]
-    gap_closure: GapClosure
     explained_fraction: float  # decrease of r'r by the effects over that by the smoother
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
+
+    @property
+    def gap_closure(self) -> GapClosure:
+        """Closure of the whole gap by all selected effects."""
+        return total_gap_closure(self.selected_effects)
 
     @property
     def accepted_selections(self) -> tuple[SelectedEffect, ...]:
@@ -197,14 +201,14 @@ def judge(
         fits, added = select_effects(search, nominal, evidence.screening, places, evidence.has_left_baseline)
     finished("refits")
     carried: tuple[EffectAmplitudeTransferCheck, ...] = ()
-    total, explained = UNDEFINED_GAP_CLOSURE, 1.0
+    explained = 1.0
     if added:
-        last, total = added[-1].refitted_model, added[-1].cumulative_closure
+        last = added[-1].refitted_model
         explained = _explained_fraction(nominal, last, located, limits)
         carried = _check_effect_amplitude_transfer(search, last)
         added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
     finished("carry_over")
-    said = Judgement("", "", fits, added, total, explained, carried, 0.0)
+    said = Judgement("", "", fits, added, explained, carried, 0.0)
     is_seen = any(entry.is_detectable for entry in evidence.screening.detectability)
     verdict, reason = _verdict_and_reason(said, has_gap, enough and is_seen, limits)
     return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
