@@ -27,7 +27,7 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
+from yid_ocp.diagnosis.verdict import NOT_LOCATED, EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknowns, SmoothedUnknownsResult
@@ -121,7 +121,7 @@ def loss(*means: float, count=100.0, channels=None) -> HeldOutLoss:
 def evaluation(residual, jacobian=None, ok=True, message="") -> Evaluation:
     residual = np.asarray(residual, float)
     jacobian = None if jacobian is None else np.asarray(jacobian, float)
-    return Evaluation(0.5 * float(residual @ residual), residual, jacobian, ok, message, ())
+    return Evaluation(0.5 * float(residual @ residual) if ok else math.inf, residual, jacobian, ok, message, ())
 
 
 def costing(cost: float, rows: int) -> Evaluation:
@@ -240,6 +240,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "thresholds": Thresholds(),
         "stage_seconds": {"nominal_model": 1.0},
         "unknown_reason": "none" if verdict == "unknown" else "",
+        "located_gap": NOT_LOCATED,
     }
     found = usual | changed
     if total := found.pop("gap_closure"):

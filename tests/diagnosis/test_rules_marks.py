@@ -19,7 +19,7 @@ from yid_ocp.diagnosis.blind_scores import (
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import EffectSearchResults
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import GapLocalization
+from yid_ocp.diagnosis.verdict import NOT_LOCATED, GapLocalization
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.workflow import blind_slices
@@ -361,7 +361,7 @@ def test_a_case_of_an_earlier_version_is_refused():
 
 
 def test_a_case_without_a_place_of_its_gap_is_not_judged_where_thresholds_see_one():
-    assert again(replace(diagnosed(), located_gap=None))[0] == "not_judged"
+    assert again(replace(diagnosed(), located_gap=NOT_LOCATED))[0] == "not_judged"
 
 
 def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):

@@ -198,7 +198,7 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
     store = Memory({"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2}, "long ago")})
     problem = Problem(lambda values: 5.0)
-    found = refit_with_effects(problem, [FRICTION], START, store)
+    found = refit_with_effects(problem, [FRICTION], START, store, FRICTION.label)
     assert solved.runs == []
     assert (found.values, found.std, found.solver_message) == (values, std, "long ago")
     assert found.p_values == {FRICTION.label: 0.2}
@@ -208,13 +208,15 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     # another start, or another time step, is another refit
     assert refit_with_effects(problem, [FRICTION], START, store, "another").values == START
     problem.step.time_step = 0.005
-    assert refit_with_effects(problem, [FRICTION], START, store).values == START
+    assert refit_with_effects(problem, [FRICTION], START, store, FRICTION.label).values == START
     assert [*store] == ["friction@elbow at 0.01 s", "another at 0.01 s", "friction@elbow at 0.005 s"]
 
 
 def test_a_stored_refit_that_cannot_be_rolled_out_is_solved_again(solved):
     store = Memory({"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2}, "")})
-    found = refit_with_effects(Problem(lambda values: 5.0 if values[A] < 9.0 else None), [FRICTION], START, store)
+    found = refit_with_effects(
+        Problem(lambda values: 5.0 if values[A] < 9.0 else None), [FRICTION], START, store, FRICTION.label
+    )
     assert solved.runs == [found.values] == [START]
     assert store["friction@elbow at 0.01 s"].solver_message == "done"
 

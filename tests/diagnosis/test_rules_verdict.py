@@ -28,6 +28,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
+    NOT_LOCATED,
     GapLocalization,
     Judgement,
     NominalModelGapEvidence,
@@ -154,7 +155,7 @@ def judged(changed):
     said |= changed
     checks = () if said["carried"] else (carried(),)
     effects = tuple(replace(entry, cumulative_closure=said["total"]) for entry in said["added"])
-    found = Judgement("", "", (), effects, said["explained"], checks, 0.0)
+    found = Judgement("", "", (), effects, said["explained"], checks, 0.0, NOT_LOCATED)
     return _verdict_and_reason(found, said["gap"], said["enough"], LIMITS)
 
 
@@ -174,7 +175,7 @@ def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
 def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_more():
     def sure(explained, effects=ALIKE, checks=()):
         effects = tuple(replace(entry, cumulative_closure=closed(0.4, 0.0, 0.5)) for entry in effects)
-        return _probability(Judgement("", "", (), effects, explained, checks, 0.0), LIMITS)
+        return _probability(Judgement("", "", (), effects, explained, checks, 0.0, NOT_LOCATED), LIMITS)
 
     assert sure(1.0, ()) == 0.0
     assert 0.9 < sure(1.0) < 1.0
@@ -187,7 +188,7 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
 
 def test_equivalent_effects_share_the_probability_of_their_set():
     entry = replace(added(ONE, [OTHER]), shares=(0.7, 0.3))
-    said = Judgement("confusable", "", (), (entry, added(THIRD)), 1.0, (), 0.9)
+    said = Judgement("confusable", "", (), (entry, added(THIRD)), 1.0, (), 0.9, NOT_LOCATED)
     expected = {ONE.label: 0.63, OTHER.label: 0.27, THIRD.label: 0.9}
     assert said.candidate_probabilities == pytest.approx(expected)
 
@@ -206,13 +207,15 @@ def test_what_effects_explain_of_what_can_be_explained(costs, decrease, part):
     """Fall of r'r less what one parameter takes, over the smoother's fall less the degrees of freedom that it takes."""
     nominal, last, located = fit(cost=costs[0]), fit([ONE], cost=costs[1]), GapLocalization((), decrease)
     assert _explained_fraction(nominal, last, located, LIMITS) == pytest.approx(part)
-    assert _explained_fraction(nominal, last, None, LIMITS) == 1.0
+    assert _explained_fraction(nominal, last, NOT_LOCATED, LIMITS) == 1.0
 
 
 def test_beside_torque_noise_what_exceeds_the_noise_can_be_explained():
     nominal, last = replace(fit(cost=100.0), has_process_noise=True), fit([ONE], loss(1.2, 1.2), cost=60.5)
-    assert _explained_fraction(nominal, last, None, LIMITS) == pytest.approx(78.0 / 199.0), "there is one residual"
-    assert _explained_fraction(nominal, replace(last, held_out_loss=loss(1.0, 1.1)), None, LIMITS) == 1.0
+    assert _explained_fraction(nominal, last, NOT_LOCATED, LIMITS) == pytest.approx(78.0 / 199.0), (
+        "there is one residual"
+    )
+    assert _explained_fraction(nominal, replace(last, held_out_loss=loss(1.0, 1.1)), NOT_LOCATED, LIMITS) == 1.0
 
 
 @cases(

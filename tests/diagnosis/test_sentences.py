@@ -158,7 +158,7 @@ def unknown():
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):
         yield f"followed for {kept} s", finding(truncated_recordings=(TruncatedHeldOutRecording("other", kept, 5.0),))
-    yield "a finer step", finding("no_gap", stated_and_finer_time_step=(0.01, 0.005))
+    yield "a finer step", finding("no_gap", stated_and_used_time_step=(0.01, 0.005))
     lost = (TruncatedHeldOutRecording("other", 0.0, 5.0),)
     yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True)
 

@@ -16,7 +16,7 @@ import scipy.stats
 
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
-from yid_ocp.diagnosis.refit import EffectSearchResults, RefitContext, RefitStatistics, UnrecordedRefitError
+from yid_ocp.diagnosis.refit import EffectSearchResults, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import (
     AllCandidatesScoreModel,
     CandidateDetectability,
@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.screening import (
     ScreeningResult,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import NOT_LOCATED, GapLocalization, Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
@@ -453,7 +453,7 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
         "are_offsets_stated": result.are_offsets_stated,
         "has_left_baseline": result.has_left_baseline,
         "thresholds": plain(result.thresholds),
-        "located_gap": None if result.located_gap is None else plain(result.located_gap),
+        "located_gap": plain(result.located_gap),
         "remaining": [plain(place) for place in result.remaining_gap_locations],
         "refits": {name: fit and _refit_to_json(fit) for name, fit in sorted(record.refits.items())},
         "screenings": {name: _screening_to_json(own) for name, own in record.screenings.items()},
@@ -474,17 +474,30 @@ def _screening_to_json(screened: ScreeningResult) -> dict[str, Any]:
     return dict(to_lossless_plain_data({"labels": labels, "alike": near, "scores": scores, "detectable": seen}))
 
 
+class _UnrecordedRefitError(LookupError):
+    """Raised when rules require a refit that the recorded search did not make."""
+
+
+class _RecordedSearch(RefitContext):
+    """Takes results from the record alone; a missing one raises `_UnrecordedRefitError`."""
+
+    def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], Any]) -> Any:
+        if name not in answers:
+            raise _UnrecordedRefitError(name)
+        return answers[name]
+
+
 class _RecordedCase:
     """The output of `diagnosis_evidence_to_dict`, as the objects that the rules need."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         self._effects = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
-        restored, located = dataclass_from_plain_data, data["located_gap"]
+        restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
         flags = (data["are_offsets_stated"], data["has_left_baseline"])
         self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *flags)
-        self.located_gap = None if located is None else restored(GapLocalization, located)
+        self.located_gap = restored(GapLocalization, data["located_gap"] or vars(NOT_LOCATED))
         self.record = EffectSearchResults(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
@@ -507,8 +520,8 @@ class _RecordedCase:
         return ScreeningResult(seen, scores, ConfusabilityMatrix(tuple(data["labels"]), overlaps), _NO_JOINT_MODEL)
 
     def locate(self) -> GapLocalization:
-        if self.located_gap is None:
-            raise UnrecordedRefitError("where the gap lies")
+        if self.located_gap == NOT_LOCATED:
+            raise _UnrecordedRefitError("where the gap lies")
         return self.located_gap
 
 
@@ -539,11 +552,11 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))
     case = _RecordedCase(data)
     try:
-        search = RefitContext(cast(Any, None), limits, NULL_PROGRESS, record=case.record, is_finished=True)
+        search = _RecordedSearch(cast(Any, None), limits, NULL_PROGRESS, record=case.record)
         judged = judge(search, case.evidence, case.locate)
-    except UnrecordedRefitError:
-        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0)
-    where = () if case.located_gap is None else case.located_gap.locations
+    except _UnrecordedRefitError:
+        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0, NOT_LOCATED)
+    where = case.located_gap.locations
     if judged.accepted_selections:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
         where = gap_locations_from_effects_and_smoother(where, judged.closure_by_location, rest, ())

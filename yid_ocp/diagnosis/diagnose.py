@@ -36,6 +36,7 @@ from yid_ocp.diagnosis.hypotheses import (
 )
 from yid_ocp.diagnosis.law import find_gap_law
 from yid_ocp.diagnosis.refit import (
+    NO_REFIT_STORE,
     NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
@@ -157,10 +158,10 @@ def _examined(
     screened = screen_candidates(composed, (), nominal.values, limits)
     evidence = NominalModelGapEvidence(nominal, *tests, screened, _offsets_stated(nominal.problem))
     _end_stage(search, "screening")
-    if evidence.has_gap(limits) and evidence.has_enough_samples(limits):
-        gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
-        if finer := _at_finer_step_that_explains(gap, search, nominal, events):
-            return _examined(*finer, cuts)
+    gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
+    is_searched = evidence.has_gap(limits) and evidence.are_data_sufficient(limits)
+    if is_searched and (finer := _at_finer_step_that_explains(gap, search, nominal, events)):
+        return _examined(*finer, cuts)
     return _Examined(replace(search, problem=composed), nominal, cuts, whole, events, smoothed, evidence)
 
 
@@ -279,20 +280,18 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
     moved = earlier.fit_parameters_differ_significantly(nominal, limits)
     evidence = replace(seen.evidence, has_left_baseline=moved)
     smoothed: SmoothedUnknownsResult | None = None
-    gap: GapLocalization | None = None
 
     def locate() -> GapLocalization:
-        nonlocal smoothed, gap
+        nonlocal smoothed
         search.progress.begin_stage("locating the gap", 1.0, 8.5)
         # without events, the smoother already ran on all fitted data
         smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
         by_chance = smoothed.dof_before - smoothed.dof_after
         places = smoother.gap_locations_by_smoother_evidence(smoothed, limits.gap_window_z)
-        gap = GapLocalization(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
-        return gap
+        return GapLocalization(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
 
     judged = judge(search, evidence, locate, end_stage)
-    where = rest = () if gap is None else gap.locations
+    where = rest = judged.located_gap.locations
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selections:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
@@ -312,7 +311,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
     finding = DiagnosisResult(
         **(vars(evidence) | vars(judged)),
         noise_floor=null_test.assumed_channel_noise_levels(nominal.problem),
-        located_gap=gap,
         record=search.record,
         smoother_result=smoothed,
         gap_locations=where,
@@ -327,7 +325,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         baseline_comparison=earlier.compare_with_baseline(final, limits),
         counterfactual=earlier.prediction_errors_with_and_without_effects(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
-        stated_and_finer_time_step=steps if is_finer else None,
+        stated_and_used_time_step=steps,
         search_seconds=ends["refits"] - ends[""],
         law=law,
     )
@@ -342,10 +340,12 @@ def _offsets_stated(problem: EstimationProblem) -> bool:
     return torques or any(episode.has_biases_treated_as_noise for episode in problem.episodes)
 
 
-def _fitted_nominal_model(search: RefitContext, start: Mapping[str, float], name: str = "") -> RefittedModel:
+def _fitted_nominal_model(
+    search: RefitContext, start: Mapping[str, float], name: str = "the nominal model"
+) -> RefittedModel:
     """The nominal model fitted from a start, with whitening fixed near its end. Raises `SolverError` if it fails."""
     problem, limits = search.problem, search.thresholds
-    for store in (None, search.store) if problem.problem.has_process_noise else (search.store,):
+    for store in (NO_REFIT_STORE, search.store) if problem.problem.has_process_noise else (search.store,):
         problem = problem.with_whitening_linearized_at(start)
         # a gap may move parameters so far that the solver's equilibrium is not found again from there
         runs = (refit_with_effects(problem, (), own, store, name, limits) for own in (start, {}))
@@ -392,7 +392,7 @@ def fit_nominal_model(
     problem: EstimationProblem,
     composed: AllCandidatesProblem,
     solution: Solution | None = None,
-    store: RefitStore | None = None,
+    store: RefitStore = NO_REFIT_STORE,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
     """Fit the nominal model within the problem with all candidates. Raises `SolverError` if the fit fails."""

@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.select import (
     total_gap_closure,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence
+from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_to_dict, to_json_types
@@ -67,12 +67,12 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
-    located_gap: GapLocalization | None = None
     record: EffectSearchResults = field(default_factory=EffectSearchResults)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first
     search_seconds: float = 0.0  # from the start to the end of the search for effects
-    stated_and_finer_time_step: tuple[float, float] | None = None  # [s], if the stated step's error was part of the gap
+    # [s]; they differ if the stated step's error was part of the gap
+    stated_and_used_time_step: tuple[float, float] = (0.0, 0.0)
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -224,7 +224,10 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
         advice = (
-            (aspects, f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording."),
+            (
+                aspects,
+                f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording.",
+            ),
             (places, f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."),
             (rivals, f"Vary {aspects[0]} over a wider range."),
         )
@@ -245,8 +248,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in a text on gap, locations, effects, events and the next experiment."""
     text = [_gap(result)]
-    if result.stated_and_finer_time_step is not None:
-        stated, used = (f"{step:.4g}" for step in result.stated_and_finer_time_step)
+    stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
+    if stated != used:
         used = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
         text.append(f"The discretisation error of {stated} s steps looks like a gap, {used}.")
     if result.verdict not in ("insufficient_data", "no_gap"):
@@ -291,10 +294,11 @@ def _gap(result: DiagnosisResult) -> str:
     fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
     sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    samples, needed = tests[0].degrees_of_freedom, result.thresholds.min_samples_per_unknown * unknowns
+    detectable, samples = f"{sum(seen)} of {len(seen)}", tests[0].degrees_of_freedom
+    needed = result.thresholds.min_samples_per_unknown * unknowns
     said = f"{samples:.0f} effective samples for {unknowns} unknowns (at least {needed:.0f} are needed)"
     texts = {
-        "insufficient_data": f"The data are insufficient: {said}; {sum(seen)} of {len(seen)} candidates are detectable.",
+        "insufficient_data": f"The data are insufficient: {said}; {detectable} candidates are detectable.",
         "no_gap": f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).",
     }
     if result.verdict in texts:

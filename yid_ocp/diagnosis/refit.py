@@ -122,12 +122,26 @@ class RefitStore(Protocol):
         """Store a refit under a name."""
 
 
+class _NoStore:
+    """Keeps nothing."""
+
+    def stored_refit(self, name: str) -> None:
+        """There is none."""
+
+    def put(self, name: str, refitted: StoredFit) -> None:
+        """Keep nothing."""
+
+
+NO_REFIT_STORE: RefitStore = _NoStore()
+"""Store of a diagnosis that no other one resumes."""
+
+
 @dataclass(frozen=True)
 class NominalSolutionAndRefitStore:
     """Solution of the nominal problem and refits of an interrupted run, known before a diagnosis."""
 
     solution: Solution | None = None
-    store: RefitStore | None = None  # receives every new refit
+    store: RefitStore = NO_REFIT_STORE  # receives every new refit
 
 
 @dataclass(frozen=True)
@@ -140,27 +154,18 @@ class EffectSearchResults:
     pairs: dict[str, tuple[ScoredCandidatePair, ...]] = field(default_factory=dict)
 
 
-class UnrecordedRefitError(LookupError):
-    """Raised when rules require a refit that the recorded search did not make."""
-
-
 @dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress, store and deadline of one diagnosis. It makes the refits that rules request.
-
-    With `is_finished`, results come from the record alone, without using the problem; a missing result raises
-    `UnrecordedRefitError`.
-    """
+    """Problem, thresholds, progress, store and deadline of one diagnosis. It makes the refits that rules request."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
     progress: Progress
-    store: RefitStore | None = None
+    store: RefitStore = NO_REFIT_STORE
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     record: EffectSearchResults = field(default_factory=EffectSearchResults)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
-    is_finished: bool = False
 
     def record_skip_if_past_deadline(self, *what: str) -> bool:
         """Whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
@@ -168,11 +173,8 @@ class RefitContext:
         self.skipped.extend(what * is_late)
         return is_late
 
-    def refit(
-        self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str = ""
-    ) -> RefitStatistics | None:
+    def refit(self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str) -> RefitStatistics | None:
         """Refit the model with some effects; None if no rollout succeeds. `name` distinguishes different starts."""
-        name = name or join_effect_labels(effects)
         asked = (self.problem, effects, start, self.store, name, self.thresholds)
         return self._answer(self.record.refits, name, lambda: refit_with_effects(*asked))
 
@@ -206,11 +208,7 @@ class RefitContext:
         return self._answer(self.record.pairs, without, lambda: tuple(itertools.islice(found, _MAX_RECORDED_PAIRS)))
 
     def _answer(self, answers: dict[str, _Answer], name: str, work: Callable[[], _Answer]) -> _Answer:
-        """A result from the record, or computed and recorded."""
-        if self.is_finished:
-            if name not in answers:
-                raise UnrecordedRefitError(name)
-            return answers[name]
+        """A result, which is recorded."""
         found = work()
         # a model's rollouts would fill the memory
         light = found.statistics() if isinstance(found, RefittedModel) else found
@@ -230,27 +228,26 @@ def refit_with_effects(
     problem: AllCandidatesProblem,
     effects: Sequence[EffectBase],
     start: Mapping[str, float],
-    store: RefitStore | None = None,
+    store: RefitStore = NO_REFIT_STORE,
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel | None:
     """Fit nominal and effect parameters, and predict held-out recordings. Returns None if no rollout succeeds.
 
-    `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name`, by
-    default the labels of the effects, and the time step are the name in the store of refits.
+    `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` and
+    the time step are the name in the store of refits.
     """
     problem = problem.restricted_to_effect_location(effects)
-    name = f"{name or join_effect_labels(effects)} at {problem.problem.step.time_step:g} s"
-    if store is not None and (stored := store.stored_refit(name)):
+    name = f"{name} at {problem.problem.step.time_step:g} s"
+    if stored := store.stored_refit(name):
         placed, at_stored = _evaluated(problem, effects, stored.values)
         if at_stored.ok:
             return _model(stored, effects, placed, at_stored)
     runs = [_attempt(problem, effects, start)]
     runs += [_attempt(problem, effects, other) for other in _other_starts(problem, effects, start, runs[0], limits)]
-    best = min(filter(None, runs), key=lambda run: run[-1].cost, default=None)
-    if best is None:
+    own, outcome, finish = min(runs, key=_cost)
+    if not finish.ok:
         return None
-    own, outcome, finish = best
     values = own.named_values(outcome.x)
     own = problem.relinearize_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
@@ -259,8 +256,7 @@ def refit_with_effects(
     sizes = own.named_values(np.linalg.norm(factor, axis=1))
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
     found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
-    if store is not None:
-        store.put(name, found)
+    store.put(name, found)
     return _model(found, effects, own, finish)
 
 
@@ -291,21 +287,24 @@ def _other_starts(
     problem: AllCandidatesProblem,
     effects: Sequence[EffectBase],
     start: Mapping[str, float],
-    first: _Attempt | None,
+    first: _Attempt,
     limits: Thresholds,
 ) -> list[Mapping[str, float]]:
     """Further starts of a refit whose first run failed or leaves more than noise."""
-    if first is not None and chi2_p_value(2 * first[-1].cost, len(first[-1].residual)) >= limits.significance_level:
+    end = first[-1]
+    if end.ok and chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level:
         return []
     # earlier effects were already tried from both starts
     moved = [effect.alternative_start(start) for effect in effects[-1:]]
     return [{**start, **values} for values in moved if values is not None]
 
 
-def _attempt(
-    problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
-) -> _Attempt | None:
-    """One run from one start; None if the model cannot be rolled out."""
+def _cost(attempt: _Attempt) -> float:
+    return attempt[-1].cost
+
+
+def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:
+    """One run from one start; its evaluation is not `ok` if the model cannot be rolled out."""
     neutral = neutral_effect_parameter_values(effects)
     own = problem.with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
@@ -315,7 +314,7 @@ def _attempt(
             break
     found = _seen(problem, effects, outcome)
     # without effects, all filters are fixed anew at the end of the run
-    if found is None or not effects:
+    if not (effects and found[-1].ok):
         return found
     moving = found[0]
     if max_torque_bias_change_in_stds(problem.problem.whitening_filters, moving.whitening_filters) < _RELINEARIZE_Z:
@@ -330,15 +329,15 @@ def _attempt(
 
     # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
     again = _seen(problem, effects, REFIT_SOLVER.minimize_cost(moving, outcome.x, None, evaluate))
-    return again if again is not None and again[-1].cost < found[-1].cost else found
+    return min(found, again, key=_cost)
 
 
-def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt | None:
+def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt:
     """The end of a run, linearised about the torques there."""
     values = problem.with_nominal_and_effects_free(effects).named_values(outcome.x)
     placed = problem.with_effects_and_relinearized_filters(effects, values)
     finish = placed.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses)
-    return (placed, outcome, finish) if finish.ok else None
+    return placed, outcome, finish
 
 
 def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:

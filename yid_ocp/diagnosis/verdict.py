@@ -63,6 +63,10 @@ class GapLocalization:
     chi2_decrease: float  # decrease by unknown forces, offsets and biases, beyond chance
 
 
+NOT_LOCATED = GapLocalization((), 0.0)
+"""Localization of a gap that was not sought."""
+
+
 @dataclass(frozen=True)
 class NominalModelGapEvidence:
     """Evidence for a gap before the search for effects."""
@@ -88,10 +92,11 @@ class NominalModelGapEvidence:
         whole = ExcessResidualCriteria(level, limits.min_excess_chi2_per_dof)
         return residuals_exceed_noise(tests, whole) or min(along, default=1.0) * max(len(ranked), 1) < level
 
-    def has_enough_samples(self, limits: Thresholds) -> bool:
-        """Whether the degrees of freedom of the residual suffice for the nominal model's unknowns."""
+    def are_data_sufficient(self, limits: Thresholds) -> bool:
+        """Whether the degrees of freedom suffice for the nominal model's unknowns, and a candidate is detectable."""
+        is_seen = any(entry.is_detectable for entry in self.screening.detectability)
         enough = limits.min_samples_per_unknown * len(self.nominal_model.values)
-        return self.nominal_test.degrees_of_freedom >= enough
+        return is_seen and self.nominal_test.degrees_of_freedom >= enough
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,7 @@ class Judgement:
     explained_fraction: float  # decrease of r'r by the effects over that by the smoother
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
+    located_gap: GapLocalization
 
     @property
     def gap_closure(self) -> GapClosure:
@@ -166,15 +172,17 @@ def _verdict_and_reason(
     said: Judgement, has_gap: bool, are_data_sufficient: bool, limits: Thresholds
 ) -> tuple[str, UnknownVerdictReason]:
     """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`."""
-    if not are_data_sufficient:
-        return "insufficient_data", ""
-    if not said.selected_effects:
-        return ("unknown", "none") if has_gap else ("no_gap", "")
-    if said.fitted_or_held_out_explained_fraction < said.required_total_explained_fraction(limits):
-        return "unknown", "little"
-    if said.failed_transfer_checks:
-        return "unknown", "stand_in"
-    return "confusable" if len(said.selected_effects[0].equivalent_effects) > 1 else "effect", ""
+    is_empty, explained = not said.selected_effects, said.fitted_or_held_out_explained_fraction
+    rules: tuple[tuple[bool, str, UnknownVerdictReason], ...] = (
+        (not are_data_sufficient, "insufficient_data", ""),
+        (is_empty and not has_gap, "no_gap", ""),
+        (is_empty, "unknown", "none"),
+        (explained < said.required_total_explained_fraction(limits), "unknown", "little"),
+        (bool(said.failed_transfer_checks), "unknown", "stand_in"),
+        (any(len(entry.equivalent_effects) > 1 for entry in said.selected_effects[:1]), "confusable", ""),
+        (True, "effect", ""),
+    )
+    return next((verdict, reason) for holds, verdict, reason in rules if holds)
 
 
 def judge(
@@ -189,14 +197,14 @@ def judge(
     depends on numbers alone. `finished` is called with the name of each stage.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
-    has_gap, enough = evidence.has_gap(limits), evidence.has_enough_samples(limits)
+    has_gap, suffices = evidence.has_gap(limits), evidence.are_data_sufficient(limits)
     # a gap closed by shifted parameters counts only if an effect explains it
-    moved = evidence.has_left_baseline and not has_gap
-    located = locate() if enough and (has_gap or moved) else None
+    is_searched = suffices and (has_gap or evidence.has_left_baseline)
+    located = locate() if is_searched else NOT_LOCATED
     finished("localisation")
     fits: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
-    if located is not None:
+    if is_searched:
         places = [place.location for place in largest_gap_locations(located.locations)]
         fits, added = select_effects(search, nominal, evidence.screening, places, evidence.has_left_baseline)
     finished("refits")
@@ -208,9 +216,8 @@ def judge(
         carried = _check_effect_amplitude_transfer(search, last)
         added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
     finished("carry_over")
-    said = Judgement("", "", fits, added, explained, carried, 0.0)
-    is_seen = any(entry.is_detectable for entry in evidence.screening.detectability)
-    verdict, reason = _verdict_and_reason(said, has_gap, enough and is_seen, limits)
+    said = Judgement("", "", fits, added, explained, carried, 0.0, located)
+    verdict, reason = _verdict_and_reason(said, has_gap, suffices, limits)
     return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
 
@@ -228,7 +235,7 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
 
 
 def _explained_fraction(
-    nominal: RefitStatistics, last: RefitStatistics, located: GapLocalization | None, limits: Thresholds
+    nominal: RefitStatistics, last: RefitStatistics, located: GapLocalization, limits: Thresholds
 ) -> float:
     """Decrease of r'r by effects over that by the smoother, minus degrees of freedom.
 
@@ -238,7 +245,7 @@ def _explained_fraction(
     if nominal.has_process_noise:
         explainable = 0.0 if leaves_noise(last, limits) else 2 * nominal.cost - nominal.residual_count
     else:
-        explainable = 0.0 if located is None else located.chi2_decrease
+        explainable = located.chi2_decrease
     decrease = 2 * (nominal.cost - last.cost) - last.total_effect_parameter_count
     return decrease / explainable if explainable > 0 else 1.0
 
