@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.screening import (
     ScreeningResult,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import NOT_LOCATED, GapLocalization, Judgement, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
@@ -281,7 +281,6 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
         significance_level=sure,
         gap_significance_level=sure,
         min_excess_chi2_per_dof=-1.0,
-        min_channel_excess_chi2_per_dof=-1.0,
         min_log_bayes_factor=1e-9,
         max_smoother_unknown_groups=1,
         min_gap_closed=-math.inf,
@@ -294,12 +293,6 @@ def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
     if said["chi2_per_dof"] is None:
         return math.inf  # the model could not follow the recording
     return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.gap_significance_level else -math.inf
-
-
-def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
-    """chi2/n - 1 of the worst channel, if any candidate is significant."""
-    is_sure = said["candidate"] < limits.gap_significance_level
-    return (said["largest_channel"] or 1.0) - 1 if is_sure else -math.inf
 
 
 def _of(name: str) -> _Statistic:
@@ -333,7 +326,6 @@ class _CalibrationRule:
 _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "gap": _CalibrationRule("min_excess_chi2_per_dof", _excess, "clean", "most", 0.1),
     "candidate": _CalibrationRule("gap_significance_level", _of("candidate"), "clean", "least", 1e-4),
-    "channel": _CalibrationRule("min_channel_excess_chi2_per_dof", _along, "clean", "most", 0.02),
     "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
     "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),
@@ -344,11 +336,10 @@ _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
 _STATISTIC_TEXTS = {
     "gap": "chi2/n - 1 of a significant residual",
     "candidate": "p of the best candidate",
-    "channel": "the same of the worst channel, along a candidate",
     "evidence": "rise of the log evidence by the best place",
     "rival": "log odds of the likeliest effect against the truth",
     "closure": "lower end of the closure by the best effect",
-    "explained": "part of the smoother's explanation",
+    "explained": "explained part of the gap",
     "carried": "standard deviations between recordings",
 }
 
@@ -450,10 +441,9 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
         "nominal_model": _refit_to_json(result.nominal_model),
         "tests": [plain(test) for test in (result.nominal_test, result.nominal_held_out_test)],
         "screening": _screening_to_json(result.screening),
-        "are_offsets_stated": result.are_offsets_stated,
         "has_left_baseline": result.has_left_baseline,
         "thresholds": plain(result.thresholds),
-        "located_gap": plain(result.located_gap),
+        "located_gap": {"locations": plain(result.located_gap)},
         "remaining": [plain(place) for place in result.remaining_gap_locations],
         "refits": {name: fit and _refit_to_json(fit) for name, fit in sorted(record.refits.items())},
         "screenings": {name: _screening_to_json(own) for name, own in record.screenings.items()},
@@ -495,9 +485,9 @@ class _RecordedCase:
         restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
-        flags = (data["are_offsets_stated"], data["has_left_baseline"])
-        self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *flags)
-        self.located_gap = restored(GapLocalization, data["located_gap"] or vars(NOT_LOCATED))
+        self.evidence = NominalModelGapEvidence(nominal, before, held, screened, data["has_left_baseline"])
+        located = data["located_gap"] or {"locations": ()}
+        self.located_gap = tuple(restored(GapLocation, place) for place in located["locations"])
         self.record = EffectSearchResults(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
@@ -518,11 +508,6 @@ class _RecordedCase:
         scores = tuple(CandidateScore(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
         seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in data["detectable"].items())
         return ScreeningResult(seen, scores, ConfusabilityMatrix(tuple(data["labels"]), overlaps), _NO_JOINT_MODEL)
-
-    def locate(self) -> GapLocalization:
-        if self.located_gap == NOT_LOCATED:
-            raise _UnrecordedRefitError("where the gap lies")
-        return self.located_gap
 
 
 _NO_JOINT_MODEL = AllCandidatesScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
@@ -553,10 +538,10 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     case = _RecordedCase(data)
     try:
         search = _RecordedSearch(cast(Any, None), limits, NULL_PROGRESS, record=case.record)
-        judged = judge(search, case.evidence, case.locate)
+        judged = judge(search, case.evidence)
     except _UnrecordedRefitError:
-        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0, NOT_LOCATED)
-    where = case.located_gap.locations
+        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0)
+    where = case.located_gap
     if judged.accepted_selections:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
         where = gap_locations_from_effects_and_smoother(where, judged.closure_by_location, rest, ())

@@ -46,7 +46,7 @@ from yid_ocp.diagnosis.refit import (
 )
 from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import GapLocalization, Judgement, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
@@ -156,7 +156,7 @@ def _examined(
     # the whitening of all hypotheses is fixed here
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
     screened = screen_candidates(composed, (), nominal.values, limits)
-    evidence = NominalModelGapEvidence(nominal, *tests, screened, _offsets_stated(nominal.problem))
+    evidence = NominalModelGapEvidence(nominal, *tests, screened)
     _end_stage(search, "screening")
     gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
     is_searched = evidence.has_gap(limits) and evidence.are_data_sufficient(limits)
@@ -279,19 +279,15 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
     steps, end_stage = (problem.step.time_step, nominal.problem.step.time_step), functools.partial(_end_stage, search)
     moved = earlier.fit_parameters_differ_significantly(nominal, limits)
     evidence = replace(seen.evidence, has_left_baseline=moved)
+    judged = judge(search, evidence, end_stage)
     smoothed: SmoothedUnknownsResult | None = None
-
-    def locate() -> GapLocalization:
-        nonlocal smoothed
+    located = where = rest = tuple[GapLocation, ...]()
+    if judged.verdict not in ("no_gap", "insufficient_data"):
         search.progress.begin_stage("locating the gap", 1.0, 8.5)
         # without events, the smoother already ran on all fitted data
         smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
-        by_chance = smoothed.dof_before - smoothed.dof_after
-        places = smoother.gap_locations_by_smoother_evidence(smoothed, limits.gap_window_z)
-        return GapLocalization(places, smoothed.chi2_before - smoothed.chi2_after - by_chance)
-
-    judged = judge(search, evidence, locate, end_stage)
-    where = rest = judged.located_gap.locations
+        located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed, limits.gap_window_z)
+    end_stage("localisation")
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selections:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
@@ -302,8 +298,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         events = _happened(seen.whole, final, limits)[0]
     end_stage("remaining")
     # what no effect explains
-    open_ = rest if judged.verdict not in ("no_gap", "insufficient_data") else ()
-    places = [name for place in open_ for name in (place.location, *place.indistinguishable_from)]
+    places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
     is_finer = steps[0] != steps[1]
     law = find_gap_law(search, problem.with_time_step(steps[1]) if is_finer else problem, final, places, seen.events)
     end_stage("law")
@@ -312,6 +307,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         **(vars(evidence) | vars(judged)),
         noise_floor=null_test.assumed_channel_noise_levels(nominal.problem),
         record=search.record,
+        located_gap=located,
         smoother_result=smoothed,
         gap_locations=where,
         remaining_test=remaining,
@@ -331,13 +327,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
     )
     finding = replace(finding, next_experiment=recommended_experiment_text(finding))
     return replace(finding, summary=diagnosis_summary_text(finding))
-
-
-def _offsets_stated(problem: EstimationProblem) -> bool:
-    """Whether the size of torque offsets or of constant sensor errors is stated."""
-    errors = (episode.input_errors for episode in problem.episodes)
-    torques = any(entry is not None and np.any(entry.torque_bias_std > 0) for entry in errors)
-    return torques or any(episode.has_biases_treated_as_noise for episode in problem.episodes)
 
 
 def _fitted_nominal_model(

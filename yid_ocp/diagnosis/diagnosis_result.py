@@ -67,6 +67,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
+    located_gap: tuple[GapLocation, ...] = ()  # of the nominal model, by the smoother
     record: EffectSearchResults = field(default_factory=EffectSearchResults)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first
@@ -169,7 +170,6 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     found = {
         "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
-        "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
         "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
         "closure_low": result.gap_closure.ci_low,
@@ -338,7 +338,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     reasons = {
         "": f"The probability that this names the cause is {100 * result.probability:.0f} %.",
         "none": "No effect tried is significant and closes enough of it.",
-        "little": f"This explains {explained:.3g} % of what unknown forces explain; {enough:.3g} % is required.",
+        "little": f"This explains {explained:.3g} % of the gap; {enough:.3g} % is required.",
         "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
     }
     text.append(reasons[result.unknown_reason])

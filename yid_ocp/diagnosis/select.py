@@ -23,9 +23,7 @@ _MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not n
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
 _RESPONSE_RTOL = 0.05  # relative error of a model's response to an effect: links and time step are finite
 _MIN_CHI2_FRACTION = _RESPONSE_RTOL**2  # of what effects explain; such an error leaves it, so less proves nothing
-_MIN_ADDED_GAP_FRACTION = 4e-4  # of the whole gap, by an effect beside others: it can close a sixth of such an error
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
-_MIN_FIRST_CLOSURE = 0.5  # of the held-out gap, by an effect beside which others are tried whatever they promise
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
@@ -64,23 +62,17 @@ def total_gap_closure(added: Sequence[SelectedEffect]) -> GapClosure:
 
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
     """Fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
-    if math.isnan(fraction := _closed_fraction(before, after)):
+    if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
         return UNDEFINED_GAP_CLOSURE
+    fraction = 1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample
     count = len(before.block_sample_counts)
     draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
     n = before.block_sample_counts[draws].sum(axis=1)
     g0, g1 = (
         np.maximum((loss.block_chi2[draws].sum(axis=1) + loss.baseline_chi2) / n - 1.0, 0.0) for loss in (before, after)
     )
-    low, high = np.quantile(1 - g1[g0 > 0] / g0[g0 > 0], [0.025, 0.975]) if g0.any() else (math.nan, math.nan)
+    low, high = np.quantile(1 - g1[g0 > 0] / g0[g0 > 0], [0.025, 0.975])
     return GapClosure(fraction, float(low), float(high))
-
-
-def _closed_fraction(before: HeldOutLoss, after: HeldOutLoss) -> float:
-    """Fraction of the held-out gap closed from `before` to `after`; NaN if there is no gap or no prediction."""
-    if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
-        return math.nan
-    return 1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample
 
 
 def leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
@@ -121,20 +113,16 @@ def _near_best_models(
     error in units of its standard error, and of equally good models the simplest is best.
     """
     best = min(fits, key=_chi2, default=nominal)
-    is_noise = leaves_noise(best, limits)
-    if is_noise:
-        best = min(fits, key=lambda fit: bic_difference(fit, nominal))
+    if leaves_noise(best, limits):
+        best = min(fits, key=lambda fit: bic_difference(fit, nominal), default=nominal)
         most = _undecided_chi2(nominal, best, limits)
         near = [(fit, bic_difference(fit, best) / most) for fit in fits]
+        order = {id(fit): (distance, 0.0) for fit, distance in near}
     else:
         near = [(fit, _distance_in_prediction(fit, best)) for fit in fits]
-
-    def order(entry: tuple[RefitStatistics, float]) -> tuple[bool, float, float]:
-        fit, distance = entry
-        size = 0 if is_noise else fit.total_effect_parameter_count
-        return not _is_plausible(fit.effects[-1], fit, limits), size, distance if is_noise else _chi2(fit)
-
-    return sorted((entry for entry in near if entry[1] <= 1), key=order)
+        order = {id(fit): (float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits}
+    near = [(fit, distance) for fit, distance in near if distance <= 1]
+    return sorted(near, key=lambda own: (not _is_plausible(own[0].effects[-1], own[0], limits), *order[id(own[0])]))
 
 
 def _undecided_chi2(nominal: RefitStatistics, best: RefitStatistics, limits: Thresholds) -> float:
@@ -173,12 +161,13 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
 def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether no parameter is clearly outside its prior range, widened by a width or a factor."""
     room = limits.prior_range_margin_in_widths
-    for name, (low, high) in effect.prior_ranges.items():
+
+    def is_within(name: str, low: float, high: float) -> bool:
         unsure, width = limits.min_z * fit.std.get(name, 0.0), room * (high - low)
         least = low / (1 + room) if low > 0 else low - width
-        if not least - unsure <= fit.values[name] <= high + width + unsure:
-            return False
-    return True
+        return least - unsure <= fit.values[name] <= high + width + unsure
+
+    return all(is_within(name, *expected) for name, expected in effect.prior_ranges.items())
 
 
 def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
@@ -186,20 +175,14 @@ def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds
     return fit.p_values[effect.label] <= math.erfc(limits.min_z / math.sqrt(2.0))
 
 
-def _is_needed(nominal: RefitStatistics, without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better.
-
-    Effects beside others must close more of the whole gap than errors in the response to these can leave.
-    """
-    before, after, whole = without.held_out_loss, fit.held_out_loss, nominal.held_out_loss.excess_chi2_per_sample
-    (gained, error), is_beside = held_out_improvement(before, after), bool(without.effects)
+def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
+    """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better."""
+    before, after = without.held_out_loss, fit.held_out_loss
+    gained, error = held_out_improvement(before, after)
+    is_clear = gained > max(error, limits.min_gap_closed * before.excess_chi2_per_sample)
     if leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
-        least = limits.min_gap_closed * whole * is_beside
-    else:
-        is_clear = gained > error
-        least = max(_MIN_ADDED_GAP_FRACTION * whole * is_beside, limits.min_gap_closed * before.excess_chi2_per_sample)
-    return is_clear and gained >= least and all(_is_significant(e, fit, limits) for e in _beside(without.effects, fit))
+    return is_clear and all(_is_significant(e, fit, limits) for e in _beside(without.effects, fit))
 
 
 def _beside(effects: Sequence[EffectBase], fit: RefitStatistics) -> list[EffectBase]:
@@ -214,14 +197,14 @@ _Start = tuple[tuple[EffectBase, ...], Mapping[str, float]]
 """Effects that are refitted, and their values at the start."""
 
 
-def _refit_shortlist(screened: ScreeningResult, limits: Thresholds, places: Sequence[str] = ()) -> list[_Start]:
-    """Candidates to refit, with initial values: the best, those confusable with them, one per place."""
+def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[_Start]:
+    """Candidates to refit, with initial values: the best, and as many that are confusable with them."""
     ranked = [score for score in screened.candidate_scores if score.p_value < limits.significance_level]
-    best, most = ranked[: limits.n_refit_per_round], limits.signature_overlap
-    names = {name for s in best for name in screened.confusability.confusable_with(s.effect.label, most)}
-    alike = [s for s in ranked if s.effect.label in names and s not in best][: limits.n_refit_per_round]
-    there = [s for place in places for s in [s for s in screened.candidate_scores if s.effect.location == place][:1]]
-    return [((s.effect,), s.predicted_values) for s in {s.effect.label: s for s in (*best, *alike, *there)}.values()]
+    best, others = ranked[: limits.n_refit_per_round], ranked[limits.n_refit_per_round :]
+    table, most = screened.confusability, limits.signature_overlap
+    names = {name for s in best for name in table.confusable_with(s.effect.label, most)}
+    alike = [s for s in others if s.effect.label in names][: limits.n_refit_per_round]
+    return [((s.effect,), s.predicted_values) for s in (*best, *alike)]
 
 
 @dataclass(frozen=True)
@@ -240,18 +223,13 @@ class _Choice:
 
 
 def select_effects(
-    search: RefitContext,
-    nominal: RefitStatistics,
-    screened: ScreeningResult,
-    locations: Sequence[str] = (),
-    moved: bool = False,
+    search: RefitContext, nominal: RefitStatistics, screened: ScreeningResult, moved: bool = False
 ) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
     """Select effects by forward selection on the held-out gap, then try replacing and removing each effect.
 
-    `locations` are those of the gap. If `moved` (the nominal fit has left the estimates of an earlier
-    run), candidates are also tried from those estimates. Returns the fits of single effects in the first round and the
-    selected effects. The fit of the chosen effect comes first (its last fit if no other effect is selected), then all
-    other fits by held-out loss.
+    If `moved` (the nominal fit has left the estimates of an earlier run), candidates are also tried from those
+    estimates. Returns the fits of single effects in the first round and the selected effects. The fit of the chosen
+    effect comes first (its last fit if no other effect is selected), then all other fits by held-out loss.
     """
     limits, alone, chosen, before = search.thresholds, screened, _Choice(nominal), nominal
     first: list[RefitStatistics] = []
@@ -259,13 +237,15 @@ def select_effects(
         base, current = chosen.fit.effects, chosen.fit
         if base:
             beside = join_effect_labels(base)
-            if search.record_skip_if_past_deadline(f"the residual gap next to {beside}"):
+            if leaves_noise(current, limits) or search.record_skip_if_past_deadline(
+                f"the residual gap next to {beside}"
+            ):
                 break
             search.progress.begin_stage(f"scoring the residual gap next to {beside}", 1.0, 12.0)
             screened = search.screen(base, current.values, f"beside {beside}")
-            if _is_futile(search, nominal, current, alone, screened):
+            if _promised_fraction(nominal, current, screened) < limits.min_explained_fraction:
                 break
-        shortlist = _refit_shortlist(screened, limits, () if base else locations)
+        shortlist = _refit_shortlist(screened, limits)
         fits = refit_with_each_effect(search, base, shortlist, current.values)
         if moved and not base:
             dearest_first = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
@@ -275,9 +255,9 @@ def select_effects(
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
         # an effect of implausible size would correct errors of earlier effects
         fits = [fit for fit in fits if not base or all(_is_plausible(e, fit, limits) for e in _beside(base, fit))]
-        near = _near_best_models(nominal, fits, limits) if fits else []
+        near = _near_best_models(nominal, fits, limits)
         first = first or sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
-        better = next((fit for fit, _ in near if _is_needed(nominal, current, fit, limits)), None)
+        better = next((fit for fit, _ in near if _is_needed(current, fit, limits)), None)
         if better is None:
             break
         # untried confusable candidates cannot be excluded yet
@@ -295,22 +275,10 @@ def select_effects(
     return tuple(first), _with_closures(search, nominal, chosen, first)
 
 
-def _is_futile(
-    search: RefitContext,
-    nominal: RefitStatistics,
-    current: RefitStatistics,
-    alone: ScreeningResult,
-    screened: ScreeningResult,
-) -> bool:
-    """Whether the linear models promise too little of another effect, or of any two if one closes little."""
-    limits, gap = search.thresholds, 2 * nominal.cost - nominal.residual_count
+def _promised_fraction(nominal: RefitStatistics, current: RefitStatistics, screened: ScreeningResult) -> float:
+    """Fraction of the gap of r'r that the effects close together with what another one promises in the linear model."""
     promised = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=0.0)
-    if leaves_noise(current, limits):
-        return promised < max(2 * limits.min_log_bayes_factor, limits.min_gap_closed * gap)
-    if _closed_fraction(nominal.held_out_loss, current.held_out_loss) >= _MIN_FIRST_CLOSURE:
-        return False
-    *_, pair = next(iter(search.ranked_candidate_pairs(alone)), (0.0,))
-    return max(pair, 2 * (nominal.cost - current.cost) + promised) < limits.min_explained_fraction * gap
+    return (2 * (nominal.cost - current.cost) + promised) / max(2 * nominal.cost - nominal.residual_count, 1.0)
 
 
 def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
@@ -327,24 +295,22 @@ def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[_Start]:
     """The pairs of candidates to refit: best penalised decrease first, without confusable duplicates."""
-    limits = search.thresholds
+    limits, chosen = search.thresholds, list[_Start]()
 
     def same(one: EffectBase, other: EffectBase) -> bool:
         alike = screened.confusability.confusable_with(one.label, limits.signature_overlap)
         return other.label in (one.label, *alike)
 
-    chosen: list[_Start] = []
     for (a, b), values, _ in search.ranked_candidate_pairs(screened, without.label):
-        before = (pair for pair, _ in chosen)
-        if not any((same(a, c) and same(b, d)) or (same(a, d) and same(b, c)) for c, d in before):
+        before = [order for pair, _ in chosen for order in (pair, pair[::-1])]
+        if not any(same(a, c) and same(b, d) for c, d in before):
             chosen.append(((a, b), values))
     return chosen[: limits.n_refit_pairs]
 
 
 def _reconsidered(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, before: RefitStatistics) -> _Choice:
     """Try each effect's position again with all others present: without it, and with other effects instead."""
-    is_added = chosen.fit.effects[:-1] == before.effects
-    tried = {frozenset(effect.label for effect in before.effects)} if is_added else set()
+    tried = {frozenset(effect.label for effect in before.effects)}
     while len(chosen.fit.effects) > 1:
         labels = frozenset(effect.label for effect in chosen.fit.effects)
         own = next((effect for effect in chosen.fit.effects if labels - {effect.label} not in tried), None)
@@ -363,7 +329,7 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     without = search.refit(rest, full.values, f"{join_effect_labels(full.effects)} without {label}")
     if without is None:
         return chosen
-    if not _is_needed(nominal, without, full, limits):
+    if not _is_needed(without, full, limits):
         search.progress.begin_stage(f"left {label} out again: the others do as well")
         return replace(chosen, fit=without)
     search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
@@ -374,11 +340,12 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
     near = _near_best_models(nominal, [own, *(f for f in others if _is_plausible(f.effects[-1], f, limits))], limits)
-    better = next((fit for fit, _ in near if _is_needed(nominal, without, fit, limits)), own)
-    if better is not own:
-        search.progress.begin_stage(f"put {better.effects[-1].label} in the place of {label}")
+    better = next((fit for fit, _ in near if _is_needed(without, fit, limits)), own)
     found = chosen.replaced(better, [(fit.effects[-1], distance) for fit, distance in near])
-    return replace(found, fit=full) if better is own else found
+    if better is own:
+        return replace(found, fit=full)
+    search.progress.begin_stage(f"put {better.effects[-1].label} in the place of {label}")
+    return found
 
 
 def _with_closures(
@@ -388,9 +355,10 @@ def _with_closures(
     effects, found = chosen.fit.effects, []
     for i, effect in enumerate(effects, 1):
         known = next((fit for fit in (chosen.fit, *first) if fit.effects == effects[:i]), None)
-        fit = known or search.refit(effects[:i], chosen.fit.values, f"{join_effect_labels(effects[:i])} again")
-        closed = held_out_gap_closure(nominal.held_out_loss, (fit or chosen.fit).held_out_loss)
+        again = f"{join_effect_labels(effects[:i])} again"
+        fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
+        closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
         rivals, distances = zip(*chosen.rivals[effect.label], strict=True)
         weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
-        found.append(SelectedEffect(effect, fit or chosen.fit, closed, rivals, tuple(weights / weights.sum())))
+        found.append(SelectedEffect(effect, fit, closed, rivals, tuple(weights / weights.sum())))
     return tuple(found)

@@ -27,9 +27,6 @@ class Thresholds(SmootherOptions):
     min_excess_chi2_per_dof: Annotated[float, Ge(0), OptionInfo("smallest chi2/n - 1 of a gap")] = (
         DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof
     )
-    min_channel_excess_chi2_per_dof: Annotated[
-        float, Ge(0), OptionInfo("smallest chi2/n - 1 of the worst channel, if a candidate explains it")
-    ] = 0.02
     gap_significance_level: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance level of a gap, of all residuals or along a candidate")
     ] = 1e-4
@@ -60,7 +57,7 @@ class Thresholds(SmootherOptions):
     ] = 0.3
     always_allowed_transfer_z: Annotated[float, Gt(0), OptionInfo("difference that is always allowed [stds]")] = 4.5
     min_explained_fraction: Annotated[
-        float, Ge(0), Le(1), OptionInfo("fraction of the smoother's decrease that effects must reach")
+        float, Ge(0), Le(1), OptionInfo("fraction of the gap that an effect must explain")
     ] = 0.75
     # where the gap lies
     gap_window_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero that mark a gap window")] = 3.0

@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import ScreeningResult
+from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, leaves_noise, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
-from yid_ocp.inference.smoother import GapLocation, largest_gap_locations
 from yid_ocp.problem.options import ExcessResidualCriteria
 
 UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
@@ -56,18 +55,6 @@ class EffectAmplitudeTransferCheck:
 
 
 @dataclass(frozen=True)
-class GapLocalization:
-    """Location of the nominal model's gap, as found by the smoother."""
-
-    locations: tuple[GapLocation, ...]
-    chi2_decrease: float  # decrease by unknown forces, offsets and biases, beyond chance
-
-
-NOT_LOCATED = GapLocalization((), 0.0)
-"""Localization of a gap that was not sought."""
-
-
-@dataclass(frozen=True)
 class NominalModelGapEvidence:
     """Evidence for a gap before the search for effects."""
 
@@ -75,22 +62,17 @@ class NominalModelGapEvidence:
     nominal_test: NullTestResult  # test on the estimation recordings
     nominal_held_out_test: NullTestResult
     screening: ScreeningResult
-    are_offsets_stated: bool  # whether the size of torque offsets or of constant sensor errors is
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
 
     def has_gap(self, limits: Thresholds) -> bool:
-        """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
+        """Whether the residual exceeds noise significantly: as a whole and by a relevant amount, or along a candidate.
 
-        Along a signature, some channel must also exceed noise: the sum over all channels hides a few deviating samples.
-        A torque offset beyond its stated size counts without such a channel, because it is one number among thousands.
+        A candidate's signature is one direction: along it, a few deviating samples show that the sum of all hides.
         """
-        tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
-        largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
-        is_seen = largest > 1 + limits.min_channel_excess_chi2_per_dof
-        level = limits.gap_significance_level
-        along = [s.p_value for s in ranked if is_seen or (self.are_offsets_stated and s.effect.is_torque_offset)]
+        level, tests = limits.gap_significance_level, (self.nominal_test, self.nominal_held_out_test)
+        along = bonferroni_corrected_min_candidate_p_value(self.screening.candidate_scores)
         whole = ExcessResidualCriteria(level, limits.min_excess_chi2_per_dof)
-        return residuals_exceed_noise(tests, whole) or min(along, default=1.0) * max(len(ranked), 1) < level
+        return along < level or residuals_exceed_noise(tests, whole)
 
     def are_data_sufficient(self, limits: Thresholds) -> bool:
         """Whether the degrees of freedom suffice for the nominal model's unknowns, and a candidate is detectable."""
@@ -107,10 +89,9 @@ class Judgement:
     unknown_reason: UnknownVerdictReason
     single_effect_models: tuple[RefitStatistics, ...]  # refits of the first round, best first
     selected_effects: tuple[SelectedEffect, ...]
-    explained_fraction: float  # decrease of r'r by the effects over that by the smoother
+    explained_fraction: float  # decrease of r'r by the effects over its excess over noise
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
-    located_gap: GapLocalization
 
     @property
     def gap_closure(self) -> GapClosure:
@@ -155,9 +136,8 @@ class Judgement:
 
     @property
     def fitted_or_held_out_explained_fraction(self) -> float:
-        """Explained fraction of the gap: fitted, or if larger the held-out 95 % lower limit of one effect."""
-        held_out = self.gap_closure.ci_low if self.independent_effect_count == 1 else 0.0
-        return max(self.explained_fraction, held_out)
+        """Explained fraction of the gap: fitted, or if larger the 95 % lower limit of the held-out closure."""
+        return max(self.explained_fraction, self.gap_closure.ci_low)
 
     def required_total_explained_fraction(self, limits: Thresholds) -> float:
         """Smallest explained fraction of the gap at which the selected effects are accepted.
@@ -186,37 +166,30 @@ def _verdict_and_reason(
 
 
 def judge(
-    search: RefitContext,
-    evidence: NominalModelGapEvidence,
-    locate: Callable[[], GapLocalization],
-    finished: Callable[[str], None] = lambda _: None,
+    search: RefitContext, evidence: NominalModelGapEvidence, finished: Callable[[str], None] = lambda _: None
 ) -> Judgement:
     """Decide the verdict from the evidence for a gap and from the results of a search for effects.
 
-    Refits, screenings and the smoother (`locate`) are requested by name and can come from a record, so the verdict
-    depends on numbers alone. `finished` is called with the name of each stage.
+    Refits and screenings are requested by name and can come from a record, so the verdict depends on numbers alone.
+    `finished` is called with the name of each stage.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
     has_gap, suffices = evidence.has_gap(limits), evidence.are_data_sufficient(limits)
-    # a gap closed by shifted parameters counts only if an effect explains it
-    is_searched = suffices and (has_gap or evidence.has_left_baseline)
-    located = locate() if is_searched else NOT_LOCATED
-    finished("localisation")
     fits: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
-    if is_searched:
-        places = [place.location for place in largest_gap_locations(located.locations)]
-        fits, added = select_effects(search, nominal, evidence.screening, places, evidence.has_left_baseline)
+    # a gap closed by shifted parameters counts only if an effect explains it
+    if suffices and (has_gap or evidence.has_left_baseline):
+        fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
     finished("refits")
     carried: tuple[EffectAmplitudeTransferCheck, ...] = ()
     explained = 1.0
     if added:
         last = added[-1].refitted_model
-        explained = _explained_fraction(nominal, last, located, limits)
+        explained = _explained_fraction(nominal, last, limits)
         carried = _check_effect_amplitude_transfer(search, last)
         added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
     finished("carry_over")
-    said = Judgement("", "", fits, added, explained, carried, 0.0, located)
+    said = Judgement("", "", fits, added, explained, carried, 0.0)
     verdict, reason = _verdict_and_reason(said, has_gap, suffices, limits)
     return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
@@ -234,20 +207,11 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
     return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
 
 
-def _explained_fraction(
-    nominal: RefitStatistics, last: RefitStatistics, located: GapLocalization, limits: Thresholds
-) -> float:
-    """Decrease of r'r by effects over that by the smoother, minus degrees of freedom.
-
-    With process noise, whose spectrum the smoother's forces share, the whole excess takes its place, if more than noise
-    is left. 1 if there is nothing to compare with.
-    """
-    if nominal.has_process_noise:
-        explainable = 0.0 if leaves_noise(last, limits) else 2 * nominal.cost - nominal.residual_count
-    else:
-        explainable = located.chi2_decrease
+def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits: Thresholds) -> float:
+    """Decrease of r'r by effects, minus degrees of freedom, over its excess over noise. 1 if hardly more is left."""
     decrease = 2 * (nominal.cost - last.cost) - last.total_effect_parameter_count
-    return decrease / explainable if explainable > 0 else 1.0
+    excess = max(2 * nominal.cost - nominal.residual_count, decrease, 1.0)
+    return 1.0 if leaves_noise(last, limits) else decrease / excess
 
 
 def _check_effect_amplitude_transfer(
@@ -277,9 +241,9 @@ def _compare(
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
         apart, spread = entry.estimate_difference_and_std
+        allowed = max(limits.always_allowed_transfer_z * spread, limits.transfer_rtol * size * width[name])
         # an unknown standard deviation is no evidence against transfer
-        sure = math.isfinite(spread) and apart > limits.always_allowed_transfer_z * spread
-        found.append(replace(entry, is_consistent=not sure or apart <= limits.transfer_rtol * size * width[name]))
+        found.append(replace(entry, is_consistent=not apart > allowed))
     return found
 
 
