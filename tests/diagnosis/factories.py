@@ -27,7 +27,7 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import NOT_LOCATED, EffectAmplitudeTransferCheck
+from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknowns, SmoothedUnknownsResult
@@ -46,12 +46,6 @@ class Local(EffectBase):
     """One that says nothing of other places."""
 
     is_local = True
-
-
-class Offset(EffectBase):
-    """A constant error of a recorded torque."""
-
-    is_torque_offset = True
 
 
 def amplitude(name="a", neutral=0.0, lower=0.0, upper=math.inf, expected=(0.0, 1.0), unit="N m"):
@@ -222,7 +216,6 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "nominal_test": outcome(p=1e-9, chi2=2.0),
         "nominal_held_out_test": outcome(p=1e-8, chi2=2.1),
         "screening": screening([score(of, p=1e-9, decrease=100.0, statistic=40.0)]),
-        "are_offsets_stated": False,
         "explained_fraction": 1.0,
         "probability": 0.9,
         "transfer_checks": (),
@@ -240,7 +233,6 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "thresholds": Thresholds(),
         "stage_seconds": {"nominal_model": 1.0},
         "unknown_reason": "none" if verdict == "unknown" else "",
-        "located_gap": NOT_LOCATED,
     }
     found = usual | changed
     if total := found.pop("gap_closure"):

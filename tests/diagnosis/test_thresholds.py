@@ -54,7 +54,7 @@ def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):
     [
         ({"min_samples_per_unknown": 1e4}, "insufficient_data"),
         ({"min_gap_closed": 0.999}, "unknown"),
-        ({"min_excess_chi2_per_dof": 1e3, "min_channel_excess_chi2_per_dof": 1e3}, "no_gap"),
+        ({"gap_significance_level": 1e-300}, "no_gap"),
     ],
 )
 @pytest.mark.usefixtures("without_law")

@@ -201,7 +201,7 @@ class RefitContext:
         asked = (self.problem, base, values, self.thresholds)
         return self._answer(self.record.screenings, name, lambda: screen_candidates(*asked))
 
-    def ranked_candidate_pairs(self, screened: ScreeningResult, without: str = "") -> tuple[ScoredCandidatePair, ...]:
+    def ranked_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, without one label. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
         found = screened.joint_score_model.ranked_candidate_pairs(labels)

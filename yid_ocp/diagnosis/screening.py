@@ -195,7 +195,7 @@ def _score_candidates(
 
 def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[CandidateScore]) -> float:
     """Bonferroni-corrected smallest p-value of the candidates; 1 without candidates."""
-    return min(1.0, *(score.p_value * len(ranked) for score in ranked))
+    return min([1.0, *(score.p_value * len(ranked) for score in ranked)])
 
 
 def _room(effect: EffectBase) -> Array:
