@@ -37,8 +37,6 @@ from yid_ocp.diagnosis.verdict import (
     _verdict_and_reason,
 )
 from yid_ocp.display import NULL_PROGRESS
-from yid_ocp.effects import EffectBase
-from yid_ocp.model.parameters import Parameters
 
 LIMITS = Thresholds(min_explained_fraction=0.5)
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")

@@ -33,7 +33,7 @@ def found(bench, effects, candidates, **how):
     assert located or not finding.single_effect_models
     assert bool(result["effects"]) is (result["verdict"] in ("effect", "confusable"))
     assert (result["reason"] != "") is (result["verdict"] == "unknown")
-    stages = "compose nominal events screening localisation refits carry_over remaining law"
+    stages = "compose nominal events screening refits carry_over localisation remaining law"
     assert list(result["seconds"]) == stages.split()
     assert finding.summary == diagnosis_summary_text(finding) == result["summary"]
     return finding, result

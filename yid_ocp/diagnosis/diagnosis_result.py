@@ -338,7 +338,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     reasons = {
         "": f"The probability that this names the cause is {100 * result.probability:.0f} %.",
         "none": "No effect tried is significant and closes enough of it.",
-        "little": f"This explains {explained:.3g} % of the gap; {enough:.3g} % is required.",
+        "little": f"On the fitted motions this explains {explained:.3g} % of the gap; {enough:.3g} % is required.",
         "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
     }
     text.append(reasons[result.unknown_reason])
