@@ -181,6 +181,9 @@ def test_a_fit_is_judged_in_units_of_noise_by_the_limits_of_a_diagnosis():
     assert assess_goodness_of_fit(plain, plain.evaluate([1.0])).chi2_per_dof == pytest.approx(9.0, rel=0.01)
     failed = MadeUp(lambda x, duration: None, count=3)
     assert not assess_goodness_of_fit(failed, failed.evaluate([1.0])).explains
+    # the prior knows as much of the unknown as the data
+    halved = MadeUp(linear([[1.0]] * 9 + [[3.0]], [1.0] * 9 + [0.0]), stated=1)
+    assert assess_goodness_of_fit(halved, halved.evaluate([0.0])).chi2_per_dof == pytest.approx(9 / 8.5)
     problem = of_size(1.2)
     found = problem.evaluate([1.0])
     assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(significance_level=1e-6)).explains

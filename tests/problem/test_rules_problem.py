@@ -300,8 +300,8 @@ def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, hel
         assert np.any(problem.held_out_prediction_inputs(x)[i][2])
 
 
-def test_a_held_out_part_of_a_recording_shares_its_start(make):
-    problem = make(initial_state="estimated")
+def test_a_held_out_part_of_a_recording_shares_its_start_and_local_parameters(make):
+    problem = make(initial_state="estimated", local_parameters=("elbow.rest",))
     part = replace(problem.episodes[1], initial_state_shared_with=1)
     split = problem.with_episodes(problem.episodes, [part])
     x = problem.unknown_vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})

@@ -52,7 +52,7 @@ from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.null_test import NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
-from yid_ocp.inference.uncertainty import noise_only_covariance_factor
+from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_factor
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -404,7 +404,7 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
     return found
 
 
-def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
+def _null_test(problem: EstimationProblem, residual: Array, fitted: float, limits: Thresholds) -> NullTestResult:
     """The null test of a residual after a fit of the given number of parameters."""
     samples, level = null_test.channels_with_residual_indices(problem), limits.significance_level
     return null_test.residual_chi2_null_test(samples, residual, fitted, level, limits.residual_test_window)
@@ -413,7 +413,7 @@ def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits:
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
     spread = null_test.encoder_noise_residual_factor(fit.problem, fit.problem.unknown_vector(fit.values))
     residual = null_test.whiten_with_extra_errors(fit.evaluation.residual, spread)
-    return _null_test(fit.problem, residual, len(fit.values), limits)
+    return _null_test(fit.problem, residual, effective_parameter_count(fit.problem, fit.evaluation), limits)
 
 
 def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool = False) -> list[ResidualAndJacobian]:

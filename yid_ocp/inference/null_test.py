@@ -2,8 +2,8 @@
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
 (white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2). A chi-squared variable
-with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each fitted parameter removes one degree of
-freedom.
+with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each parameter that the data determine removes one
+degree of freedom.
 """
 
 from __future__ import annotations
@@ -108,14 +108,14 @@ def chi2_p_value(chi2: float, degrees: float) -> float:
 def residual_chi2_null_test(
     series: Sequence[ChannelResidualIndices],
     residual: Array,
-    parameters: int,
+    parameters: float,
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
     """Test whether a whitened residual (nr,) is noise alone after a fit of `parameters` parameters.
 
-    Rows that belong to no series (priors) are ignored. `level` is the false-discovery rate over time windows of length
-    `window` [s].
+    Rows that belong to no series (priors) are ignored, and so are parameters that their priors determine. `level` is
+    the false-discovery rate over time windows of length `window` [s].
     """
     count = sum(len(s.residual_indices) for s in series)
     degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)

@@ -108,7 +108,8 @@ def assess_goodness_of_fit(
                 parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
         residual = np.concatenate(parts)
     series = channels_with_residual_indices(problem)
-    found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, len(problem.unknown_names))
+    fitted = effective_parameter_count(problem, evaluation)
+    found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, fitted)
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.no_data_issue_exceeds_warning)
 
@@ -137,6 +138,18 @@ def noise_only_covariance_factor(problem: EstimationProblem, evaluation: Evaluat
         rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
         vectors, singular = np.vstack([vectors, rest.T]), np.pad(singular, (0, count - len(singular)))
     return scale[:, None] * vectors.T / np.maximum(singular, 1e-8)
+
+
+def effective_parameter_count(problem: EstimationProblem, evaluation: Evaluation) -> float:
+    """Number of unknowns that the data determine, without the part that stated priors determine (MacKay 1992).
+
+    It is n - trace(P (J'J)^-1 P') for n unknowns and the Jacobians P of the stated priors and J of data and priors.
+    """
+    count, rows = len(problem.unknown_names), problem.residual_rows.stated_priors
+    if evaluation.jacobian is None or rows.start == rows.stop:
+        return count
+    priors = residual_and_jacobian_without_weak_priors(problem, evaluation)[1][rows]
+    return count - float(np.sum((priors @ noise_only_covariance_factor(problem, evaluation)) ** 2))
 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:

@@ -385,8 +385,8 @@ def problem_with_relinearized_held_out_whitening(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
     """Re-estimate the torque offsets in held-out whitening filters at the unknowns `x`; gains stay fixed."""
-    before = problem.held_out_theta(frozen)
-    at = [(*own, before) for own in problem.held_out_prediction_inputs(x)]
+    pairs = zip(problem.held_out_prediction_inputs(x), problem.held_out, strict=True)
+    at = [(*own, problem.held_out_theta(frozen, held)) for own, held in pairs]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
     return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
 

@@ -194,7 +194,7 @@ class Episode:
     known_parameters: Mapping[str, float] = field(default_factory=dict)  # values that differ among recordings
     input_errors: TorqueAndAngleErrorModel | None = None  # errors of the torques and angles that drive the rollout
     fixed_initial_state: PrecomputedInitialState | None = None  # given or fitted to points; else it is an equilibrium
-    # index of the estimation episode whose initial state this held-out part of the same recording shares
+    # index of the estimation episode whose initial state and local parameters this held-out part of it shares
     initial_state_shared_with: int | None = None
     equilibrium_guess: Array | None = None  # near the initial equilibrium, if that is not of least energy, (n,)
 

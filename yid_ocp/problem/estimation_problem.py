@@ -327,7 +327,7 @@ class EstimationProblem(ReprMixin):
         return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameter_names, guess)
 
     def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[EpisodeAndPrediction]:
-        """Predict held-out recordings with the shared parameters in `x` and initial values of local parameters.
+        """Predict held-out recordings with the parameters of `held_out_theta`.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
         prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free
@@ -338,10 +338,9 @@ class EstimationProblem(ReprMixin):
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
         """Inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
-        x = np.asarray(x, float)
-        theta, found = self.held_out_theta(x), []
+        x, found = np.asarray(x, float), []
         for held in self.held_out:
-            shared = held.initial_state_shared_with
+            theta, shared = self.held_out_theta(x, held), held.initial_state_shared_with
             if shared is not None:
                 episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
                 found.append((episode, theta, self.theta_and_initial_state_deviation(x, shared)[1]))
@@ -351,10 +350,14 @@ class EstimationProblem(ReprMixin):
             found.append((episode, theta, _estimated_initial_state_offset(self.predictor, episode, theta, std)))
         return found
 
-    def held_out_theta(self, x: Array) -> Array:
-        """Vector theta (ntheta,) with the shared parameters in `x`. Local parameters keep their initial values."""
-        theta, _ = self.theta_and_initial_state_deviation(x, 0)
-        for name in self.local_parameters:
+    def held_out_theta(self, x: Array, held: Episode) -> Array:
+        """Vector theta (ntheta,) of a held-out recording, with the shared parameters in `x`.
+
+        Local parameters have the values in `x` if it is part of an estimation recording, else their initial values.
+        """
+        whole = held.initial_state_shared_with
+        theta, _ = self.theta_and_initial_state_deviation(x, whole or 0)
+        for name in self.local_parameters if whole is None else ():
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return theta
 
