@@ -190,12 +190,6 @@ def test_what_it_does_not_do_is_refused(urdf_folder):
     step = pendulum_step(urdf_folder, late)
     with pytest.raises(SolverError, match="an effect changes recorded inputs, times"):
         transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",)))
-    step = pendulum_step(urdf_folder)
-    with pytest.raises(SolverError, match="two recordings are called 'one'"):
-        transcribe(EstimationProblem(step, [taken(step, seed, name="one") for seed in (1, 2)], ("elbow.damping",)))
-    known = ProblemOptions(parameters_by_recording={"run_1": {"elbow.damping": 0.3}})
-    with pytest.raises(SolverError, match=r"elbow.damping is free, but this recording has a known value"):
-        transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), known))
 
 
 def test_blocks_are_named_after_what_they_hold(urdf_folder):

@@ -33,6 +33,7 @@ from yid_ocp.problem.evaluation import (
     ResidualVectorLayout,
     UnknownVectorLayout,
     check_free_parameters,
+    check_names_and_known_parameters,
     check_parameter_bounds,
     estimated_initial_state_names,
     initial_internal_state_offset_bounds,
@@ -56,8 +57,9 @@ class EstimationProblem(ReprMixin):
     """Immutable, thread-safe problem of estimating free parameters from recordings.
 
     It evaluates the cost, predicts held-out recordings, and derives problems with other parameters, data, options or
-    whitening filters (made by `inference.whitening`). Raises `ConfigError` if a parameter is unknown, listed twice, or
-    outside its bounds, and `DataError` if a recording lacks joints, points or a noise level, or is too short.
+    whitening filters (made by `inference.whitening`). Raises `ConfigError` if a parameter is unknown, listed twice,
+    outside its bounds, or free although a recording has a known value of it, or if two recordings have the same name,
+    and `DataError` if a recording lacks joints, points or a noise level, or is too short.
 
     Parameters
     ----------
@@ -115,6 +117,7 @@ class EstimationProblem(ReprMixin):
             tuple(episode_at_equilibrium_with_denoised_gear_loads(self.predictor, e, theta) for e in group)
             for group in (fitted, others)
         )
+        check_names_and_known_parameters(ready, other, free)
         self._set(functions, options, tuple(free), theta, ready, other)
 
     def _set(

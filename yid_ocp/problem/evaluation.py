@@ -287,6 +287,21 @@ def check_free_parameters(system: System, free: Sequence[str], options: ProblemO
             raise ConfigError(what, where=where, **unknown_name_error_arguments(name, free, "set its `free: true`"))
 
 
+def check_names_and_known_parameters(used: Sequence[Episode], held_out: Sequence[Episode], free: Sequence[str]) -> None:
+    """Raise `ConfigError` if two used episodes have one name, or an episode has a known value of a free parameter."""
+    names = [episode.name for episode in used]
+    if twice := [name for name in names if names.count(name) > 1]:
+        what, hint = f"two recordings are called '{twice[0]}'", "rename one of them"
+        raise ConfigError(what, where="recordings.estimate", allowed="every name once", hint=hint)
+    for episode in (*used, *held_out):
+        start = episode.fixed_initial_state
+        known = {*episode.known_parameters, *(() if start is None else start.fitted_parameters)}
+        if found := [name for name in free if name in known]:
+            what = f"{found[0]} is free, but this recording has a known value of it"
+            allowed, hint = "parameters that are free or known", f"set parameters.{found[0]}.free: false"
+            raise ConfigError(what, where=f"recording '{episode.name}'", allowed=allowed, hint=hint)
+
+
 def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:
     """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or if its bounds coincide."""
     for name in free:

@@ -337,23 +337,15 @@ def _levels(
         (JOINT_POSITION_GROUP_NAME, position, joint_angle_noise_std),
         (JOINT_EFFORT_GROUP_NAME, effort, joint_torque_noise_std),
     )
-    known = [is_noise_std_stated(joints, group, choice) for group, choice, _ in kinds]
-    if episode.input_errors is None:
-        angle, torque = (
-            noise_std(joints, names, choice, episode.name) if stated else None
-            for stated, (_, choice, noise_std) in zip(known, kinds, strict=True)
-        )
-        return angle, torque, None
-    at, rest = [names.index(name) for name in driven], [i for i, name in enumerate(names) if name not in driven]
-    other = tuple(names[i] for i in rest)
-    levels = np.zeros((3, len(names)))
-    levels[2, at] = joint_torque_bias_std(joints, driven, effort)
-    for level, stated, (_, choice, noise_std) in zip(levels[:2], known, kinds, strict=True):
-        level[at] = noise_std(joints, driven, choice, episode.name)
-        if other and stated:
-            level[rest] = noise_std(joints, other, choice, episode.name)
-    angle, torque, bias = levels
-    return angle, torque, bias
+    noisy, levels = () if episode.input_errors is None else driven, np.zeros((3, len(names)))
+    at, found = [names.index(name) for name in noisy], list[Array | None]()
+    for level, (group, choice, noise_std) in zip(levels[:2], kinds, strict=True):
+        stated = is_noise_std_stated(joints, group, choice)
+        if stated or noisy:  # of joints that drive the model it is estimated if it is not stated
+            level[slice(None) if stated else at] = noise_std(joints, names if stated else noisy, choice, episode.name)
+        found.append(level if stated or noisy else None)
+    levels[2, at] = joint_torque_bias_std(joints, noisy, effort)
+    return found[0], found[1], levels[2] if noisy else None
 
 
 def _noisy(values: Array, std: Array, rng: np.random.Generator | None) -> Array:

@@ -207,11 +207,11 @@ def _joint_noise_std(
     joints: RecordedJointsInterface, names: Sequence[str], choice: SensorOptions, where: str, *, group: str
 ) -> Array:
     channel, columns = CHANNEL_KINDS[group], recorded_joint_column_indices(joints, tuple(names), where)
-    values, given, step = getattr(joints, channel.quantity)[:, columns], choice.std, np.zeros(len(names))
+    values, given, step = getattr(joints, channel.quantity), choice.std, np.zeros(len(names))
     if given is None and group == JOINT_POSITION_GROUP_NAME:
         found = joints.position_resolution
         if found is None:
-            step = np.array([quantization_step(column) for column in values.T])
+            step = np.array([quantization_step(column) for column in values[:, columns].T])
         else:
             step = expand_to_joint_values(found, joints.names, names, "position_resolution")
     step_std = step / math.sqrt(12)
@@ -221,7 +221,7 @@ def _joint_noise_std(
         return np.hypot(expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std"), step_std)
     if is_noise_std_stated(joints, group, choice):
         return step_std
-    return np.maximum(_estimated_noise_std(values, where, group, channel.unit), step_std)
+    return np.maximum(_estimated_noise_std(values[:, columns], where, group, channel.unit), step_std)
 
 
 joint_angle_noise_std = partial(_joint_noise_std, group=JOINT_POSITION_GROUP_NAME)

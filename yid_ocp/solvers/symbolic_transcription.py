@@ -59,8 +59,7 @@ def transcribe(
     """Transcribe an estimation problem into a nonlinear program with a node at every step.
 
     Equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955. Raises
-    `SolverError` if an effect changes recorded inputs or times, a free parameter has a known value in a recording, or
-    two recordings have the same name.
+    `SolverError` if an effect changes recorded inputs or times.
 
     Parameters
     ----------
@@ -77,7 +76,7 @@ def transcribe(
         `weight.GROUP[NAME]`, `start[NAME]` and others, see docs/howto/program.md.
     """
     problem = _about_zero(problem)
-    _check_transcribable(problem)
+    check_no_effect_changes_inputs(problem, "transcribe")
     compiled = problem.step.is_compiled if use_compiler is None else use_compiler
     start = problem.initial_unknowns if initial_unknowns is None else np.asarray(initial_unknowns, float)
     with CASADI_LOCK:
@@ -100,23 +99,6 @@ def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> No
         message = "an effect changes recorded inputs, times or the reference of the tracking feedback"
         allowed = "effects that change the mechanics or the readings of sensors"
         raise SolverError(message, where=where, allowed=allowed, hint="set solver.name: gauss_newton")
-
-
-def _check_transcribable(problem: EstimationProblem) -> None:
-    """Raise `SolverError` for problems that the program does not support."""
-    check_no_effect_changes_inputs(problem, where := "transcribe")
-    names = [episode.name for episode in problem.episodes]
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        allowed, hint = "a name of its own for every recording", "rename one of the files"
-        raise SolverError(f"two recordings are called '{twice[0]}'", where=where, allowed=allowed, hint=hint)
-    for episode in problem.episodes:
-        start = episode.fixed_initial_state
-        known = {*episode.known_parameters, *(() if start is None else start.fitted_parameters)}
-        for name in (name for name in problem.free if name in known):
-            what, where = f"{name} is free, but this recording has a known value of it", f"recording '{episode.name}'"
-            allowed, hint = "parameters that are free or known", f"set parameters.{name}.free: false"
-            raise SolverError(what, where=where, allowed=allowed, hint=hint)
 
 
 def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:

@@ -34,7 +34,7 @@ from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_prin
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
 from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import expand_recording_path, read_recordings_of_role
+from yid_ocp.workflow.run_inputs import expand_recording_path, read_recordings_of_role, uniquely_named_recordings
 
 log = logging.getLogger(__name__)
 
@@ -227,7 +227,8 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
                 found.append(read_recording(expand_recording_path(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
-    return tuple(replace(recording, name=f"{recording.name} (without)") for recording in found), ""
+    named = (replace(recording, name=f"{recording.name} (without)") for recording in found)
+    return tuple(uniquely_named_recordings(named)), ""
 
 
 def require_recordings_not_in_baseline(

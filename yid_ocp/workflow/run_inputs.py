@@ -166,17 +166,25 @@ def expand_recording_path(path: str) -> Path:
 
 
 def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
-    """Read the first `count` recordings (None: all) of `recordings.estimate` or `held_out`, uniquely named.
+    """Read the first `count` recordings (None: all) of `recordings.estimate` or `held_out`.
 
-    Errors are as in `read_recording`, with the setting.
+    Names are unique among the recordings of both lists. Errors are as in `read_recording`, with the setting.
     """
     paths: Sequence[str] = getattr(run.recordings, which)
-    result: list[Recording] = []
+    others = () if which == "estimate" else map(expand_recording_path, run.recordings.estimate)
+    found: list[Recording] = []
     for i, path in enumerate(paths[:count]):
         file = _existing(run, expand_recording_path(path), "recording", "recordings", which, i)
         with add_setting_location_to_errors(run, "recordings", which, i):
-            recording = read_recording(file)
-        if recording.name in [entry.name for entry in result]:
-            recording = replace(recording, name=f"{recording.name}_{i}")
-        result.append(recording)
-    return result
+            found.append(read_recording(file))
+    return uniquely_named_recordings(found, [path.stem for path in others])
+
+
+def uniquely_named_recordings(recordings: Iterable[Recording], taken: Iterable[str] = ()) -> list[Recording]:
+    """Append a number to the names of recordings that are in `taken` or that an earlier recording has."""
+    names, found = [*taken], list[Recording]()
+    for recording in recordings:
+        name = f"{recording.name}_{len(names)}" if recording.name in names else recording.name
+        names.append(name)
+        found.append(replace(recording, name=name))
+    return found
