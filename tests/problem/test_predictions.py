@@ -56,6 +56,34 @@ def test_its_own_values_without_any_and_noise_by_its_seed(problem):
     assert spread == pytest.approx(float(np.nanmedian(samples.std)), rel=0.3)
 
 
+READ = {
+    "effort_offset@shoulder.offset": 0.7,
+    "effort_gain@elbow.inverse": 0.8,
+    "effort_delay@gripper.delay": 0.023,
+    "effort_lag@elbow.time_constant": 0.03,
+    "encoder_offset@shoulder.offset": 0.05,
+}
+
+
+@pytest.mark.parametrize("how", ["prescribed", "driven"])
+def test_simulated_joints_are_read_with_the_errors_of_the_effects(urdf_folder, how):
+    effects = [(*name.rpartition(".")[0].split("@"), {}) for name in READ]
+    step = pendulum_step(urdf_folder, effects, **{how: PENDULUM})
+    own = {"arm_tracking_feedback": "none", "sensors": {"joints.effort": SensorOptions(std=0.01)}}
+    options, source = ProblemOptions(path_cutoff=np.inf, **own), taken(step, 1, steps=200, camera=how == "driven")
+    made = EstimationProblem(step, [source], list(READ), options).simulate_synthetic_recording(READ)
+    again = EstimationProblem(step, [made], list(READ), options)
+    costs = [again.evaluate(again.unknown_vector(values), derivatives=False).cost for values in (READ, {})]
+    assert costs[0] < 1e-3 * costs[1]
+
+
+def test_simulated_joints_without_efforts_may_have_stated_noise(urdf_folder):
+    step = pendulum_step(urdf_folder, prescribed=PENDULUM)
+    options = ProblemOptions(path_cutoff=20.0, sensors={"joints.effort": SensorOptions(std=0.3)})
+    problem = EstimationProblem(step, [taken(step, 1, efforts=False)], ["elbow.damping"], options)
+    assert problem.simulate_synthetic_recording(seed=1).joints.effort_std.tolist() == [0.3, 0.3]
+
+
 @pytest.mark.parametrize("how", [{"prescribed": PENDULUM}, {"driven": ("shoulder",), "prescribed": ("elbow",)}])
 def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
     step = pendulum_step(urdf_folder, **how)

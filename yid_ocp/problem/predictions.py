@@ -17,10 +17,13 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
+from yid_ocp.problem.signal_filters import FirstOrderLag
 from yid_ocp.sensors.base import EffortSamplingKind, expand_to_joint_values
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
     JOINT_POSITION_GROUP_NAME,
+    PositionSensor,
+    PrescribedJointEffortSensor,
     is_noise_std_stated,
     joint_angle_noise_std,
     joint_torque_bias_std,
@@ -192,7 +195,7 @@ def recording_from_prediction(
     own = predictor.theta_with_episode_values(episode, theta)
     truth = dict(zip(system.parameters.names, map(float, own), strict=True))
     text = f"{description} Simulated with the inputs of {episode.name}.".strip()
-    joints = _joints(predictor, episode, outcome, rng)
+    joints = _joints(predictor, episode, outcome, own, rng)
     channels = _channel_groups(predictor, episode, outcome, own, rng)
     said = (text, "yid_ocp simulate", f"{episode.name}_simulated")
     made = Recording(joints, tuple(groups), *said, true_parameters=truth, channel_groups=channels)
@@ -271,19 +274,19 @@ def _straight(made: Recording, source: Recording) -> Array | None:
 
 
 def _joints(
-    predictor: EpisodePredictor, episode: Episode, outcome: EpisodePrediction, rng: np.random.Generator | None
+    predictor: EpisodePredictor,
+    episode: Episode,
+    outcome: EpisodePrediction,
+    theta: Array,
+    rng: np.random.Generator | None,
 ) -> JointGroup | None:
     system, source = predictor.system, episode.recording.joints
     if source is None or not (system.driven or system.prescribed):
         return None
     names = tuple(name for name in (*system.driven, *system.prescribed) if name in source.names)
-    at = [system.mechanism.joint_index(name) for name in names]
-    position = outcome.rollout.state[:, at]
+    position, effort = _joint_readings(predictor, outcome, theta, names)
     if system.servos:
         return _commanded(predictor, episode, position, names, rng)
-    held = {name: outcome.rollout.torque[:, i] for i, name in enumerate(system.driven)}
-    held |= {name: outcome.rollout.effort[:, i] for i, name in enumerate(system.prescribed)}
-    effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
     angle_std, effort_std, bias_std = _levels(predictor, episode, names)
     position, effort = (
         _noisy(values, np.broadcast_to(0.0 if std is None else std, values.shape), rng)
@@ -296,6 +299,26 @@ def _joints(
     # for prescribed joints, the effort at the nodes
     kind: EffortSamplingKind = "command" if system.driven else "sample"
     return JointGroup(names, episode.grid.node_times, position, effort=effort, effort_kind=kind, **levels)
+
+
+def _joint_readings(
+    predictor: EpisodePredictor, outcome: EpisodePrediction, theta: Array, names: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """Angles and efforts (N + 1, nj) of joints at every node as recorded, with the errors that effects add."""
+    functions, h, rollout = predictor.model_functions, predictor.integrator_step.time_step, outcome.rollout
+    corrections, times = functions.input_corrections, h * np.arange(len(rollout.state))
+    if (lag := corrections.joint_delays_or_lag_times("effort_lag", theta, ())) is not None:
+        rollout = replace(rollout, effort=FirstOrderLag(*lag, h).lagged_node_values(rollout.effort, None)[0])
+    if (lag := corrections.joint_delays_or_lag_times("torque_lag", theta, ())) is not None:
+        # the applied torque lags behind the recorded one
+        rollout = replace(rollout, torque=FirstOrderLag(-lag[0], lag[1], h).lagged_node_values(rollout.torque, None)[0])
+    values, found = predictor.state_values_at_nodes(rollout), []
+    for sensor in (PositionSensor(names), PrescribedJointEffortSensor(names)):
+        read = functions.compiled_sensor_function(sensor)(values, theta).output
+        delays = corrections.sensor_delays_with_derivatives(sensor, theta, ())
+        shift = np.zeros(len(names)) if delays is None else delays[0]
+        found.append(np.stack([np.interp(times - s, times, x) for x, s in zip(read.T, shift, strict=True)], axis=1))
+    return found[0], found[1]
 
 
 def _commanded(
