@@ -38,6 +38,7 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.sensors import CHANNEL_KINDS
 
 _Models = Sequence[LinearResidualModel]
 _Groups = Sequence[SmoothedUnknownGroup]
@@ -56,7 +57,7 @@ class SmoothedUnknowns:
     interval_edges: Array  # shape (J + 1,) [s]
     unknown_names: tuple[str, ...]
     unknown_groups: tuple[SmoothedUnknownGroup, ...]
-    reference_std: Array  # shape (nd,) [N m, N or m]
+    reference_std: Array  # in the units of `smoothed_unknown_units`, shape (nd,)
     posterior_mean: Array  # in units of the reference, shape (J, nd)
     posterior_std: Array  # in units of the reference, shape (J, nd)
 
@@ -554,8 +555,23 @@ def z_scores_of_smoothed_unknowns(
 def smoothed_unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
     """SI unit of every smoothed unknown in `trace`: of a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
-    other = {"push": "N", "offset": "m", "bias": "m"}
-    return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
+    found = []
+    for name, group in pairs:
+        of_kind = {
+            "force": generalised_force_unit(system, name),
+            "push": "N",
+            "offset": "m",
+            "bias": _reading_unit(name),
+        }
+        found.append(of_kind[group.kind])
+    return tuple(found)
+
+
+def _reading_unit(output: str) -> str:
+    """Unit of a sensor's output, such as `joints.position.JOINT` or `wrist.force.FRAME.x`; m for points."""
+    group, _, quantity = output.partition(".")
+    kinds = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
+    return next((k.unit for k in kinds if k.matches_group_name(group) and quantity.startswith(f"{k.quantity}.")), "m")
 
 
 def generalised_force_unit(system: System, coordinate: str) -> str:
