@@ -179,18 +179,18 @@ def test_variances_stay_within_their_range_and_rounding_is_never_the_best():
 
 def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
     models = [made(3, size=np.array([30.0, 0.0, 0.0])), made(4, size=np.array([20.0, 0.0, 0.0]))]
-    [(evidence, size)] = smoother._largest_evidences(models, NOTHING, [FORCE])
+    evidence, size = smoother._largest_evidence(smoother._run(models, NOTHING).filtered, FORCE)
     assert evidence == pytest.approx(Dense(models, NOTHING | {FORCE: size}).log_evidence, rel=1e-9)
     assert evidence > Dense(models, NOTHING | {FORCE: 4 * size}).log_evidence
     assert evidence > Dense(models, NOTHING | {FORCE: size / 4}).log_evidence
     base = NOTHING | {OTHER_FORCE: 1.0}
-    [(more, at)] = smoother._largest_evidences(models, base, [FORCE])
+    more, at = smoother._largest_evidence(smoother._run(models, base).filtered, FORCE)
     assert more == pytest.approx(Dense(models, base | {FORCE: at}).log_evidence, rel=1e-9)
     # a group may hold several unknowns, and some of them errors that are known
     shared = {"unknown_groups": (FORCE, FORCE, BIAS), "torque_noise_variance": np.array([0.0, 0.4, 0.0])}
     both = [replace(model, **shared) for model in models]
     some = {FORCE: 0.0, BIAS: 0.3}
-    [(most, here)] = smoother._largest_evidences(both, some, [FORCE])
+    most, here = smoother._largest_evidence(smoother._run(both, some).filtered, FORCE)
     assert most == pytest.approx(smoother._run(both, some | {FORCE: here}).log_evidence, rel=1e-9)
     assert most > smoother._run(both, some).log_evidence + 1
 

@@ -40,9 +40,10 @@ class FilterStateTransition:
 
     def propagate_state(self, columns: Array) -> Array:
         """Propagate states, the columns of an (nx, c) array, over the step."""
-        ns, rows, own = len(self.state_rows), self.state_rows, columns[len(self.state_rows) :]
-        together = own.reshape(*self._shape, own.shape[1]).sum(axis=0)
-        return np.vstack([rows[:, :ns] @ columns[:ns] + rows[:, ns:] @ together, self.decay[:, None] * own])
+        ns, own = len(self.state_rows), columns[len(self.state_rows) :]
+        if self._shape[0] != 1:
+            columns = np.vstack([columns[:ns], own.reshape(*self._shape, own.shape[1]).sum(axis=0)])
+        return np.vstack([self.state_rows @ columns, self.decay[:, None] * own])
 
     def _propagate_costate_back(self, costate: Array) -> Array:
         """Costates (nx, c) before the step, from those after it, by the transposed map."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +39,6 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.sensors import CHANNEL_KINDS
 
 _Models = Sequence[LinearResidualModel]
 _Groups = Sequence[SmoothedUnknownGroup]
@@ -57,7 +57,7 @@ class SmoothedUnknowns:
     interval_edges: Array  # shape (J + 1,) [s]
     unknown_names: tuple[str, ...]
     unknown_groups: tuple[SmoothedUnknownGroup, ...]
-    reference_std: Array  # in the units of `smoothed_unknown_units`, shape (nd,)
+    reference_std: Array  # shape (nd,) [N m, N or m]
     posterior_mean: Array  # in units of the reference, shape (J, nd)
     posterior_std: Array  # in units of the reference, shape (J, nd)
 
@@ -188,6 +188,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
 class _State:
     """All recordings at given variances, with the `shift` of the scaled free parameters and its covariance `spread`."""
 
+    filtered: tuple[_Filtered, ...]
     recordings: tuple[_Smoothed, ...]
     shift: Array
     spread: Array
@@ -205,7 +206,7 @@ def _run(models: _Models, variance: _Variances) -> _State:
     products = np.sum([done.products for done in filtered], axis=0)
     evidence, shift, information = _judged(products, sum(done.log_determinant for done in filtered))
     known = tuple(done for done in smoothed if done is not None)
-    return _State(known, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
+    return _State(filtered, known, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
 
 
 def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
@@ -257,7 +258,7 @@ def _selected(
             promising = promising[:_LATER_GROUP_TRIALS]
         if not promising:
             break
-        reached = zip(_largest_evidences(models, variance, promising), promising, strict=True)
+        reached = zip(map_in_threads(partial(_largest_evidence, state.filtered), promising), promising, strict=True)
         (evidence, size), source = max(reached, key=lambda pair: pair[0][0])
         if not evidence > state.log_evidence + limits.min_log_bayes_factor:
             break
@@ -265,35 +266,27 @@ def _selected(
     return variance, state
 
 
-def _largest_evidences(models: _Models, variance: _Variances, sources: _Groups) -> list[tuple[float, float]]:
-    """`_largest_evidence` of several groups, each on top of the same variances."""
-    if not sources:
-        return []
-    bases = map_in_threads(lambda m: _forwards(m, m.smoothed_unknown_prior_variances(variance), True), models)
-    return map_in_threads(lambda source: _largest_evidence(bases, source), sources)
-
-
 def _responses(base: _Filtered, chosen: IntArray) -> Array:
-    """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, u J)."""
+    """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, J u)."""
     model, updates = base.model, base.updates
     ns, count, u = len(model.initial_state_std), len(updates), len(chosen)
     kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(updates[0].p)[ns:] > 0)])
-    # state error that the filter has not yet followed, and the disturbed unknowns, by the interval of the disturbance;
-    # unknowns without variance stay at zero
-    behind, unknown = np.zeros((len(kept), u, count)), np.zeros((u, count))
-    behind[:ns, :, 0] = model.initial_state_jacobian[:, chosen]
+    # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown;
+    # unknowns without variance stay at zero, and so does all before the disturbance
+    behind, unknown = np.zeros((len(kept), count * u)), np.zeros((count, 1))
+    behind[:ns, :u] = model.initial_state_jacobian[:, chosen]
     found = []
     for k, update in enumerate(updates):
-        unknown[:, :k] *= model.interval_correlation
-        unknown[:, k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
-        left = behind.reshape(len(kept), u * count)
+        unknown[:k] *= model.interval_correlation
+        unknown[k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
+        begun, left = unknown[: k + 1], behind[:, : (k + 1) * u]
         shaped, move = update.step.whitening @ update.step.observation, update.step.transition
         rows = shaped[:, kept] @ left
-        rows += (shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
-        found.append(rows)
+        rows += (shaped[:, None, ns + chosen] * begun).reshape(rows.shape)
+        found.append(np.pad(rows, ((0, 0), (0, (count - k - 1) * u))))
         follow = FilterStateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
-        behind = follow.propagate_state(left - update.step.projected_covariance[:, kept].T @ rows).reshape(behind.shape)
-        behind[:ns] += move.state_rows[:, ns + chosen][:, :, None] * unknown
+        left[:] = follow.propagate_state(left - update.step.projected_covariance[:, kept].T @ rows)
+        left[:ns] += (move.state_rows[:, None, ns + chosen] * begun).reshape(left[:ns].shape)
     return np.vstack(found)
 
 
@@ -425,7 +418,7 @@ def _alternatives(
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         loss = (1 - limits.min_tied_evidence_ratio) * drop[source]
         least = state.log_evidence - max(limits.min_log_bayes_factor, loss)
-        reached = zip(asked, _largest_evidences(models, less, asked), strict=True)
+        reached = zip(asked, map_in_threads(partial(_largest_evidence, without.filtered), asked), strict=True)
         found[source] = tuple(other for other, (reach, _) in reached if reach >= least)
     return drop, found
 
@@ -555,23 +548,8 @@ def z_scores_of_smoothed_unknowns(
 def smoothed_unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
     """SI unit of every smoothed unknown in `trace`: of a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
-    found = []
-    for name, group in pairs:
-        of_kind = {
-            "force": generalised_force_unit(system, name),
-            "push": "N",
-            "offset": "m",
-            "bias": _reading_unit(name),
-        }
-        found.append(of_kind[group.kind])
-    return tuple(found)
-
-
-def _reading_unit(output: str) -> str:
-    """Unit of a sensor's output, such as `joints.position.JOINT` or `wrist.force.FRAME.x`; m for points."""
-    group, _, quantity = output.partition(".")
-    kinds = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
-    return next((k.unit for k in kinds if k.matches_group_name(group) and quantity.startswith(f"{k.quantity}.")), "m")
+    other = {"push": "N", "offset": "m", "bias": "m"}
+    return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
 
 
 def generalised_force_unit(system: System, coordinate: str) -> str:
