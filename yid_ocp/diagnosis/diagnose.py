@@ -141,8 +141,9 @@ def _examined(
     excess = _excess_of(residual)
     # neither events nor candidates are sought while the step makes most of the gap
     is_poor = excess >= limits.min_excess_chi2_per_dof * len(residual)
-    if is_poor and (finer := _at_finer_step_that_explains(excess, search, nominal)):
-        return _examined(*finer, known)
+    tried, fall = nominal, _fall_at_half_time_step(search, nominal) if is_poor else -math.inf
+    if fall > excess / 2:
+        return _examined(*_at_half_time_step(search, nominal, fall), known)
     search, nominal, cuts = _followed(search, nominal, known)
     _end_stage(search, "nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
@@ -158,26 +159,29 @@ def _examined(
     screened = screen_candidates(composed, (), nominal.values, limits)
     evidence = NominalModelGapEvidence(nominal, *tests, screened)
     _end_stage(search, "screening")
-    gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
-    is_searched = evidence.has_gap(limits) and evidence.are_data_sufficient(limits)
-    if is_searched and (finer := _at_finer_step_that_explains(gap, search, nominal, events)):
-        return _examined(*finer, cuts)
+    if evidence.has_gap(limits) and evidence.are_data_sufficient(limits):
+        gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
+        if not is_poor or tried is not nominal:
+            fall = _fall_at_half_time_step(search, nominal, events)
+        if fall > gap / 2:
+            return _examined(*_at_half_time_step(search, nominal, fall), cuts)
     return _Examined(replace(search, problem=composed), nominal, cuts, whole, events, smoothed, evidence)
 
 
-def _at_finer_step_that_explains(
-    gap: float, search: RefitContext, fit: RefittedModel, events: EventSet = NO_EVENTS
-) -> tuple[RefitContext, RefittedModel] | None:
-    """Hypotheses and nominal fit at half the time step, if that lowers r'r - n by more than half of a gap."""
+def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet = NO_EVENTS) -> float:
+    """How much half the time step lowers r'r - n of a fit; minus infinity if the motion cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
-    h, x, residual = fit.problem.step.time_step / 2, fit.problem.unknown_vector(fit.values), fit.evaluation.residual
-    finer = search.problem.with_time_step(h)
-    fine = problem_corrected_for_events(finer.problem, events)
+    finer = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False).problem
+    fine, x = problem_corrected_for_events(finer, events), fit.problem.unknown_vector(fit.values)
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
-    if left is None or (fall := _excess_of(residual) - _excess_of(left)) <= gap / 2:
-        return None
+    return -math.inf if left is None else _excess_of(fit.evaluation.residual) - _excess_of(left)
+
+
+def _at_half_time_step(search: RefitContext, fit: RefittedModel, fall: float) -> tuple[RefitContext, RefittedModel]:
+    """Hypotheses and nominal fit at half the time step."""
+    h = fit.problem.step.time_step / 2
     search.progress.begin_stage(f"half the time step lowers chi2 by {fall:.3g}: going on at {h:g} s")
-    search = replace(search, problem=finer)
+    search = replace(search, problem=search.problem.with_time_step(h))
     return search, _fitted_nominal_model(search, fit.values)
 
 

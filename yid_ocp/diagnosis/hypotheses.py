@@ -172,11 +172,11 @@ class AllCandidatesProblem:
         made = problem_with_whitening_at(self.problem, x, rounds=1 if known else 2)
         return replace(self, problem=problem_with_held_out_kalman_whitening(made, x))
 
-    def with_time_step(self, time_step: float) -> AllCandidatesProblem:
+    def with_time_step(self, time_step: float, with_held_out: bool = True) -> AllCandidatesProblem:
         """Problem with another time step [s] and the whole recordings, whitened by sensor noise alone."""
         made = self.problem.with_time_step(time_step)
-        if self.is_split_in_blocks:
-            return replace(self, problem=_in_blocks(made))
+        if self.is_split_in_blocks or not with_held_out:
+            return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made)
         held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(time_step)
         return replace(self, problem=made.with_episodes(made.episodes, held.episodes))
 
