@@ -16,11 +16,11 @@ from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.virtual.mjcf import (
-    FORMAT_ELEMENTS,
     MUJOCO_APPROXIMATED_ASPECTS,
     ExpressionEvaluator,
     JointDynamicsTerms,
     effect_joint_terms_and_changed_aspects,
+    format_elements,
     format_xml_numbers,
     model_aspects_depending_on_symbols,
     system_joint_dynamics_terms,
@@ -143,7 +143,7 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
-    known = FORMAT_ELEMENTS[aspect]
+    known = format_elements()[aspect]
     if aspect == "reading":
         return _READING
     if form not in known:
@@ -152,7 +152,7 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 
 
 _READING = FeatureExportSupport(
-    "not representable", f"{FORMAT_ELEMENTS['reading']['is']}: correct the readings instead"
+    "not representable", f"{format_elements()['reading']['is']}: correct the readings instead"
 )
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
 _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")

@@ -6,6 +6,7 @@ treated like those of the library.
 
 from __future__ import annotations
 
+import functools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,9 +28,6 @@ from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement,
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, MidpointStateSymbols, System
 
-FORMAT_ELEMENTS: Mapping[str, Mapping[str, str]] = YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml"))
-"""Aspects of a model that an engine may or may not represent: a description (`is`) and the elements of each format."""
-
 _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of friction torque tau_c [N m]
 
 _N_COMPARED_STATES = 3  # number of states at which equations are compared
@@ -37,17 +35,17 @@ _ROUNDING_TOLERANCE = 1e-9
 MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 # aspects of sensors and recorded torques, which do not enter the mechanics
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
-# aspects for which MuJoCo has an equivalent term
-_NATIVE_ASPECTS = (
-    frozenset(FORMAT_ELEMENTS)
-    - MUJOCO_APPROXIMATED_ASPECTS
-    - _IGNORED_ASPECTS
-    - {"servo_firmware", "clock", "memory", "force"}
-)
+_NON_NATIVE_ASPECTS = MUJOCO_APPROXIMATED_ASPECTS | _IGNORED_ASPECTS | {"servo_firmware", "clock", "memory", "force"}
 
 _JOINTS_PER_BODY = 6  # MuJoCo's limit
 _ROTOR_INERTIA = 5e-4  # [kg m^2] of a motor behind play, as small as stability at a stop allows
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
+
+
+@functools.cache
+def format_elements() -> Mapping[str, Mapping[str, str]]:
+    """Aspects of a model that an engine may or may not represent: a description (`is`) and elements of each format."""
+    return dict(YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml")))
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class ExpressionEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Find the model aspects (keys of `FORMAT_ELEMENTS`) whose expressions depend on `symbols`."""
+    """Find the model aspects (keys of `format_elements`) whose expressions depend on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -249,7 +247,7 @@ def mujoco_xml(
     `grasp_NAME_holder` and `grasp_NAME_held`. There are no contacts or limits. Everything is inside one fixed body
     `world_base`, because some readers require a single root. Raises `ModelError` if MuJoCo cannot express the system: a
     moving body without mass, more than six massless joints at one location, a frame on one of them, a compliant grasp,
-    a cubic spring with a rest angle, an effect beyond `_NATIVE_ASPECTS`.
+    a cubic spring with a rest angle, an effect among `_NON_NATIVE_ASPECTS`.
 
     Parameters
     ----------
@@ -442,13 +440,14 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
 
 
 def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: bool) -> None:
-    able = _NATIVE_ASPECTS | MUJOCO_APPROXIMATED_ASPECTS if emulate else _NATIVE_ASPECTS
+    native = format_elements().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
+    able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
     for effect in system.effects:
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
         if aspects:
-            changed = FORMAT_ELEMENTS[min(aspects)]["is"]
+            changed = format_elements()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            allowed = ", ".join(own["is"] for name, own in FORMAT_ELEMENTS.items() if name in able)
+            allowed = ", ".join(own["is"] for name, own in format_elements().items() if name in able)
             where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:
