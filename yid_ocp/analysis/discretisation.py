@@ -355,10 +355,13 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def min_grasp_gaps_at_posture(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_grasp_gaps_at_posture(
+    system: System, configuration: Mapping[str, float], theta: Array, near: Array | None = None
+) -> dict[str, float]:
     """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
 
-    `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths.
+    `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths. The search starts
+    at the configuration `near` (n,), if given.
     """
     if not system.grasps:
         return {}
@@ -383,16 +386,13 @@ def min_grasp_gaps_at_posture(system: System, configuration: Mapping[str, float]
     def slopes(x: Array) -> Array:
         return np.vstack([phi_at(x, 1), 1e-4 * np.eye(len(free))])
 
-    best: Array | None = None
-    for seed in range(4):
-        start = np.random.default_rng(seed).normal(scale=0.1, size=len(free))
+    best, starts = np.full(phi.numel(), math.inf), [] if near is None else [near[free]]
+    starts += [np.random.default_rng(seed).normal(scale=0.1, size=len(free)) for seed in range(4)]
+    for start in starts:
         found = scipy.optimize.least_squares(gaps, start, slopes, max_nfev=100)
-        gap = phi_at(found.x, 0).ravel()
-        if best is None or np.linalg.norm(gap) < np.linalg.norm(best):
-            best = gap
+        best = min(best, phi_at(found.x, 0).ravel(), key=np.linalg.norm)
         if np.linalg.norm(best) < 1e-3:
             break
-    assert best is not None
     distances = np.linalg.norm(best.reshape(-1, 3), axis=1)
     return {grasp.name: float(distance) for grasp, distance in zip(system.grasps, distances, strict=True)}
 

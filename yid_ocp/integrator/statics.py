@@ -134,6 +134,10 @@ class EquilibriumSolver:
             energy = float(self._energy(placed, inner, hold, theta)) if converged else error
             if best is None or (not converged, energy) < best[:2]:
                 best = (not converged, energy, error, w)
+            # a displacement that changes no equation, as twist without stiffness, does so in bent copies too
+            is_near = not converged and guess is not None and math.isfinite(error)
+            if is_near and np.linalg.matrix_rank(equations(start)[1][:, :count]) < count:
+                break
         assert best is not None
         failed, _, error, w = best
         if failed and guess is None:

@@ -128,17 +128,16 @@ def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:
     return build_step(settings, build_system(run, link_division=2))
 
 
-def _refuse_joints_carried_by_driven_arm(run: RunSettings, system: System) -> None:
-    """Raise `ConfigError` if the tracking filter would take the momentum of other joints for an error of the arm."""
+def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> None:
+    """Raise `ConfigError` if the tracking filter would take the object's momentum for an error of the arm."""
     tree, driven = system.mechanism, set(system.actuated_coordinate_indices)
     for i, name in enumerate(tree.joint_names):
-        if i not in driven and driven.intersection(tree.ancestor_joint_indices(i)):
-            is_passive = name in run.model.arms.passive_joints
-            what = f"{name} moves on a driven arm, whose tracking filter needs the arm's own momentum"
-            where = ("model", "arms", "passive_joints") if is_passive else ("model", "object", "mount")
-            hint = "set problem.arm_tracking_feedback: proportional, or model.arms.mode: prescribed"
-            hint += "" if is_passive else "; or hold the object by `model.grasp`, not by `model.object.mount`"
-            raise run.config_error(what, *where, allowed="a driven arm that carries no other joints", hint=hint)
+        of_arm = i in driven or name in run.model.arms.passive_joints
+        if not of_arm and driven.intersection(tree.ancestor_joint_indices(i)):
+            what = f"{name} of the object moves on a driven arm, whose tracking filter needs the arm's own momentum"
+            hint = "set model.arms.mode: prescribed; or hold the object by `model.grasp`, not by `model.object.mount`"
+            allowed = "a driven arm that holds its object by a grasp"
+            raise run.config_error(what, "model", "object", "mount", allowed=allowed, hint=hint)
 
 
 def build_problem(
@@ -151,7 +150,7 @@ def build_problem(
     """
     system = build_system(run) if step is None else step.system
     if run.problem.arm_tracking_feedback == "lqr" and not system.servos:
-        _refuse_joints_carried_by_driven_arm(run, system)
+        _refuse_object_mounted_on_driven_arm(run, system)
     free = free_parameter_names(run, system.parameters)
     if not free:
         choice = unknown_name_error_arguments("", system.parameters.names, "set parameters.NAME.free: true")
@@ -192,7 +191,9 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
     theta = problem.theta.copy()
     for name, value in episode.known_parameters.items():
         theta[system.parameters.index(name)] = value
-    return min_grasp_gaps_at_posture(system, posture, theta)
+    start = problem.initial_state_of_episode(episode, theta)
+    near = None if start.failure_message else start.state[: system.n_coordinates]
+    return min_grasp_gaps_at_posture(system, posture, theta, near)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
