@@ -124,11 +124,10 @@ def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expect
     assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
 
 
-def test_units_of_unknowns_are_those_of_their_joints_and_sensors():
+def test_units_of_unknowns_are_those_of_their_joints_or_metres():
     joints = (SimpleNamespace(name="slide", kind="prismatic"), SimpleNamespace(name="hinge", kind="revolute"))
     system = SimpleNamespace(mechanism=SimpleNamespace(joints=joints, joint_names=("slide", "hinge")))
-    read = {"points_camera.tip.z": "m", "joints.position.hinge": "rad", "wrist.force.hand.x": "N"}
-    read |= {"wrist_left.torque.hand.x": "N m", "imu.specific_force.hand.y": "m/s^2"}
-    names, groups = ("hinge", "slide", "left.x", *read), (FORCE, FORCE, OFFSET, *[BIAS] * len(read))
-    made = SimpleNamespace(unknown_names=names, unknown_groups=groups)
-    assert smoothed_unknown_units(system, made) == ("N m", "N", "m", *read.values())
+    made = SimpleNamespace(
+        unknown_names=("hinge", "slide", "left.x", "tip.z"), unknown_groups=(FORCE, FORCE, OFFSET, BIAS)
+    )
+    assert smoothed_unknown_units(system, made) == ("N m", "N", "m", "m")

@@ -374,7 +374,8 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
         else:
             # a delayed oscillation looks like a flipped sign, so delays are tested first
             data = _Data(arm, motion, motion.effort, needed, size)
-            found += list(_late(data)) or list(_by_joint(data))
+            fit = _fitted(data)
+            found += list(_late(data, fit)) or list(_by_joint(data, fit))
     return [replace(issue, recording=recording.name) for issue in found]
 
 
@@ -401,14 +402,14 @@ def _zero(arm: RecordedJointsModel, dead: BoolArray) -> Issue:
     return _issue("effort_zero", words, 1e3, advice, setting=setting)
 
 
-def _by_joint(data: _Data) -> Iterator[Issue]:
+def _by_joint(data: _Data, fit: _Fit) -> Iterator[Issue]:
     arm, effort, needed, size = data.arm, data.effort, data.needed, data.size
     loaded, factor, names = _loaded(data), _WRONG_GAIN_FACTOR, arm.joint_names
     # A held object can add to efforts, but not several times the arm's weight, nor support nearly all of it. The prior
     # on the gain does not allow powers of ten, so efforts are scaled first.
     ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(effort)), 1e-300)
     common = 1.0 if 1 / factor < ratio < factor else 10.0 ** round(math.log10(ratio))
-    fit = _fitted(replace(data, effort=common * effort))
+    fit = fit if common == 1.0 else _fitted(replace(data, effort=common * effort))
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < _MAX_EXPLAINED_RMS) & (np.abs(fit.offset) < 3 * _OFFSET_FRACTION * size)
     if common != 1.0 and sound.sum() >= 2:
@@ -467,9 +468,9 @@ def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
             yield _issue("effort_offset", words, depth, "let it be estimated, or set the sensor's zero", name, setting)
 
 
-def _late(data: _Data) -> Iterator[Issue]:
+def _late(data: _Data, fit: _Fit) -> Iterator[Issue]:
     motion, trials = data.motion, _LAG_SEARCH_STEP * np.arange(-5, 6)
-    if motion.t[-1] - motion.t[0] < 4 * trials[-1] or np.max(_fitted(data).left) < _WELL_EXPLAINED_RMS:
+    if motion.t[-1] - motion.t[0] < 4 * trials[-1] or np.max(fit.left) < _WELL_EXPLAINED_RMS:
         return
     inside = (motion.t >= motion.t[0] + trials[-1]) & (motion.t <= motion.t[-1] - trials[-1])
     kept = replace(motion, t=motion.t[inside], q=motion.q[inside], v=motion.v[inside], a=motion.a[inside])

@@ -118,16 +118,13 @@ def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[l
                 return dict(json.loads(file.read_text(encoding="utf-8")))
         found = load_robot_meshes_by_joint(robot, mechanism)
         names = (*system.mechanism.joint_names, "")
-        made = {names[j]: _integer_lists(mesh) for j, mesh in _thinned(found).items()}
+        whole = {j: (np.rint(_POSITION_SCALE * m.vertices).astype(int), m.faces) for j, m in _thinned(found).items()}
+        made = {names[j]: [array.ravel().tolist() for array in arrays] for j, arrays in whole.items()}
         with contextlib.suppress(OutputError):
             if file:
                 write_text(file, json.dumps(made, separators=(",", ":")))
         return made
     return {}
-
-
-def _integer_lists(mesh: TriangleMesh) -> list[list[int]]:
-    return [np.rint(_POSITION_SCALE * mesh.vertices).astype(int).ravel().tolist(), mesh.faces.ravel().tolist()]
 
 
 def _thinned(found: dict[int, TriangleMesh]) -> dict[int, TriangleMesh]:

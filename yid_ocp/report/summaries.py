@@ -435,13 +435,10 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         rows, seen = own["rows"], own["seen"]
         sight = _row_names_text(seen or ()) or "none"
         sight = "" if seen is None or not rows else "all" if len(seen) == len(rows) else sight
-        changes = ("" if own[key] is None else _change_in_std_text(own[key]) for key in ("moved", "along"))
+        moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
+        changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])
         yield name, own["unit"], str(len(rows)), _row_names_text(rows), sight, *sensors, *changes
-
-
-def _change_in_std_text(change: float) -> str:
-    return f"{change:.2g}" if change > _NEGLIGIBLE_STDS else f"< {_NEGLIGIBLE_STDS:g}"
 
 
 def _row_names_text(names: Sequence[str]) -> str:
