@@ -116,13 +116,14 @@ def _near_best_models(
     if leaves_noise(best, limits):
         best = min(fits, key=lambda fit: bic_difference(fit, nominal), default=nominal)
         most = _undecided_chi2(nominal, best, limits)
-        near = [(fit, bic_difference(fit, best) / most) for fit in fits]
-        order = {id(fit): (distance, 0.0) for fit, distance in near}
+        distances = [bic_difference(fit, best) / most for fit in fits]
+        ranks = [(distance, 0.0) for distance in distances]
     else:
-        near = [(fit, _distance_in_prediction(fit, best)) for fit in fits]
-        order = {id(fit): (float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits}
-    near = [(fit, distance) for fit, distance in near if distance <= 1]
-    return sorted(near, key=lambda own: (not _is_plausible(own[0].effects[-1], own[0], limits), *order[id(own[0])]))
+        distances = [_distance_in_prediction(fit, best) for fit in fits]
+        ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
+    near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
+    near.sort(key=lambda own: (not _is_plausible(own[0].effects[-1], own[0], limits), *own[2]))
+    return [(fit, distance) for fit, distance, _ in near]
 
 
 def _undecided_chi2(nominal: RefitStatistics, best: RefitStatistics, limits: Thresholds) -> float:
