@@ -416,10 +416,16 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
 LITTLE = {"": (1.6, 1.8), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
 
 
-@pytest.mark.parametrize(("least", "chosen"), [(0.1, ["a"]), (0.05, ["a", "b"])])
-def test_a_rest_that_is_hardly_more_than_noise_is_left(monkeypatch, least, chosen):
-    """9 % more than noise, along which both others would close all of it."""
-    assert Rounds(monkeypatch, LITTLE, left=1e-9).compose(min_excess_chi2_per_dof=least)[1] == chosen
+@pytest.mark.parametrize(
+    ("least", "whole", "chosen"),
+    [(0.1, 1.7, ["a"]), (0.05, 1.7, ["a", "b"]), (0.05, 225, ["a", "b"]), (0.05, 228, ["a"])],
+)
+def test_a_rest_that_is_hardly_more_than_noise_or_than_an_error_of_the_response_is_left(
+    monkeypatch, least, whole, chosen
+):
+    """9 % more than noise, which both others would close: a 2500th of 226 - 1."""
+    rounds = Rounds(monkeypatch, LITTLE | {"": (whole, whole)}, left=1e-9)
+    assert rounds.compose(min_excess_chi2_per_dof=least)[1] == chosen
 
 
 @cases(

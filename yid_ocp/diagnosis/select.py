@@ -23,6 +23,7 @@ _MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not n
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
 _RESPONSE_RTOL = 0.05  # relative error of a model's response to an effect: links and time step are finite
 _MIN_CHI2_FRACTION = _RESPONSE_RTOL**2  # of what effects explain; such an error leaves it, so less proves nothing
+_RESPONSE_REST = 4e-4  # of the whole gap; so little can be an error of the response, and no further effect is sought
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
@@ -78,6 +79,12 @@ def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
 def leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether a fit's held-out chi2 per sample is near 1, so that its residual is mainly noise."""
     return fit.held_out_loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
+
+
+def _leaves_little(nominal: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
+    """Whether a fit leaves so little of the held-out gap that errors in the response to its effects can be the rest."""
+    most = max(limits.min_excess_chi2_per_dof, _RESPONSE_REST * nominal.held_out_loss.excess_chi2_per_sample)
+    return fit.held_out_loss.excess_chi2_per_sample < most
 
 
 def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
@@ -238,11 +245,10 @@ def select_effects(
         base, current = chosen.fit.effects, chosen.fit
         if base:
             beside = join_effect_labels(base)
-            if leaves_noise(current, limits) or search.record_skip_if_past_deadline(
-                f"the residual gap next to {beside}"
-            ):
+            rest = f"the residual gap next to {beside}"
+            if _leaves_little(nominal, current, limits) or search.record_skip_if_past_deadline(rest):
                 break
-            search.progress.begin_stage(f"scoring the residual gap next to {beside}", 1.0, 12.0)
+            search.progress.begin_stage(f"scoring {rest}", 1.0, 12.0)
             screened = search.screen(base, current.values, f"beside {beside}")
             if _promised_fraction(nominal, current, screened) < limits.min_explained_fraction:
                 break
