@@ -129,6 +129,9 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),
     "empty cell of a joint": ("t,q_a\n0,1\n1,\n", {}, "'position' of joint 'a' is not finite at t = 1 s", ""),
     "clock": ("t,q_a\n1,1\n0,1\n", {}, "from index 0 to 1", ""),
+    "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg and in rad", ""),
+    "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "meaning of column 'q_a .mrad.'", ""),
+    "force of no link": ("t,force_x,force_y,force_z\n0,1,1,1\n", {}, "meaning of column 'force_x'", ""),
     "unit of what": (GOOD, {"units": {"angle": "deg"}}, "the quantity 'angle' of a unit", ""),
     "unit": (GOOD, {"units": {"velocity": "deg"}}, "'deg' is not a unit of 'velocity'", "did you mean 'deg/s'"),
 }
@@ -290,6 +293,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         ("%time,field.position0,field.velocity0,field.effort0", "t position:0 velocity:0 effort:0"),
         ("time,q[0],dq[0],tau_J[0]", "t position:0 velocity:0 effort:0"),
         ("timestamp,actual_q_0,actual_qd_0,target_q_0", "t position:0 velocity:0 position_command:0"),
+        ("time [µs],q_a [°],/ft/wrench/torque/x", "t position:a None"),
         ("t,tip X,tip Y,tip Z", "t x:tip y:tip z:tip"),
         ("t,tip_x [mm],tip_y [mm],tip_z [mm]", "t x:tip y:tip z:tip"),
         ("t,x,y,z", "t x:marker y:marker z:marker"),
@@ -308,6 +312,15 @@ def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -
     assert joints_of(recording).position[:, 0] == pytest.approx(np.radians([90, 45]))
     assert recording.points[0].position[0, 0] == pytest.approx([0.1, 0.2, 0.3])
     assert read_any(path, units={"points": "cm"}).points[0].position[0, 0] == pytest.approx([1, 2, 3])
+    # units in a row of their own, numbers of the rows, and a row that a spreadsheet left
+    path = table(tmp_path, ",Time,q1,p_x,p_y,p_z\n,(ms),°,mm,mm,mm\n0,0,90,100,200,300\n1,10,45,100,200,300\n,,,,,\n")
+    assert preview_file(path).reader_options == {}
+    assert read_csv(path).points[0].position[1, 0] == pytest.approx([0.1, 0.2, 0.3])
+    assert joints_of(read_csv(path)).position[:, 0] == pytest.approx(np.radians([90, 45]))
+    # a slide in millimetres, and torques of a wrist sensor
+    header = ",".join(["t", "q_slide [mm]", *(f"ft_torque_{axis} [Nm]" for axis in "xyz")])
+    path = table(tmp_path, f"{header}\n0,90,1,2,3\n1,91,1,2,3\n")
+    assert joints_of(read_csv(path)).position[0, 0] == pytest.approx(0.09)
 
 
 RIGID = "Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error"
@@ -349,9 +362,13 @@ def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are
     kept = read_any(tmp_path / name, point_names={"tip": "w_rod"})
     assert kept.points[0].names == ("w_rod",)
     assert [source.name for source in preview_file(tmp_path / name).sources] == list(names)
-    (tmp_path / name).write_text(text.splitlines()[0] + "\n")
-    with pytest.raises(DataError):
-        read_any(tmp_path / name)
+    without_rate = (
+        text.replace("\n100\n", "\n0\n").replace("Y\t100", "Y\t0").replace(",Time (Seconds),X,Y,Z,W,X,Y,Z,,X,Y,Z", "")
+    )
+    for broken in (without_rate, text.splitlines()[0] + "\n"):
+        (tmp_path / name).write_text(broken)
+        with pytest.raises(DataError, match="the motion capture export cannot be understood"):
+            read_any(tmp_path / name)
 
 
 # ------------------------------------------------------------------------------------------------------- any format

@@ -131,7 +131,7 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
 ) -> None:
     t = np.arange(0, 2, 0.01)
     rows = "".join(f"{x:.3f},{math.sin(3 * x):.6f},{3 * math.cos(3 * x):.6f},{k % 3}\n" for k, x in enumerate(t))
-    (odd / "joints.csv").write_text("timestamp,pos_a,vel_a,tau_a\n" + rows)
+    (odd / "joints.csv").write_text("timestamp,pos_a,vel_a,tau_a [Nm]\n" + rows)
     rows = "".join(
         f"{x:.3f},{500 * math.cos(math.sin(3 * x)):.3f},{500 * math.sin(math.sin(3 * x)):.3f},0\n" for x in t
     )
@@ -147,7 +147,7 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     assert recording.joints.names == ("a",)
     assert recording.points[0].position[0, 0] == pytest.approx([0.5, 0, 0])
     assert all(file_sha256(odd / name) in recording.source for name in ("joints.csv", "mocap.csv"))
-    words = ["--units", "mm", "--points", "tip=w_rod", "--joints", "a=elbow", "--columns", "tau_a=skip"]
+    words = ["--units", "mm", "--points", "tip=w_rod", "--joints", "a=elbow", "--columns", "tau_a [Nm]=skip"]
     assert main(["import", "joints.csv", "mocap.csv", "--out", "both.h5", *words, "--clock-offset", "mocap=0.5"]) == 0
     recording = read_recording(odd / "both.h5")
     assert recording.joints is not None

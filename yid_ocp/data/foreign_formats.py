@@ -32,44 +32,54 @@ _CHANNEL_WORDS: Mapping[str, str] = {
 _CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
 _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
-_UNIT_WORDS = {
+UNIT_WORDS = {
     **dict.fromkeys(("s", "sec", "secs", "seconds", "second"), "s"),
     **{word: word for word in ("ms", "us", "ns", "m", "cm", "mm", "rad", "deg", "rev", "rpm", "rad/s", "deg/s")},
     **{"degrees": "deg", "radians": "rad", "deg/sec": "deg/s", "rad_s": "rad/s", "deg_s": "deg/s", "rad/sec": "rad/s"},
+    **{"°": "deg", "°/s": "deg/s", "µs": "us", "μs": "us"},
     **dict.fromkeys(("nm", "n m", "n*m", "n.m", "n·m", "n_m"), "N m"),
     **{"nmm": "N mm", "n mm": "N mm", "n*mm": "N mm", "mnm": "mN m", "mn m": "mN m"},
 }
+"""Units in the spellings of headers, in lower case."""
+_NO_POINT = re.compile(r"(.*_)?(force|torque|moment|velocity|acceleration|orientation|rotation|quaternion)", re.I)
 _BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
-_SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, _UNIT_WORDS), key=len, reverse=True))})", re.I)
+_SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_WORDS), key=len, reverse=True))})", re.I)
 
 
-def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[_Meaning], dict[str, str]]:
-    """Find the meaning of every column of `header` from its name (None if unclear), and the units in the names.
+def column_meanings(
+    header: Sequence[str], sensor_components: Sequence[str]
+) -> tuple[list[_Meaning], list[tuple[str, str]]]:
+    """Find the meaning of every column of `header` from its name (None if unclear), and quantities with their units.
 
     `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
     """
     split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
     meanings: list[_Meaning] = []
-    units: dict[str, str] = {}
+    units: dict[tuple[str, str], None] = {}
     for name, unit in split:
         meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name)
         if meaning is None and set(_AXES) <= whole and name.strip().lower() in _AXES:
             meaning = name.strip().lower(), "marker"  # a table of one point
         meanings.append(meaning)
-        if meaning and unit:
-            units.setdefault("points" if meaning[0] in _AXES else meaning[0], unit)
-    return meanings, units
+        if meaning and unit and not (meaning[0] in sensor_components and unit in ("N m", "rad/s")):
+            units["points" if meaning[0] in _AXES else meaning[0], unit] = None
+    return meanings, list(units)
 
 
 def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str]:
-    """Name and unit of a column such as `time [ms]` or `q1_deg`. The unit is empty if the name has none."""
-    if (bracketed := _BRACKETED_UNIT.fullmatch(column)) and (unit := _UNIT_WORDS.get(bracketed[2].lower())):
-        return bracketed[1], unit
+    """Name and unit of a column such as `time [ms]` or `q1_deg`. The unit is empty if the name has none.
+
+    If the unit is unknown, the name is empty as well.
+    """
+    if (bracketed := _BRACKETED_UNIT.fullmatch(column)) and not bracketed[2].isdecimal():
+        name, unit = bracketed[1], UNIT_WORDS.get(bracketed[2].lower(), "")
+        if unit or _exact_meaning(name, sensor_components) or _spelled_meaning(name):
+            return name if unit else "", unit
     if _exact_meaning(column, sensor_components) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
         name = suffixed[1]
         if _exact_meaning(name, sensor_components) or _spelled_meaning(name):
-            return name, _UNIT_WORDS[suffixed[2].lower()]
+            return name, UNIT_WORDS[suffixed[2].lower()]
     return column, ""
 
 
@@ -84,7 +94,7 @@ def _exact_meaning(column: str, sensor_components: Sequence[str]) -> _Meaning:
         if (name := column.removesuffix(f"_{component}")) not in ("", column):
             return component, name
     point, _, axis = column.rpartition("_")
-    return (axis, point) if point and axis in _AXES else None
+    return (axis, point) if point and axis in _AXES and not _NO_POINT.fullmatch(point) else None
 
 
 def _spelled_meaning(column: str) -> _Meaning:
@@ -93,7 +103,7 @@ def _spelled_meaning(column: str) -> _Meaning:
     if plain.lower() in _TIME_WORDS.split() or plain.lower() in ("field_header_stamp", "header_stamp_sec"):
         return "t", ""
     if axis := re.fullmatch(r"(.+?)_([xyzXYZ])", plain):
-        return axis[2].lower(), axis[1]
+        return None if _NO_POINT.fullmatch(axis[1]) else (axis[2].lower(), axis[1])
     plain = _TOPIC_PREFIX.sub("", plain, count=1) if _TOPIC_PREFIX.match(plain) else plain
     for word in _LONGEST_FIRST:
         channel = _CHANNEL_BY_WORD[word]
@@ -134,10 +144,10 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
     by_label = {(row[1] if len(row) > 1 else ""): row for row in head[1:]}
     axes, kinds, names = head[-1], by_label.get("Type", []), by_label.get("Name", [])
     quantities = next((row for row in head[1:-1] if "Position" in row), [])
-    if axes[:1] != ["Frame"] or not (kinds and names and quantities):
+    if axes[:1] != ["Frame"] or len(axes) < 2 or not (kinds and names and quantities):
         raise _broken(where, "rows Type, Name, Rotation or Position, then Frame, Time (Seconds)")
     columns: dict[str, range] = {}
-    for i in range(2, len(axes) - 2):
+    for i in range(2, min(len(axes) - 2, len(names))):
         if quantities[i : i + 3] == ["Position"] * 3 and axes[i : i + 3] == ["X", "Y", "Z"] and names[i]:
             columns.setdefault(names[i], range(i, i + 3))
     table = _numbers(body, len(axes), where)
@@ -163,10 +173,7 @@ def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
     short = {name.rpartition(":")[2]: at for name, at in columns.items()}
     columns = short if len(short) == len(columns) else columns
     unit = _UNITS.get(next((cell for cell in units if cell), "mm").lower(), "mm")
-    try:
-        frequency = float(rate[0])
-    except ValueError as error:
-        raise _broken(where, "the rate in Hz in the line below Trajectories") from error
+    frequency = _frequency(rate, where, "the rate in Hz in the line below Trajectories")
     return _made((table[:, 0] - table[0, 0]) / frequency, columns, table, unit, "Vicon", [], where)
 
 
@@ -185,10 +192,7 @@ def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
     names = [name for name in said.get("MARKER_NAMES", []) if name]
     first = 2 if head else 0  # frame and time
     table = _numbers(body, max(map(len, body), default=0), where)
-    try:
-        frequency = float(said["FREQUENCY"][0])
-    except (KeyError, IndexError, ValueError) as error:
-        raise _broken(where, "FREQUENCY and MARKER_NAMES in the header") from error
+    frequency = _frequency(said.get("FREQUENCY", []), where, "FREQUENCY and MARKER_NAMES in the header")
     if not names or table.shape[1] < first + 3 * len(names):
         raise _broken(where, "MARKER_NAMES and three columns for each")
     columns = {name: range(first + 3 * i, first + 3 * i + 3) for i, name in enumerate(names)}
@@ -197,6 +201,12 @@ def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
         table[np.ix_((own == 0).all(axis=1), list(at))] = math.nan
     t = table[:, 1] if head else np.arange(len(table)) / frequency
     return _made(t, columns, table, "mm", "Qualisys", [], where)
+
+
+def _frequency(cells: Sequence[str], where: str, allowed: str) -> float:
+    if not (cells and _is_number(cells[0]) and 0 < float(cells[0]) < math.inf):
+        raise _broken(where, allowed)
+    return float(cells[0])
 
 
 def _made(

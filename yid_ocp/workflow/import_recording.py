@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import fnmatch
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
@@ -23,6 +22,7 @@ from yid_ocp.data.readers.base import (
     guess_units,
     parse_quantity_units,
 )
+from yid_ocp.data.readers.csv import column_pattern
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.files import attributes_to_dict
@@ -166,7 +166,8 @@ def _merged(
         own |= {"units": units} if units and "units" in known[file] else {}
         if columns and "column_meanings" in known[file]:
             names = [source.name for source in preview_file(file).sources]
-            own["column_meanings"] = {key: value for key, value in columns.items() if fnmatch.filter(names, key)}
+            known_here = (key for key in columns if any(map(column_pattern(key).fullmatch, names)))
+            own["column_meanings"] = {key: columns[key] for key in known_here}
             matched |= set(own["column_meanings"])
         parts.append(read_third_party_recording(file, own, progress))
     if missing := set(columns) - matched:

@@ -453,8 +453,7 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
-    hint = "choose topics: --joint-topic TOPIC, once for each"
-    together, notes = base.joints_on_fastest_clock(made, where, hint)
+    together, notes = base.joints_on_fastest_clock(made, where, "choose topics: --joint-topic TOPIC, once for each")
     for entry in groups:
         if entry.command:
             group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
@@ -498,8 +497,7 @@ def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
     names = dict[str, str]()
     for topic in bag.file.topic_names_of_types(*(kinds or _PLACES)):
         parts = [part for part in topic.split("/") if part]
-        telling = [part for part in parts if part.lower() not in _PLAIN_WORDS]
-        names[topic] = (telling or parts)[-1]
+        names[topic] = ([part for part in parts if part.lower() not in _PLAIN_WORDS] or parts)[-1]
     return names
 
 

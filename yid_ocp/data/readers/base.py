@@ -55,7 +55,7 @@ SKIPPED_COLUMN_MEANING = "skip"
 _TO_SI: Mapping[str, Mapping[str, float]] = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "rad": {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi},
+    "rad": {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi, "m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60},
     "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "A": 1.0, "mA": 1e-3},
 }
@@ -93,7 +93,7 @@ def _spaceless(unit: str) -> str:
     return unit.replace(" ", "")
 
 
-def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
+def si_factors(units: Mapping[str, str], where: str) -> dict[str, float]:
     """Factor to SI units of every quantity; for a current, to ampere."""
     factors = dict.fromkeys(_QUANTITIES, 1.0)
     for quantity, unit in units.items():
@@ -143,7 +143,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
     Raises `DataError` for an unknown joint, point, quantity or unit, for a current without torque constants, or if
     `validated_recording` refuses the result.
     """
-    factors = _factors(options.units or {}, where)
+    factors = si_factors(options.units or {}, where)
     group = raw.joints
     if group is not None:
         names = {name: name for name in group.names}

@@ -18,7 +18,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import mean_sample_rate
-from yid_ocp.data.foreign_formats import column_meanings, select_mocap_table_reader
+from yid_ocp.data.foreign_formats import UNIT_WORDS, column_meanings, select_mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -83,8 +83,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     cell, option or unit cannot be understood, or if `validated_recording` refuses the result.
     """
     path = Path(path)
-    digest = file_sha256(path)
-    said = options.description, path.name, path.stem, digest
+    said = options.description, path.name, path.stem, file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
         if options.column_meanings:
             what = "this is a motion capture export, whose header names its columns"
@@ -174,7 +173,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         kept = (base.TopicOrColumnSummary(name, "marker", int(n), rate, f"point {name}") for name, n in listed)
         return base.FilePreview(tuple(kept), {}, remarks)
     options, delimiter = dict[str, Any](), _delimiter(path)
-    lines = _rows(path, delimiter)
+    lines = _table_rows(path, delimiter)
     names = [cell.strip() for cell in next(lines, (1, []))[1]]
     head = next(lines, None)
     if len(names) < 2 or head is None:  # the error of reading such a file
@@ -199,11 +198,12 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
     if bad:
         options["skip_bad_lines"] = True
-    meanings, said = column_meanings(names, _COMPONENTS)
+    meanings, stated = column_meanings(names, _COMPONENTS)
     if "has_header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
         meanings[0] = ("t", "")
     meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # the first of two equal ones
-    unknown = {name: base.SKIPPED_COLUMN_MEANING for name, meaning in zip(names, meanings, strict=True) if not meaning}
+    unclear = (name for name, meaning in zip(names, meanings, strict=True) if name and not meaning)
+    unknown = dict.fromkeys(unclear, base.SKIPPED_COLUMN_MEANING)
     if "has_header" in options and meanings[0]:
         unknown = {names[0]: "t", **unknown}
     if unknown:
@@ -222,8 +222,8 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         units, why = base.guess_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
-    notes += [f"{quantity} is in {unit}, by the header" for quantity, unit in said.items()]
-    units = {quantity: unit for quantity, unit in units.items() if quantity not in said}
+    notes += [f"{quantity} is in {unit}, by the header" for quantity, unit in stated]
+    units = {quantity: unit for quantity, unit in units.items() if quantity not in dict(stated)}
     if units:
         options["units"] = units
     return base.FilePreview(tuple(sources), options, (*notes, *why))
@@ -253,11 +253,25 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
                 if len(cells) > _MAX_COLUMNS:
                     what, hint = f"the table has {len(cells)} columns", "check the --delimiter: comma, semicolon or tab"
                     raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)
-                if cells and not cells[0].lstrip().startswith(("#", "sep=")):  # the latter tells Excel the delimiter
+                # `sep=` tells Excel the delimiter
+                if any(map(str.strip, cells)) and not cells[0].lstrip().startswith(("#", "sep=")):
                     yield lines.line_num, cells
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         what, hint = "the file is not a table in UTF-8 text", "export it as CSV in UTF-8"
         raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8", hint=hint) from error
+
+
+def _table_rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """`_rows` with the units of a second row, if it has nothing else, in the names of the first row."""
+    rows = _rows(path, delimiter)
+    head, second = next(rows, None), next(rows, None)
+    if head and second and len(head[1]) == len(second[1]):
+        units = [cell.strip(" []()") for cell in second[1]]
+        if all(not unit or unit.lower() in UNIT_WORDS for unit in units):
+            names = [f"{name.strip()} [{unit}]" if unit else name for name, unit in zip(head[1], units, strict=True)]
+            head, second = (head[0], names), None
+    yield from filter(None, (head, second))
+    yield from rows
 
 
 def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
@@ -273,7 +287,7 @@ def _read_table(
     path: Path, options: CsvOptions
 ) -> tuple[list[tuple[str, str]], dict[str, str], Array, tuple[str, ...]]:
     """The columns with a meaning: meanings, units of the header, table (rows, columns), and notes on bad lines."""
-    lines = _rows(path, options.delimiter or _delimiter(path))
+    lines = _table_rows(path, options.delimiter or _delimiter(path))
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
@@ -349,23 +363,34 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Me
     return numbers
 
 
+def column_pattern(key: str) -> re.Pattern[str]:
+    """Pattern of the columns that a key of `column_meanings` selects."""
+    return re.compile(re.escape(key).replace(r"\*", "(.*)"))
+
+
 def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> tuple[list[_Meaning], dict[str, str]]:
     given: dict[str, str] = {}
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
-        pattern = re.escape(key).replace(r"\*", "(.*)")
-        found = {name: match for name in header if (match := re.fullmatch(pattern, name))}
+        found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
         if not found:
             raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: dict[str, _Meaning] = {}
     meant: dict[tuple[str, str], str] = {}
-    by_name, units = column_meanings(header, _COMPONENTS)
+    by_name, stated = column_meanings(header, _COMPONENTS)
+    units: dict[str, str] = {}
+    for quantity, unit in stated:
+        both = units.setdefault(quantity, unit), unit
+        if len({base.si_factors({quantity: one}, where)[quantity] for one in both}) > 1:
+            what, allowed = f"columns of {quantity} are in {' and in '.join(both)}", "one unit for every quantity"
+            raise DataError(what, where=where, allowed=allowed, hint="convert them to one unit in the file")
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
-        if own is None and name not in given:
+        if own is None and name and name not in given:
             channels = ", ".join(f"{channel}_<joint>" for channel in JOINT_CHANNEL_UNITS)
-            allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z"
+            allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z, <link>_force_x, and so on, with a "
+            allowed += "unit such as [ms], [deg], [N m], or without"
             hint = f"rename the column, give its meaning (--columns '{name}=position:JOINT'), or leave it out "
             hint += f"(--columns '{name}={base.SKIPPED_COLUMN_MEANING}')"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
