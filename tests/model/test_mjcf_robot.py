@@ -225,6 +225,9 @@ def test_constants_of_joints_come_into_the_model_unless_the_settings_have_others
     found = values("servo.xml", "{joints: [pan, lift], mode: prescribed}", more)
     assert (found["rotor_inertia@pan.armature"], found["rotor_inertia@lift.armature"]) == (0.028, 0.5)
     assert found["joint_coulomb@pan.tau_c"] == 0.2
+    (tmp_path / "servo.mjcf").write_text(MODELS["servo arm"].replace('name="pan" ', ""))
+    found = values("servo.mjcf", "{joints: [shoulder_joint, lift], mode: prescribed}")
+    assert found["rotor_inertia@shoulder_joint.armature"] == 0.028
 
 
 def test_bad_files_are_refused(tmp_path: Path) -> None:

@@ -149,28 +149,23 @@ def with_tip(mass="1", moments=(1, 1, 1), tensor=TENSOR, change=("", "")):
     return link("base"), tip, joint("turn", "base", "tip")
 
 
+TWO = link("a"), link("b")
+THREE = *TWO, link("c")
 BROKEN = {
-    "floating": ((link("a"), link("b"), joint("j", "a", "b", "floating")), ["'j'", "'floating'", "prismatic"]),
-    "planar": ((link("a"), link("b"), joint("j", "a", "b", "planar")), ["'j'", "'planar'"]),
-    "zero_axis": (
-        (link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")),
-        ["'j'", "zero axis", "allowed: an axis other than 0 0 0", "try: write the axis"],
-    ),
-    "two_roots": ((link("a"), link("b")), ["2 root links", "exactly one"]),
-    "no_root": ((link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")), ["0 root links"]),
+    "floating": ((*TWO, joint("j", "a", "b", "floating")), ["'j'", "'floating'", "prismatic"]),
+    "planar": ((*TWO, joint("j", "a", "b", "planar")), ["'j'", "'planar'"]),
+    "zero_axis": ((*TWO, joint("j", "a", "b", axis="0 0 0")), ["'j'", "zero axis", "axis other than 0 0 0", "write"]),
+    "two_roots": (TWO, ["2 root links", "exactly one"]),
+    "no_root": ((*TWO, joint("j", "a", "b"), joint("k", "b", "a")), ["0 root links"]),
     "unknown_link": ((link("base"), link("b"), joint("j", "bas", "b")), ["'j'", "'bas'", "'base'"]),
     "two_parents": (
-        (link("a"), link("b"), link("c"), joint("j", "a", "c"), joint("k", "a", "b"), joint("l", "b", "c")),
+        (*THREE, joint("j", "a", "c"), joint("k", "a", "b"), joint("l", "b", "c")),
         ["two joints carry the link 'c'"],
     ),
-    "twice_the_joint": (
-        (link("a"), link("b"), link("c"), joint("j", "a", "b"), joint("j", "b", "c")),
-        ["two joints are called 'j'"],
-    ),
-    "ring_beside": (
-        (link("a"), link("b"), link("c"), joint("j", "c", "b"), joint("k", "b", "c")),
-        ["link 'b' is not connected to the root link 'a'"],
-    ),
+    "twice_the_joint": ((*THREE, joint("j", "a", "b"), joint("j", "b", "c")), ["two joints are called 'j'"]),
+    "ring_beside": ((*THREE, joint("j", "c", "b"), joint("k", "b", "c")), ["'b' is not connected to the root"]),
+    "xacro": ((*TWO, '<x:tip xmlns:x="http://www.ros.org/wiki/xacro"/>'), ["xacro elements", "xacro FILE.xacro > "]),
+    "nan_mimic": ((*TWO, joint("j", "a", "b").replace("<limit", '<mimic offset="nan"/><limit')), ["offset is 'nan'"]),
     "truncated": ((link("a"), "<link name="), ["cannot be read"]),
     "negative_moment": (with_tip(moments=(1, -2, 1)), ["negative moment of inertia"]),
     "nan_moment": (with_tip(moments=("nan", 1, 1)), ["inertia ixx is 'nan'"]),
@@ -182,10 +177,10 @@ BROKEN = {
     "mass_with_unit": (with_tip(mass="1 kg"), ["mass is '1 kg'"]),
     "no_mass": (with_tip(change=('<mass value="1"/>', "")), ["without a mass"]),
     "two_inertials": (with_tip(change=("</link>", "<inertial/></link>")), ["2 elements <inertial>"]),
-    "axis_short": ((link("a"), link("b"), joint("j", "a", "b", axis="1 0")), ["axis xyz"]),
-    "axis_nan": ((link("a"), link("b"), joint("j", "a", "b", axis="nan 0 1")), ["axis xyz"]),
-    "axis_long": ((link("a"), link("b"), joint("j", "a", "b", axis="1 0 0 0")), ["axis xyz"]),
-    "axis_empty": ((link("a"), link("b"), joint("j", "a", "b", axis="")), ["axis xyz"]),
+    "axis_short": ((*TWO, joint("j", "a", "b", axis="1 0")), ["axis xyz"]),
+    "axis_nan": ((*TWO, joint("j", "a", "b", axis="nan 0 1")), ["axis xyz"]),
+    "axis_long": ((*TWO, joint("j", "a", "b", axis="1 0 0 0")), ["axis xyz"]),
+    "axis_empty": ((*TWO, joint("j", "a", "b", axis="")), ["axis xyz"]),
 }
 
 

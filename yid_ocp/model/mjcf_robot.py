@@ -55,12 +55,12 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
     `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `mjcf_robot_description`.
     """
-    if file.suffix.lower() != ".xml" or b"<mujoco" not in check_input_file(file).read_bytes():
+    if file.suffix.lower() == ".urdf" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}
     model = _compiled_file(file)
-    found: dict[str, dict[str, float]] = {model.joint(j).name: {} for j in range(model.njnt)}
+    found: dict[str, dict[str, float]] = {_joint_name(model, j): {} for j in range(model.njnt)}
     for j in range(model.njnt):
-        dof, own = int(model.jnt_dofadr[j]), found[model.joint(j).name]
+        dof, own = int(model.jnt_dofadr[j]), found[_joint_name(model, j)]
         for name, values in (
             ("armature", model.dof_armature),
             ("damping", model.dof_damping),
@@ -69,7 +69,7 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
             own |= {name: float(np.ravel(values[dof])[0])} if np.ravel(values[dof])[0] > 0 else {}
     for i in filter(lambda i: _is_position_actuator(model, i), range(model.nu)):
         gain, damping = float(model.actuator_gainprm[i, 0]), -float(model.actuator_biasprm[i, 2])
-        found[model.joint(int(model.actuator_trnid[i, 0])).name] |= {"servo_gain": gain, "servo_damping": damping}
+        found[_joint_name(model, int(model.actuator_trnid[i, 0]))] |= {"servo_gain": gain, "servo_damping": damping}
     return {name: own for name, own in found.items() if own}
 
 
@@ -114,8 +114,7 @@ def _body(
     mass, inertial = float(model.body_mass[i]), None
     if mass > 0:
         turn = _pose(model.body_ipos[i], model.body_iquat[i])
-        tensor = np.diag(model.body_inertia[i])
-        inertial = SimpleNamespace(mass=mass, inertia=tensor, origin=turn)
+        inertial = SimpleNamespace(mass=mass, inertia=np.diag(model.body_inertia[i]), origin=turn)
     links, joints = [SimpleNamespace(name=name, inertial=inertial)], []
     if i in welds:
         carrier, at = welds[i]
@@ -124,8 +123,7 @@ def _body(
     at, last = _pose(model.body_pos[i], model.body_quat[i]), np.zeros(3)
     first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
     for j in range(first, first + count):
-        joint, kind = model.joint(j), _JOINT_TYPES.get(int(model.jnt_type[j]))
-        label = joint.name or f"{name}_joint{j - first + 1 if count > 1 else ''}"
+        label, kind = _joint_name(model, j), _JOINT_TYPES.get(int(model.jnt_type[j]))
         if kind is None:
             what, allowed = f"joint '{label}' has the type free or ball", "hinge and slide joints"
             raise ModelError(what, where=where, allowed=allowed, hint="fix the base, or use several hinges")
@@ -134,7 +132,10 @@ def _body(
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
         if carried != name:
             links.append(SimpleNamespace(name=carried, inertial=None))
-        made = {"name": label, "type": kind if model.jnt_limited[j] or kind == "prismatic" else "continuous"}
+        made: dict[str, Any] = {
+            "name": label,
+            "type": kind if model.jnt_limited[j] or kind == "prismatic" else "continuous",
+        }
         made |= {"axis": np.array(axis), "limit": _limits(model, j), "mimic": follows.get(label)}
         joints.append(SimpleNamespace(**made, origin=origin, parent=parent, child=carried))
         parent, at, last = carried, np.eye(4), place
@@ -168,7 +169,7 @@ def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
             refs = [float(model.qpos0[model.jnt_qposadr[j]]) for j in (first, second)]
             offset, factor = float(model.eq_data[i, 0]), float(model.eq_data[i, 1])
             law = {"multiplier": factor, "offset": offset + refs[0] - factor * refs[1]}
-            found[model.joint(first).name] = SimpleNamespace(joint=model.joint(second).name, **law)
+            found[_joint_name(model, first)] = SimpleNamespace(joint=_joint_name(model, second), **law)
     return found
 
 
@@ -213,6 +214,13 @@ def _left_out(model: Any) -> Iterator[str]:
 
 def _body_name(model: Any, i: int) -> str:
     return model.body(int(i)).name or f"body{int(i)}" if i else _WORLD
+
+
+def _joint_name(model: Any, j: int) -> str:
+    """Name of a joint; without one, that of its body, with a number if the body has several joints."""
+    body = int(model.jnt_bodyid[j])
+    number = j - int(model.body_jntadr[body]) + 1 if model.body_jntnum[body] > 1 else ""
+    return model.joint(j).name or f"{_body_name(model, body)}_joint{number}"
 
 
 def _fixed(name: str, parent: str, child: str, origin: Array) -> SimpleNamespace:

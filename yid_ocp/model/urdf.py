@@ -255,6 +255,9 @@ def _part(element: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 
 def _check_numbers(robot: ElementTree.Element, where: str) -> None:
+    if any("xacro}" in part.tag for part in robot.iter()):
+        hint = "expand them: xacro FILE.xacro > robot.urdf"
+        raise ModelError("the file has xacro elements", where=where, allowed="URDF without macros", hint=hint)
     for owner in robot:
         if owner.tag not in ("link", "joint"):
             continue
@@ -266,9 +269,9 @@ def _check_numbers(robot: ElementTree.Element, where: str) -> None:
         for part in (*owner.findall("origin"), *owner.findall("axis"), *owner.findall("inertial/origin")):
             for key in {"xyz", "rpy"} & set(part.attrib):
                 _numbers(part.attrib[key], 3, f"{name}: {part.tag} {key}", where)
-        for limit in owner.findall("limit"):
-            for key, text in limit.attrib.items():
-                _numbers(text, 1, f"{name}: limit {key}", where, infinite=True)
+        for part in (*owner.findall("limit"), *owner.findall("mimic")):
+            for key in set(part.attrib) - {"joint"}:
+                _numbers(part.attrib[key], 1, f"{name}: {part.tag} {key}", where, infinite=part.tag == "limit")
         for inertial in inertials:
             mass, tensor = inertial.find("mass"), inertial.find("inertia")
             value = 0.0 if mass is None else _numbers(mass.get("value", ""), 1, f"{name}: mass", where)[0]

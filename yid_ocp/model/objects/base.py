@@ -118,8 +118,7 @@ class CableTopology:
     def clamp_pose_definitions_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Pose definitions of the start clamp and the end clamp."""
         a, b, *_, y, z = self.main_branch_vertex_names
-        start = ClampPoseDefinition(START_CLAMP, a, b)
-        return start, ClampPoseDefinition(END_CLAMP, y, z)
+        return ClampPoseDefinition(START_CLAMP, a, b), ClampPoseDefinition(END_CLAMP, y, z)
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
@@ -245,8 +244,7 @@ class ObjectBuilder:
 
     def with_file_names_only(self) -> ObjectBuilder:
         """Return a copy with file names instead of paths, to compare objects of different runs."""
-        names = {key: Path(file).name for key, file in self.input_file_paths().items()}
-        return replace(self, **names)
+        return replace(self, **{key: Path(file).name for key, file in self.input_file_paths().items()})
 
 
 @runtime_checkable

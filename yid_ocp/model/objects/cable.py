@@ -214,8 +214,7 @@ def _with_vertices(
 
 def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     clamp = six_joint_floating_mechanism(START_CLAMP)
-    text = "roll of the start clamp about the first edge"
-    roll = Parameter(f"{START_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
+    roll = Parameter(f"{START_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
     edge = Parameter(f"{START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
     carrier = clamp.frame(START_CLAMP)
     turn = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], roll.symbol)

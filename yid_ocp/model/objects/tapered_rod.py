@@ -72,8 +72,7 @@ parameters:
 def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
     """The object with a taper parameter, on which masses, inertias, springs and dampers depend."""
     tree, [layout] = plain.mechanism, plain.segment_layouts
-    text = "radius of the tip over that of the base"
-    taper = Parameter(f"{_SEGMENT}.taper", ratio, "1", 1e-3, math.inf, text)
+    taper = Parameter(f"{_SEGMENT}.taper", ratio, "1", 1e-3, math.inf, "radius of the tip over that of the base")
     n, links = len(layout.link_joints), layout.link_joints
 
     def radius_at(fraction: float) -> ca.SX:
