@@ -92,7 +92,7 @@ def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Read an input file as text. Raises the errors of `check_input_file`, and `DataError` if it is not UTF-8."""
     check_input_file(path, max_bytes)
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = os_error_reason(error) if isinstance(error, OSError) else "it is not UTF-8 text"
         what = f"the file cannot be read ({reason})"
@@ -231,8 +231,7 @@ def _value(hint: Any, value: Any) -> Any:
             return None
         return _value(next(entry for entry in arguments if entry is not type(None)), value)
     if origin is np.ndarray:
-        kind = typing.get_args(arguments[1])[0]
-        return np.array(value["values"], dtype=kind).reshape(value["shape"])
+        return np.array(value["values"], dtype=typing.get_args(arguments[1])[0]).reshape(value["shape"])
     if origin is tuple:
         inner = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
         return tuple(_value(entry, item) for entry, item in zip(inner, value, strict=True))

@@ -119,6 +119,7 @@ def test_depth_images_and_their_lens(open3d, tmp_path, lens):
 
 
 def test_units_and_frames_of_clouds(folder):
+    (folder / "timestamps.csv").write_text("\ufeff" + (folder / "timestamps.csv").read_text())  # as Excel saves it
     changed(folder, unit="mm")
     assert np.allclose(read_frames(folder).load_cloud(0), 1e-3 * CLOUD)
     assert np.allclose(read_frames(folder, unit="m").load_cloud(0), CLOUD, atol=1e-6)

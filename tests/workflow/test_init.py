@@ -399,7 +399,7 @@ def test_late_markers_are_placed_by_where_they_are_while_the_arm_rests(late: flo
     assert float(str(frames["a"].parent_frame).partition(":")[2].removesuffix("%")) == pytest.approx(100 / 3, abs=0.1)
 
 
-def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
+def test_a_file_of_another_tool_is_imported_along(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = moved(SHORT)
     assert recording.joints is not None
     columns = ["t,r,p,ax,ay,az"]
@@ -417,6 +417,8 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
     columns = {"r": "position:roll", "p": "position:pitch", "ax": "x:tip", "ay": "y:tip", "az": "z:tip"}
     assert run.import_.column_meanings == columns
     assert main(["import", "bag.csv", "--out", "again.h5", "--config", "run.yaml"]) == 0
+    assert main(["init", "wrist.urdf", "again.h5", "--out", "my run.yaml", *CABLE]) == 0
+    assert "yid-ocp check 'my run.yaml'" in capsys.readouterr().out
     assert np.array_equal(read_recording("again.h5").points[0].position, made.points[0].position)
 
 

@@ -308,7 +308,7 @@ class _Reader:
         markers = options.split_annotated(hint)[1]
         unit = next((entry.unit for entry in markers if isinstance(entry, options.OptionInfo) and entry.unit), "")
         advice = ""
-        if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s].*)", raw)):
+        if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s.,].*)", raw)):
             advice = f"write the number alone, in {unit}" if unit else "write the number alone"
             if unit and match[2].strip() != unit:
                 advice += f": convert it from {match[2].strip()}"

@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -186,12 +187,13 @@ def _summary_lines(
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
     for signals, kinds in effect_kinds_without_recorded_signals(recordings).items():
         lines.append(f"diagnose does not try {', '.join(kinds)}: nothing was recorded of {signals}")
-    lines += [*picture, "", f"next: yid-ocp check {out}, then yid-ocp solve {out}"]
+    quoted = shlex.quote(str(out))
+    lines += [*picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     has_efforts = "joints.effort" in proposal.noise_by_group
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
         is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.efforts_alone_identify_model
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
-        lines.append(f"friction of the arm's joints: yid-ocp friction {out}{more}")
+        lines.append(f"friction of the arm's joints: yid-ocp friction {quoted}{more}")
     return [*lines, ""]
 
 

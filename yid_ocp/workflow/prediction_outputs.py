@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,7 +102,7 @@ def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, fold
         "yaml": ["parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
-        "export": f"yid-ocp export {folder} --out model.xml",
+        "export": f"yid-ocp export {shlex.quote(str(folder))} --out model.xml",
         "cite": "CITATION.cff of yid_ocp, and Caldwell, Coleman and Correll (ISER 2014) for the problem",
     }
 

@@ -152,9 +152,9 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
 def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     if is_file(file):
         return file
-    names = [entry.name for entry in file.parent.glob(f"*{file.suffix}")] if file.parent.is_dir() else []
-    check = "check the path, which is relative to the configuration file"
-    hint = nearest_name_question(file.name, names) or check
+    near = file.parent.glob(f"*{file.suffix}") if file.parent.is_dir() else ()
+    names = [entry.name for entry in near if entry.is_file()]
+    hint = nearest_name_question(file.name, names) or "check the path, which is relative to the configuration file"
     raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 
