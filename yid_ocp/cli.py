@@ -48,8 +48,7 @@ def _setting(parser: argparse.ArgumentParser, flag: str, override: str, text: st
 
 
 def _repeated(parser: argparse.ArgumentParser, flag: str, metavar: str, text: str, dest: str | None = None) -> None:
-    text = f"{text}; may be repeated"
-    parser.add_argument(flag, metavar=metavar, action="append", default=[], dest=dest, help=text)
+    parser.add_argument(flag, metavar=metavar, action="append", default=[], dest=dest, help=f"{text}; may be repeated")
 
 
 def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None:

@@ -28,8 +28,7 @@ class LocalQuadraticModel:
 
     def damped_step(self, damping: float) -> Array:
         """Step (n,) that minimises the model with Levenberg-Marquardt damping."""
-        damped = self.hessian + damping * np.diag(np.diag(self.hessian))
-        return np.asarray(-np.linalg.solve(damped, self.gradient))
+        return np.asarray(-np.linalg.solve(self.hessian + damping * np.diag(np.diag(self.hessian)), self.gradient))
 
 
 class _SumOfSquares:

@@ -113,8 +113,7 @@ def compare_methods(
         runs.append(_MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), *taken))
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
-        shown = replace(best, solution=solution_with_profile_intervals(problem, best.solution))
-        runs[runs.index(best)] = best = shown
+        runs[runs.index(best)] = best = replace(best, solution=solution_with_profile_intervals(problem, best.solution))
     if whole.has_process_noise:
         able: Solver = next((solver for solver in solvers if uses_process_noise_covariance(solver)), GaussNewton())
         judged = estimation.solve(whole, able, callback=listener(_SOLVE_LABEL))

@@ -261,8 +261,7 @@ def _refined_problem(problem: EstimationProblem, what: RefinementKind) -> _Finer
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)
     made = EstimationProblem(step, recordings, problem.free, options)
-    joints = _fine_joints_by_coarse_joint(problem.system, step.system)
-    return _FinerDiscretisationProblem(made, factors, joints)
+    return _FinerDiscretisationProblem(made, factors, _fine_joints_by_coarse_joint(problem.system, step.system))
 
 
 def estimates_with_discretisation_error(

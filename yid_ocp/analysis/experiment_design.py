@@ -465,8 +465,7 @@ def _travel(system: System, values: Mapping[str, float], episode: Episode) -> fl
 
 def _frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
     symbol = ca.SX.sym("q", system.n_coordinates)
-    tree = system.numeric_mechanism(values)
-    kinematics = forward_kinematics(tree, symbol)
+    kinematics = forward_kinematics(system.numeric_mechanism(values), symbol)
     at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
     return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
 

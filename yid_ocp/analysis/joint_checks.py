@@ -116,8 +116,7 @@ class RecordedJointsModel:
 
     @cached_property
     def _effort(self) -> ca.Function:
-        size = self.system.n_coordinates
-        full = [ca.SX.sym(name, size) for name in ("q", "v", "a")]
+        full = [ca.SX.sym(name, self.system.n_coordinates) for name in ("q", "v", "a")]
         known = [ca.SX.sym(name, len(self.joint_names)) for name in ("q", "v", "a")]
         rigid = lagrangian_first_derivatives(
             forward_kinematics(self.system.mechanism, full[0]), full[1], self.system.gravity

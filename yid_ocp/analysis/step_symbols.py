@@ -91,8 +91,7 @@ def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Se
 
 
 def _function(expressions: Sequence[ca.SX], variables: ca.SX) -> ca.Function:
-    together = ca.cse(ca.densify(ca.vertcat(*expressions)))
-    return ca.Function("formula", [variables], [together])
+    return ca.Function("formula", [variables], [ca.cse(ca.densify(ca.vertcat(*expressions)))])
 
 
 # Operation, nodes that it takes, and the index of a variable or the value of a constant.

@@ -166,8 +166,7 @@ def _smallest(
 def _are_compatible(changes: Sequence[ExperimentChange]) -> bool:
     """Whether changes can be combined: at most one camera rate and one motion."""
     rates = sum(change.camera_rate is not None for change in changes)
-    motions = sum(change.mechanical_change in ("motion", "travel") for change in changes)
-    return rates <= 1 and motions <= 1
+    return rates <= 1 and sum(change.mechanical_change in ("motion", "travel") for change in changes) <= 1
 
 
 def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedExperimentResult]:

@@ -299,8 +299,7 @@ def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
         if best is None or evidence > best[0]:
             best = (evidence, values, precision)
     assert best is not None
-    names = law.parameters.names
-    return _Family(law, best[0], dict(zip(names, map(float, best[1]), strict=True)), best[2])
+    return _Family(law, best[0], dict(zip(law.parameters.names, map(float, best[1]), strict=True)), best[2])
 
 
 def _prior_precision(law: TorqueLaw, roughness_weight: float) -> Array:
@@ -328,8 +327,7 @@ def _refitted(
     prior = MultivariateGaussianPrior(names, covariance)
     with_prior = replace(composed, problem=composed.problem.with_multivariate_prior(prior))
     effects: tuple[EffectBase, ...] = (*before.effects, family.law)
-    start = {**before.values, **family.values}
-    return refit_with_effects(with_prior, effects, start, limits=search.thresholds)
+    return refit_with_effects(with_prior, effects, {**before.values, **family.values}, limits=search.thresholds)
 
 
 def _tables(law: TorqueLaw, fit: RefittedModel) -> tuple[TorqueLawTable, ...]:

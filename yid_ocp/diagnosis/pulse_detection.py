@@ -237,8 +237,7 @@ class _Filter:
         count = last - first
         column = np.repeat(np.arange(len(count)), count)
         row = np.arange(len(column)) - np.repeat(np.cumsum(count) - count - first, count)
-        values = self._seen(windows[column], t[row])
-        return scipy.sparse.csc_array((values, (row, column)), shape=(len(t), len(count)))
+        return scipy.sparse.csc_array((self._seen(windows[column], t[row]), (row, column)), shape=(len(t), len(count)))
 
     def _seen(self, windows: _Windows, t: Array) -> Array:
         return sum((w * windows.at(t - d) for d, w in zip(self.delay, self.weight, strict=True)), np.zeros(()))

@@ -211,8 +211,7 @@ class RefitContext:
         """A result, which is recorded."""
         found = work()
         # a model's rollouts would fill the memory
-        light = found.statistics() if isinstance(found, RefittedModel) else found
-        answers.setdefault(name, cast(_Answer, light))
+        answers.setdefault(name, cast(_Answer, found.statistics() if isinstance(found, RefittedModel) else found))
         return found
 
 

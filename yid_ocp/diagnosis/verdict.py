@@ -50,8 +50,7 @@ class EffectAmplitudeTransferCheck:
     @property
     def estimate_difference_and_std(self) -> tuple[float, float]:
         """Absolute difference between the two estimates, and its standard deviation."""
-        spread = math.hypot(self.estimation_std, self.held_out_std)
-        return abs(self.estimation_value - self.held_out_value), spread
+        return abs(self.estimation_value - self.held_out_value), math.hypot(self.estimation_std, self.held_out_std)
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     if location not in places and not (EFFECTS[kind].is_at_point_groups and location.partition("_")[0] == "points"):
         said = {"allowed": "no location of this model", "hint": "leave the effect out"}
         said = unknown_name_error_arguments(location, places) if places else said
-        what = f"the effect {kind} is not possible at '{location}'"
-        raise ModelError(what, where=f"{kind}@{location}", **said)
+        raise ModelError(f"the effect {kind} is not possible at '{location}'", where=f"{kind}@{location}", **said)
     return base.effect_at_checked_location(kind, location, system, values or {})
 
 

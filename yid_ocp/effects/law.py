@@ -95,8 +95,7 @@ class TorqueLaw(EffectBase):
         force = ca.SX(state.system.n_coordinates, 1)
         for index in _coordinate_indices(state.system, self.location):
             for quantity in self.quantities:
-                x = _quantity(quantity, state, self.label, index)
-                torque = self._torque(quantity, x)
+                torque = self._torque(quantity, _quantity(quantity, state, self.label, index))
                 if quantity == "command":
                     torque = ca.if_else(_servo_input(state, index) < MOTOR_OFF_COMMAND / 2, torque, 0)
                 force[index] += torque

@@ -169,8 +169,7 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
             found[label] = _NEUTRAL
         else:
             _, aspects = effect_joint_terms_and_changed_aspects(system, effect, value)
-            parts = [_aspect_support(x, form) for x in sorted(aspects)]
-            found[label] = _worst(parts)
+            found[label] = _worst([_aspect_support(x, form) for x in sorted(aspects)])
     return found
 
 

@@ -214,8 +214,7 @@ def _windows(
         for k in range(int(last / length) + 1):
             begin, total, degrees, count = k * length, 0.0, 0.0, 0
             for s in own:
-                inside = (s.t >= begin) & (s.t < begin + length)
-                r = residual[s.residual_indices[inside]]
+                r = residual[s.residual_indices[(s.t >= begin) & (s.t < begin + length)]]
                 total, count = total + float(r @ r), count + len(r)
                 degrees += len(r) / _variance_inflation(s.noise_autocorrelation)
             if count:

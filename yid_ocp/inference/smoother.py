@@ -300,8 +300,7 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
         return -math.inf, _VARIANCE_BOUNDS[0]
     values, pulls = [], []
     for base in bases:
-        chosen = np.flatnonzero([own == source for own in base.model.unknown_groups])
-        rows = _responses(base, chosen)
+        rows = _responses(base, np.flatnonzero([own == source for own in base.model.unknown_groups]))
         value, vectors = np.linalg.eigh(rows.T @ rows)
         values.append(np.maximum(value, 0.0))
         pulls.append(vectors.T @ (rows.T @ np.vstack([update.white for update in base.updates])))

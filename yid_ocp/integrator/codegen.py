@@ -449,8 +449,7 @@ def _part(instructions: Sequence[_Instruction], first: int, size: int, needed: S
     for k in own:
         told, name = instructions[k], f"v{k}"
         if told.code == ca.OP_OUTPUT:
-            result = value(told.inputs[0])
-            lines.append(f"res[{told.outputs[0]}][{told.outputs[1]}] = {result};")
+            lines.append(f"res[{told.outputs[0]}][{told.outputs[1]}] = {value(told.inputs[0])};")
             continue
         if told.code == ca.OP_CONST:
             constant = repr(told.constant).replace("inf", "INFINITY").replace("nan", "NAN")

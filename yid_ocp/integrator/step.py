@@ -62,8 +62,7 @@ class Step(ReprMixin):
 
     def clock_scaled_time_step(self, theta: Array) -> float:
         """Time step corrected for the recording's clock [s]: h times `System.recorded_time_scale` at `theta`."""
-        s = self.sizes
-        none = [np.zeros(s[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
+        none = [np.zeros(self.sizes[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
         return float(self.functions.row_scale_and_time_step_function(*none, theta, self.time_step)[1])
 
     @property

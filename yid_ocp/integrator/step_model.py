@@ -58,8 +58,7 @@ def build_step_model(
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
     limit = newton_correction_tolerance(time_step) if tolerance is None else tolerance
-    tables = codegen.step_sparsity_tables(functions)
-    return StepModel(system, e, functions, tables, sizes, float(time_step), limit)
+    return StepModel(system, e, functions, codegen.step_sparsity_tables(functions), sizes, float(time_step), limit)
 
 
 def newton_correction_tolerance(time_step: float) -> float:

@@ -80,8 +80,7 @@ def lqr_tracking_feedback(
     for k in reversed(range(steps)):
         a, b, stage = by_state[k], by_torque[k], stages[k]
         cost = stage if cost is None else cost
-        inner = weight_u + b.T @ cost @ b
-        gain[k] = np.linalg.solve(inner, b.T @ cost @ a)
+        gain[k] = np.linalg.solve(weight_u + b.T @ cost @ b, b.T @ cost @ a)
         closed = a - b @ gain[k]
         cost = stage + closed.T @ cost @ closed + gain[k].T @ weight_u @ gain[k]
         cost = 0.5 * (cost + cost.T)
@@ -110,8 +109,7 @@ def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: A
     """p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, (N + 1, nu), which starts from rest."""
     angles, torques = np.vstack([measured[:1], measured]), np.vstack([torque[:1], torque])
     state = np.hstack([angles, np.zeros_like(angles)])
-    none = np.zeros((len(torques), 0))
-    return arm_step.kernel.linearize_step_equations(theta, state, none, torques, (), False).p1
+    return arm_step.kernel.linearize_step_equations(theta, state, np.zeros((len(torques), 0)), torques, (), False).p1
 
 
 def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, theta: Array) -> tuple[Array, Array]:
@@ -218,8 +216,7 @@ class EffectMomentumShift:
 
     def momentum_derivative_by_previous_torque(self, theta: Array) -> Array:
         """Derivative of the momentum with respect to the previous step's torques, (nu, nu) [s]."""
-        arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
-        return np.array(self._impulse(*arguments, theta, self._time_step))
+        return np.array(self._impulse(*[np.zeros(self._impulse.numel_in(i)) for i in range(5)], theta, self._time_step))
 
     def effect_momentum_shifts_and_derivatives(
         self,

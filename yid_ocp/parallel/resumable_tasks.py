@@ -397,8 +397,7 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
         if isinstance(said, str):
             allowed = "workers that import the same modules and see the same folders as this process"
             hint = "install yid-ocp where the workers run, and choose --out on a file system that all of them share"
-            what = f"a worker cannot do the tasks: {said}"
-            raise ParallelWorkError(what, where=address, allowed=allowed, hint=hint)
+            raise ParallelWorkError(f"a worker cannot do the tasks: {said}", where=address, allowed=allowed, hint=hint)
         if unlike := software_fingerprint_differences(here, said):
             raise _unfit(address, unlike)
 

@@ -184,8 +184,7 @@ def _size(effect: EffectBase) -> Array:
     if np.any(known):
         return known[:, None]
     ranges = (effect.prior_ranges[name] for name in effect.amplitude_parameter_names)
-    half = [(high - low) / 2 for low, high in ranges]
-    return np.diag(half)
+    return np.diag([(high - low) / 2 for low, high in ranges])
 
 
 def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions) -> None:

@@ -409,8 +409,7 @@ class InformativeMotionSearch:
         while rows is not None and done < rounds and not finished:
             done += 1
             slopes = self.experiment.sensitivity_derivatives_by_coefficients(w, rows)
-            rolled = self.experiment.simulator.simulate_path(w, True)
-            limited, by_w = self.limits.limited_quantity_values(rolled, w)
+            limited, by_w = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w, True), w)
             if slopes is None or by_w is None:
                 break
             bounded = limited / self._unit, by_w / self._unit[:, None]

@@ -118,8 +118,7 @@ class SensorMeasurements:
             low = int(self.node.min(initial=self.predictable_nodes[1]))
             high = int(self.node.max(initial=self.predictable_nodes[0]))
             return np.arange(max(low - 1, self.predictable_nodes[0]), min(high + 2, self.predictable_nodes[1] + 1))
-        after = self.node[self.fraction > 0] + 1
-        return np.unique(np.concatenate([self.node, after]))
+        return np.unique(np.concatenate([self.node, self.node[self.fraction > 0] + 1]))
 
     @property
     def positive_weight_mask(self) -> BoolArray:

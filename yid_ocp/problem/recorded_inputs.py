@@ -261,8 +261,7 @@ def prescribed_coordinates_at_nodes(
             what = f"joint '{remaining[0]}' is prescribed, but the recording has no joints"
             allowed, hint = "a recording with the group `joints`", "import the joints too, or give another recording"
             raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
-        joints = recording.joints
-        sampled = smoothed_joint_angles_at_nodes(joints, remaining, grid, recording.name, low_pass)
+        sampled = smoothed_joint_angles_at_nodes(recording.joints, remaining, grid, recording.name, low_pass)
         course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
     return np.stack([course[name] for name in system.prescribed], axis=1)
 

@@ -152,8 +152,7 @@ class FirstOrderLag:
         first input. `slope` (N, k, d) is the derivative of x.
         """
         decay, share, decay_slope, share_slope = self._factors()
-        held = self._following(value, np.zeros(value.shape), decay)
-        gap = held - value
+        gap = self._following(value, np.zeros(value.shape), decay) - value
         by_value = np.zeros((*value.shape, self.time_constant_sensitivity.shape[1])) if slope is None else slope
         by_time = self._following(np.zeros(value.shape), decay_slope * gap, decay)
         mean_by_time = (gap * share_slope + share * by_time)[:, :, None] * self.time_constant_sensitivity

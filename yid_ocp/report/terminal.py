@@ -122,8 +122,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
     yield SummaryTable(rows, "In doubt")
     yield from advice
     if any(entry["weight"] != "warning" for entry in doubts):
-        text = "no value counts as found while a recording of the run has issues"
-        yield SummaryStatement(text, "verdict")
+        yield SummaryStatement("no value counts as found while a recording of the run has issues", "verdict")
 
 
 def misfit_summary_blocks(
@@ -217,8 +216,7 @@ def recording_summary_lines(recording: Recording) -> list[str]:
         rate, span = mean_sample_rate(group.t), f"{group.t[-1] - group.t[0]:.4g}"
         sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", span
         rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), ", ".join(group.names)))
-    table = aligned_table_lines(rows)
-    return [*table, "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
+    return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
 
 
 def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) -> list[str]:

@@ -143,8 +143,7 @@ def _resting(
     for table in (state, pull):
         for column in range(table.shape[1]):
             table[:, column] = np.interp(times, times[chosen], table[chosen, column])
-    driven = list(problem.system.actuated_coordinate_indices)
-    state[:, driven] = episode.measured_driven_angles[nodes]
+    state[:, list(problem.system.actuated_coordinate_indices)] = episode.measured_driven_angles[nodes]
     velocity = np.gradient(state[:, :n], times, axis=0)
     state[:, n : 2 * n] += generalized_momentum_from_velocity(step, state[:, :n], velocity, theta)
     return state, pull[:-1] * h

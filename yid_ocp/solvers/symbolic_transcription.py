@@ -136,8 +136,7 @@ class _Places(NamedTuple):
 
     def stages(self) -> IntArray:
         """(free, x_k, x_{k+1}, lam_k, errors) of every step, (N, nv)."""
-        steps = len(self.multipliers)
-        free = np.broadcast_to(self.free, (steps, len(self.free)))
+        free = np.broadcast_to(self.free, (len(self.multipliers), len(self.free)))
         return np.hstack([free, self.state[:-1], self.state[1:], self.multipliers, self.errors])
 
     def inputs(self) -> IntArray:
@@ -322,8 +321,7 @@ class _Maker:
             feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_shift
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
-            made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
-            self._stages[key] = made
+            self._stages[key] = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
         return self._stages[key]
 
     def _erring(self, episode: Episode) -> tuple[IntArray, IntArray, list[ResidualTerm]]:
@@ -341,8 +339,7 @@ class _Maker:
         places, priors = {}, []
         for label, std, count in wanted:
             none = np.tile(std <= 0, count)
-            zero = np.zeros(nu * count)
-            at = self._w.append_values(zero, np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
+            at = self._w.append_values(np.zeros(nu * count), np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
             places[label] = at.reshape(count, nu)
             self._w.name_indices(f"{label}[{name}]", places[label].T, driven)
             weight = self._p.append_block(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
@@ -452,8 +449,7 @@ class _Maker:
         return self._sensors[key]
 
     def _unloaded(self, function: ca.Function) -> LocalVariableFunction:
-        n = self._sizes["n"]
-        q, z = ca.SX.sym("q", n), ca.SX.sym("z", self._sizes["nz"])
+        q, z = ca.SX.sym("q", self._sizes["n"]), ca.SX.sym("z", self._sizes["nz"])
         read = function(q=q, z=z, theta=self._freed.theta)
         inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
         slopes = ca.horzcat(read["by_theta"], read["by_q"], read["by_z"])
@@ -503,8 +499,7 @@ class _Maker:
                 weight = weight * problem.initial_unknowns[unknown[last]]
             names = [problem.unknown_names[k] for k in unknown]
             start = self._p.append_block(f"{name}.start", problem.initial_unknowns[unknown], names)
-            rows = [names[k] for k in last]
-            weights = self._p.append_block(f"{name}.weight", weight, rows)
+            weights = self._p.append_block(f"{name}.weight", weight, [names[k] for k in last])
             local = LocalVariableFunction(name, [v, about, ca.SX(0, 1)], value)
             at = np.array([[columns[int(k)]] for k in unknown])
             term = MappedFunctionTerm(name, (name,), local, at, start, np.zeros(0, np.int64))

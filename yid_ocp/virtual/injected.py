@@ -298,8 +298,7 @@ def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], 
         if data.ne and len(others):
             # the pull of grasps follows from the object's joints, which have no friction
             rows = data.efc_J.reshape(-1, model.nv)[: data.ne]
-            pull = np.linalg.lstsq(rows[:, others].T, data.qfrc_constraint[others], rcond=None)[0]
-            outside += rows[:, at].T @ pull
+            outside += rows[:, at].T @ np.linalg.lstsq(rows[:, others].T, data.qfrc_constraint[others], rcond=None)[0]
         return np.asarray(data.qfrc_actuator[at] + data.qfrc_applied[at] - drag * data.qvel[at] - outside)
 
     return gear_load

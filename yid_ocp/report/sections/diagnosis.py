@@ -208,8 +208,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
         plot = TimePlotData(title, lines, force.t, force.max_likelihood_forces, marked_intervals=spans)
         by_recording.setdefault(force.recording, []).append(plot)
-    shown = _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
-    return "Brief disturbances", sentences, shown
+    return "Brief disturbances", sentences, _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
 
 
 def _recording_figures(

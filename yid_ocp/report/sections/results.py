@@ -116,8 +116,7 @@ def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
     if result.get("format") in formats:
         for name, entry in result["parameters"].items():
             known = {r: own for r, own in entry["values"].items() if own.get("verdict") != "not_identifiable"}
-            values = {run: (own["value"], own["std"]) for run, own in known.items()}
-            rows.append((name, entry["unit"], values))
+            rows.append((name, entry["unit"], {run: (own["value"], own["std"]) for run, own in known.items()}))
     return draw_figure_per_unit(rows, figures.parameter_values_by_source_figure)
 
 
