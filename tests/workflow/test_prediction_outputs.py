@@ -287,7 +287,7 @@ def test_a_spring_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder)
     theta = system.parameters.vector({"elbow.stiffness": 4.0})
     problem = SimpleNamespace(system=system, theta_and_initial_state_deviation=lambda x, i: (theta, None))
     found = {"elbow.stiffness": ParameterEstimate(4.0, 0.1, "N m/rad", 3.0, 0.0, np.inf, True, "identifiable")}
-    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "my runs/a")
+    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
     [line] = told["mjcf"]
     joint = line.replace("<joint ", '<joint axis="0 0 1" ')
     body = f'<body><geom size="1"/>{joint}</body>'
@@ -310,7 +310,7 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
         "T1.bend": estimate(22.0, "identifiable"),
         "T1.twist": estimate(7.0, "not_identifiable"),
     }
-    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
+    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "my runs/a")
     assert told["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
     assert told["joints"] == [
         {"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0},
