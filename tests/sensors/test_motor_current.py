@@ -155,6 +155,12 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
         (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "noise level of the motor currents"),
         (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder'"),
         (replace(KNOWN, use=False), {}, "no sensor of the model has a measurement"),
+        (KNOWN, {"t": T[:1], "values_by_quantity": {"current": np.zeros((1, 2))}}, "0 s of efforts are too short"),
+        (
+            KNOWN,
+            {"t": T[:20], "values_by_quantity": {"current": np.zeros((20, 2))}},
+            r"0\.19 s of efforts are too short",
+        ),
     ],
 )
 def test_currents_that_cannot_be_compared_are_refused(step, made, options, changes, message):

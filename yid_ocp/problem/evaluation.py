@@ -294,8 +294,7 @@ def check_names_and_known_parameters(used: Sequence[Episode], held_out: Sequence
         what, hint = f"two recordings are called '{twice[0]}'", "rename one of them"
         raise ConfigError(what, where="recordings.estimate", allowed="every name once", hint=hint)
     for episode in (*used, *held_out):
-        start = episode.fixed_initial_state
-        known = {*episode.known_parameters, *(() if start is None else start.fitted_parameters)}
+        known = {*episode.known_parameters, *getattr(episode.fixed_initial_state, "fitted_parameters", ())}
         if found := [name for name in free if name in known]:
             what = f"{found[0]} is free, but this recording has a known value of it"
             allowed, hint = "parameters that are free or known", f"set parameters.{found[0]}.free: false"

@@ -140,12 +140,10 @@ def filtered_effort_measurements(
     constant error. With `is_sample`, a value is measured at its time, otherwise it is the mean until the next value's
     time. Raises `DataError` if the recording is too short for the filter.
     """
-    period, last = float(np.median(np.diff(t))), len(inputs.node_times) - 1
     # the mean of an interval belongs to its centre
-    late = 0.0 if is_sample else 0.5 * period
-    kept, measured = nodes_and_decorrelated_values(inputs, t, values, "efforts", late)
-    times = inputs.node_times[kept]
-    unit = sensor.effort_per_unit_reading
+    kept, measured = nodes_and_decorrelated_values(inputs, t, values, "efforts", at_centres=not is_sample)
+    times, last = inputs.node_times[kept], len(inputs.node_times) - 1
+    unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
     total, correlation = _smoothed_effort_noise(inputs, sensor.joint_names, std * np.abs(unit), period, times)
     if correlation is not None:
         correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
@@ -153,30 +151,31 @@ def filtered_effort_measurements(
 
 
 def nodes_and_decorrelated_values(
-    inputs: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
+    inputs: SensorDataInputs, t: Array, values: Array, noun: str, *, at_centres: bool = False, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
 
-    `values` (M, k) belong to the times `t` + `late` [s]. `like_path` selects the path filter; the default is the effort
-    filter, which is also applied to predictions. Raises `DataError`, which names `noun`, if the recording is too short.
+    `values` (M, k) belong to the times `t` [s] or, with `at_centres`, to the centres of the intervals from these times.
+    `like_path` selects the path filter; the default is the effort filter, which is also applied to predictions. Raises
+    `DataError`, which names `noun`, if there are too few samples for the filter.
     """
-    low_pass = inputs.path_filter if like_path else inputs.effort_filter
-    times, smooth = inputs.node_times, low_pass(t, values)
-    measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
+    low_pass, times = inputs.path_filter if like_path else inputs.effort_filter, inputs.node_times
     # Neighbouring smoothed values are correlated: only nearly independent ones at samples are kept. Both ends are
     # omitted: there the filter has data on one side only, and the impulses depend on the motion before or after the
     # recording.
-    step, steps = inputs.time_step, len(times) - 1
-    apart = max(1, round(float(np.median(np.diff(t))) / step))
-    ends = apart * math.ceil(max(1, math.ceil(low_pass.end_distortion_duration / step)) / apart)
+    step, steps, distorted = inputs.time_step, len(times) - 1, low_pass.end_distortion_duration
+    period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    apart = max(1, round(period / step))
+    ends = apart * math.ceil(max(1, math.ceil(distorted / step)) / apart)
     kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride(step) / apart))
-    span = t[[0, -1]] + low_pass.end_distortion_duration * np.array([1, -1])
-    kept = kept[(times[kept] > span[0] - step) & (times[kept] < span[1] + step)]
+    kept = kept[(times[kept] > t[0] + distorted - step) & (times[kept] < t[-1] - distorted + step) & (len(t) > 1)]
     if not len(kept):
-        what = f"{steps * step:.3g} s of {noun} are too short for a low-pass filter of {low_pass.cutoff:g} Hz"
-        allowed, hint = f"more than {2 * ends * step:.3g} s", "use a longer recording, or raise problem.path_cutoff"
+        length, allowed = min(steps * step, float(t[-1] - t[0])), f"more than {2 * ends * step:.3g} s"
+        what = f"{length:.3g} s of {noun} are too short for a low-pass filter of {low_pass.cutoff:g} Hz"
+        hint = "use a longer recording, raise problem.path_cutoff, or leave this sensor out (`use: false`)"
         raise DataError(what, where=f"recording '{inputs.recording.name}'", allowed=allowed, hint=hint)
-    return kept, measured[kept]
+    smooth, late = low_pass(t, values), 0.5 * period if at_centres else 0.0
+    return kept, np.stack([np.interp(times[kept], t + late, column) for column in smooth.T], axis=1)
 
 
 def is_noise_std_stated(joints: RecordedJointsInterface, group: str, choice: SensorOptions) -> bool:

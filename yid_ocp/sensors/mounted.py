@@ -108,11 +108,9 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
         kept = (group.t >= last[0] - 1e-9) & (group.t <= last[1] + 1e-9)
         own = np.broadcast_to(by_output[0], values[kept].shape)
         return SensorData(sensor, group.t[kept], values[kept], own, inner, by_output[1])
-    low_pass = around.path_filter
-    period = float(np.median(np.diff(group.t)))
     nodes, measured = nodes_and_decorrelated_values(around, group.t, values, key, like_path=True)
-    times = around.node_times[nodes]
-    own = by_output[0] * low_pass.noise_gains_of_value_and_rates(period)[0]
+    times, period = around.node_times[nodes], float(np.median(np.diff(group.t)))
+    own = by_output[0] * around.path_filter.noise_gains_of_value_and_rates(period)[0]
     total, correlation = _with_encoder_noise(around, sensor, own, times)
     return SensorData(sensor, times, measured, total, inner, by_output[1], correlation)
 

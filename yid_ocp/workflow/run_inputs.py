@@ -170,10 +170,9 @@ def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: in
 
     Names are unique among the recordings of both lists. Errors are as in `read_recording`, with the setting.
     """
-    paths: Sequence[str] = getattr(run.recordings, which)
     others = () if which == "estimate" else map(expand_recording_path, run.recordings.estimate)
     found: list[Recording] = []
-    for i, path in enumerate(paths[:count]):
+    for i, path in enumerate(getattr(run.recordings, which)[:count]):
         file = _existing(run, expand_recording_path(path), "recording", "recordings", which, i)
         with add_setting_location_to_errors(run, "recordings", which, i):
             found.append(read_recording(file))
