@@ -101,12 +101,14 @@ def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
     assert np.all((held.holding_torque - command) * sag > 0)
 
 
-def test_the_torque_along_a_rollout_is_what_moves_it(step) -> None:
+@pytest.mark.parametrize("scale", [1.0, 1.25])
+def test_the_torque_along_a_rollout_is_what_moves_it(urdf_folder, scale) -> None:
+    step = servo_step(urdf_folder, [("clock_scale", "clock", {"scale": scale})])
     made = problem_of(step, commanded(), ["shoulder.damping"])
     [result] = made.evaluate(made.initial_unknowns, False).episode_predictions
     torque = input_or_servo_torques_of_rollout(step, made.theta, result.rollout)
     q = result.rollout.state[:, :2]
-    rate, middle = np.diff(q, axis=0) / H, (q[1:] + q[:-1]) / 2
+    rate, middle = np.diff(q, axis=0) * scale / H, (q[1:] + q[:-1]) / 2
     demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate
     np.testing.assert_allclose(torque, saturated(demand, [9.0, 3.0]), rtol=1e-9)
 

@@ -304,7 +304,7 @@ def checked_rollout_inputs(
 
 def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
     """Torque on the driven joints in every step, (N, nu) [N m]: the input, or the torque of the position servos."""
-    system, h = step.system, step.time_step
+    system, h = step.system, step.clock_scaled_time_step(np.asarray(theta, float))
     if not system.servos:
         return rollout.torque
     e, driven = step.equations, list(system.actuated_coordinate_indices)

@@ -315,8 +315,7 @@ def _joint_readings(
     values, found = predictor.state_values_at_nodes(rollout), []
     for sensor in (PositionSensor(names), PrescribedJointEffortSensor(names)):
         read = functions.compiled_sensor_function(sensor)(values, theta).output
-        delays = corrections.sensor_delays_with_derivatives(sensor, theta, ())
-        shift = np.zeros(len(names)) if delays is None else delays[0]
+        shift, _ = corrections.sensor_delays_with_derivatives(sensor, theta, ()) or (np.zeros(len(names)), None)
         found.append(np.stack([np.interp(times - s, times, x) for x, s in zip(read.T, shift, strict=True)], axis=1))
     return found[0], found[1]
 
