@@ -190,10 +190,7 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
         ((broken,), ["result.json", "not JSON"]),
         ((tmp_path,), ["no finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),
-        (
-            (found, "--format", "urdf", "--lossy", "--out", tmp_path / "no" / "y.urdf"),
-            ["folder to write to does not exist"],
-        ),
+        ((found, "--lossy", "--out", tmp_path / "no" / "y.urdf"), ["folder to write to does not exist"]),
     ):
         done = cli("export", *arguments, *(() if "--out" in arguments else ("--out", tmp_path / "y.xml")))
         assert done.code == 2, done.err
@@ -217,9 +214,12 @@ def test_a_format_that_cannot_hold_all_is_refused_before_anything_is_replayed(cl
     assert list(tmp_path.iterdir()) == []
 
 
-def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path, exported) -> None:
-    said = ("--set", "output.write_report=false", "--set", "sensors.joints.effort.std=0.02")
-    assert cli("solve", pendulum, "--out", "run", *said).code == 0
+def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path, exported, urdf_folder) -> None:
+    robot = shutil.copy(urdf_folder / "double_pendulum.urdf", tmp_path)
+    said = ("output.write_report=false", "sensors.joints.effort.std=0.02", f"model.robot={robot}")
+    said += ("model.effects=[{kind: effort_offset, location: shoulder}]", "parameters.effort_offset@*={free: true}")
+    assert cli("solve", pendulum, "--out", "run", *(word for entry in said for word in ("--set", entry))).code == 0
+    assert "the file is an input of the run" in cli("export", "run", "--lossy", "--out", robot).err
     manifest = exported("run", tmp_path / "pendulum.xml")
     [(name, entry)] = manifest["gate"]["channels"].items()
     assert (name, entry["unit"]) == ("joints.effort", "N m")

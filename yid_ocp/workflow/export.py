@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import fnmatch
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from yid_ocp.data import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check
 from yid_ocp.display import Progress
-from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.errors import ConfigError, DataError, ModelError, OutputError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FeatureExportSupport
 from yid_ocp.export.signals import (
@@ -44,7 +45,7 @@ from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_prog
 from yid_ocp.workflow.import_recording import recording_contents_summary
 from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import software_and_plugin_versions
-from yid_ocp.workflow.run_inputs import read_recordings_of_role
+from yid_ocp.workflow.run_inputs import input_files_by_name, read_recordings_of_role
 
 _MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
 _FORMAT_BY_ENDING = {"": "mjcf", "xml": "mjcf", "yml": "yaml", "world": "sdf"}  # of other endings, the ending itself
@@ -114,9 +115,9 @@ class _CalibratedModel:
             return build_system(run)
         kept = {"", *labels}
         effects = tuple(effect for effect in run.model.effects if f"{effect.kind}@{effect.location}" in kept)
-        # parameters, and patterns of them, start with the name of their effect
-        owners = {name: name.rpartition(".")[0] if "@" in name else "" for name in run.parameters}
-        parameters = {name: said for name, said in run.parameters.items() if owners[name] in kept}
+        # names of parameters start with that of their effect
+        names = [n for n in self.parameter_values if "@" not in n or n.rpartition(".")[0] in kept]
+        parameters = {key: said for key, said in run.parameters.items() if fnmatch.filter(names, key)}
         return build_system(replace(run, model=replace(run.model, effects=effects), parameters=parameters))
 
     def values_for(self, system: System) -> dict[str, float]:
@@ -155,6 +156,9 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         where = "--format, or the ending of --out"
         raise ConfigError(f"there is no format '{form}'", where=where, allowed=allowed, hint=hint)
     calibrated = _read_calibrated_model(folder)
+    if out.exists() and any(map(out.samefile, input_files_by_name(calibrated.nominal_settings).values())):
+        what, hint = "the file is an input of the run", "choose another --out"
+        raise OutputError(what, where=str(out), allowed="a file that the run does not read", hint=hint)
     progress.begin_stage("building the model")
     full = calibrated.system()
     if form == "yaml":

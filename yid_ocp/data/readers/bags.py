@@ -180,8 +180,9 @@ def read_bag(
     type. Stamped points, poses and transforms of `geometry_msgs` and frames of `/tf` become points, one group per
     reference frame. Each topic of `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
 
-    Times are header stamps (recording times if a message has no stamp), relative to the first message. A joint channel
-    that is empty or all NaN is omitted. `notes` lists unused topics. Raises `DataError` if `rosbags` is not installed,
+    Times are header stamps (recording times if a message has no stamp), relative to the first message. A message that
+    repeats time and values of another counts once. A joint channel that is empty or all NaN is omitted. `notes` lists
+    unused topics. Raises `DataError` if `rosbags` is not installed,
     if the bag cannot be read, has no usable topic or is ambiguous, or if `validated_recording` refuses the result.
     """
     path, distance = Path(path), options.pose_axis_point_distance
@@ -200,6 +201,8 @@ def read_bag(
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]
     seconds = time_since_first_message_function(used_messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
+    if unstamped := sum(message.stamp <= 0 for message in used_messages):
+        more = (*more, f"{unstamped} of {len(used_messages)} messages have no stamp: all times are those of recording")
     points = []
     for frame, entries in seen.items():
         position = _positions(_with_axes(entries, distance), seconds, str(path))
@@ -486,7 +489,9 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
     if "position" not in channels:
         allowed, hint = "messages whose `position` is filled", "choose another topic with --joint-topic"
         raise DataError("the joint states have no positions", where=where, allowed=allowed, hint=hint)
-    return JointGroup(entry.wanted, t, **channels)
+    values = np.hstack([t[:, None], *channels.values()])
+    own = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))  # a message that is sent twice counts once
+    return JointGroup(entry.wanted, t[own], **{name: values[own] for name, values in channels.items()})
 
 
 _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
@@ -541,12 +546,11 @@ def _positions(
     """Names, times and positions (N, np, 3) of some points, NaN if a point was not seen."""
     seen: dict[tuple[float, str], tuple[float, ...]] = {}
     for point, message in entries:
-        key = seconds(message), point
-        if key in seen:
-            what, where = f"point '{point}' has two positions at {key[0]:g} s", f"{where}: {message.source}"
+        time, place = seconds(message), message.content.point
+        if seen.setdefault((time, point), place) != place:
+            what, where = f"point '{point}' has two positions at {time:g} s", f"{where}: {message.source}"
             hint = "name the points of the two sources differently: --points SOURCE=POINT"
             raise DataError(what, where=where, allowed="one position of a point at a time", hint=hint)
-        seen[key] = message.content.point
     times, names = sorted({time for time, _ in seen}), sorted({point for _, point in seen})
     rows, columns = ({key: index for index, key in enumerate(keys)} for keys in (times, names))
     array = np.full((len(times), len(names), 3), np.nan)
