@@ -72,8 +72,7 @@ def abbreviated_names_text(names: Sequence[str]) -> str:
                     break
                 run.append(parts.index(following))
             if len(run) > max(2, len(longest)) and not taken.intersection(run):
-                end = parts[run[-1]][at]
-                longest, text = run, "".join([*own[: at + 1], "..", end, *own[at + 1 :]])
+                longest, text = run, "".join([*own[: at + 1], "..", parts[run[-1]][at], *own[at + 1 :]])
         taken.update(longest)
         if len(said) < _MAX_NAMES_IN_LINE:
             said.append(text)

@@ -398,8 +398,7 @@ _COMBINATIONS: tuple[_Combination, ...] = (
 
 
 def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
-    units = map(view.unit, view.names)
-    parts = zip(view.names, vector.tolist(), view.x[view.chosen].tolist(), units, strict=True)
+    parts = zip(view.names, vector.tolist(), view.x[view.chosen].tolist(), map(view.unit, view.names), strict=True)
     return [_Component(*part) for part in parts if abs(part[1]) > 0.05 * np.max(np.abs(vector))]
 
 

@@ -281,8 +281,7 @@ def _excess_of(residual: Array) -> float:
 def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBaseline) -> DiagnosisResult:
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
     steps, end_stage = (problem.step.time_step, nominal.problem.step.time_step), functools.partial(_end_stage, search)
-    moved = earlier.fit_parameters_differ_significantly(nominal, limits)
-    evidence = replace(seen.evidence, has_left_baseline=moved)
+    evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_significantly(nominal, limits))
     judged = judge(search, evidence, end_stage)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()

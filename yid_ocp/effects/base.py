@@ -193,8 +193,7 @@ def effect_at_checked_location(kind: str, location: str, system: System, values:
     )
     inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
     internal = {name: ca.SX.sym(name) for name in inner}
-    joints = joint_names_by_arm(system).get(location, ())
-    return cls(kind, location, Parameters(entries), internal, definitions, joints)
+    return cls(kind, location, Parameters(entries), internal, definitions, joint_names_by_arm(system).get(location, ()))
 
 
 def segment_names(system: System) -> tuple[str, ...]:

@@ -136,8 +136,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     Column j of F (nr, k), the argument `spread`, is the change of the residual for one standard deviation of error j.
     Columns that are not finite are ignored.
     """
-    spread = spread[:, np.isfinite(spread).all(axis=0)]
-    columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
+    columns, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
 
 

@@ -237,8 +237,7 @@ class _Symbols:
         """Expression of the midpoint in terms of the two nodes."""
         midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
         (q, v), (z, z_rate) = (((a + b) / 2, (b - a) / self.h) for a, b in ((self.q0, self.q1), (self.z0, self.z1)))
-        values = ca.vertcat(q, v, z, z_rate, self.lam / self.h, z)
-        placed = ca.substitute(expression, midpoint, values)
+        placed = ca.substitute(expression, midpoint, ca.vertcat(q, v, z, z_rate, self.lam / self.h, z))
         return ca.densify(placed) if dense else placed
 
 
@@ -438,8 +437,7 @@ class NlpStepConstraints:
 
     def residual_and_effort_jacobians_by_parameters(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
         """Sparse derivatives of `residual` and `prescribed_effort` with respect to parameters, (..., len(names))."""
-        parameters = self.equations.system.parameters
-        chosen = ca.vertcat(ca.SX(0, 1), *(parameters[name].symbol for name in names))
+        chosen = ca.vertcat(ca.SX(0, 1), *(self.equations.system.parameters[name].symbol for name in names))
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)
 
 

@@ -223,8 +223,7 @@ class EquilibriumSolver:
             search = {"print_level": 0, "sb": "yes", "max_iter": _ENERGY_ITERATION_LIMIT, "tol": 1e-8}
             options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "ipopt": search}
             energy = self._energy(q, np.zeros(self.step.sizes["nz"]), hold, theta)
-            program = {"x": x, "f": scale * energy, "g": residual[-m:]}
-            solver = ca.nlpsol("lowest", "ipopt", program, options)
+            solver = ca.nlpsol("lowest", "ipopt", {"x": x, "f": scale * energy, "g": residual[-m:]}, options)
         for start in self._guesses(given, None):
             found = np.array(solver(x0=start[:size], lbg=0.0, ubg=0.0)["x"]).ravel()
             if solver.stats()["success"]:

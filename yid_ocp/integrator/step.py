@@ -298,8 +298,7 @@ def checked_rollout_inputs(
             first = directions.initial_state_tangents.copy()
             first[fixed] = along[0]
             directions = replace(directions, initial_state_tangents=first)
-    values = check("theta", theta, (sizes["ntheta"],))
-    return RolloutInputs(values, begin, inputs, course, feedback, directions)
+    return RolloutInputs(check("theta", theta, (sizes["ntheta"],)), begin, inputs, course, feedback, directions)
 
 
 def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:

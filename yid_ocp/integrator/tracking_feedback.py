@@ -239,8 +239,7 @@ class EffectMomentumShift:
         width = max((len(names), *(x.shape[-1] for x in slopes if x is not None)))
         wanted = [(k, self.parameter_names.index(name)) for k, name in enumerate(names) if name in self.parameter_names]
         z, by_z = self._remembered(true, theta, wanted, width)
-        moved = by_z is not None or true.angles_sensitivity is not None
-        value, by_theta, *by_all = self._maps(moved)(
+        value, by_theta, *by_all = self._maps(by_z is not None or true.angles_sensitivity is not None)(
             *true._before_and_after, _one_before(z), z, _one_before(true.torque), theta, self._time_step
         )
         total = np.zeros((*value.shape[:2], width))

@@ -442,8 +442,7 @@ class System(ReprMixin):
                 heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
                 force += heavy * ca.dot(ca.vertcat(ca.cross(com, self.gravity), self.gravity), screw)
         if self.n_constraints:
-            slope = ca.jacobian(self.constraint_residual(kinematics), state.q[index])
-            force -= ca.dot(slope, state.constraint_force)
+            force -= ca.dot(ca.jacobian(self.constraint_residual(kinematics), state.q[index]), state.constraint_force)
         return force
 
     def gear_torque_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:

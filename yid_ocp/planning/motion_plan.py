@@ -116,8 +116,7 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
         what, where = "the start of the motion is not given", "plan.start_joint_positions"
         hint = "set it, or model.grasp: the positions then follow from the grasp"
         raise ConfigError(what, where=where, allowed="the position of every joint that moves", hint=hint)
-    by_name = dict(zip(system.parameters.names, map(float, theta), strict=True))
-    angles = grasping_joint_angles(system, by_name)
+    angles = grasping_joint_angles(system, dict(zip(system.parameters.names, map(float, theta), strict=True)))
     return start_joint_positions_as_array(system, {name: angles[name] for name in angles if name in system.prescribed})
 
 

@@ -439,8 +439,7 @@ class EpisodePredictor:
         feedback = episode.tracking_feedback
         if feedback is not None:
             by_state[:-1, feedback.state_indices] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
-        by_lam = by_multipliers if np.any(by_multipliers) else None
-        partials = (by_state, by_lam, by_effort)
+        partials = (by_state, by_multipliers if np.any(by_multipliers) else None, by_effort)
         by_inputs = self.integrator_step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
         inputs = self.corrected_inputs(episode, theta, wanted)
         start = self.initial_state_of_episode(episode, theta, offset, wanted, result.equilibrium_guess, inputs)

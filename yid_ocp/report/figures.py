@@ -224,8 +224,7 @@ def lines_over_time_figure(curve: TimePlotData) -> _Figure:
         figure["layout"]["shapes"].append(_shade("", (0, 1), (-curve.band_half_height, curve.band_half_height)))
     # the legend below takes as many rows as the screen is narrow
     below = {"orientation": "h", "y": -0.22, "yanchor": "top", "x": 0, "font": {"size": 11}}
-    title = {**_axis_title(curve.axis_title, 1), "font": {"size": 12}}
-    figure["layout"] |= {"legend": below, "annotations": [title]}
+    figure["layout"] |= {"legend": below, "annotations": [{**_axis_title(curve.axis_title, 1), "font": {"size": 12}}]}
     return figure
 
 

@@ -98,8 +98,7 @@ def _packed_script() -> str:
         file = private_cache_folder() / f"plotly-{metadata.version('plotly')}.base64"
     if file and file.is_file():
         return file.read_text(encoding="ascii")
-    small = gzip.compress(_plotly_script()[1].encode(), compresslevel=4, mtime=0)
-    packed = base64.b64encode(small).decode("ascii")
+    packed = base64.b64encode(gzip.compress(_plotly_script()[1].encode(), compresslevel=4, mtime=0)).decode("ascii")
     with contextlib.suppress(OutputError):
         if file:
             write_text(file, packed)

@@ -240,8 +240,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    unknown = f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else ""
-    yield SummaryStatement(unknown, "verdict")
+    yield SummaryStatement(f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else "", "verdict")
 
 
 def _relative(value: float | None) -> str:

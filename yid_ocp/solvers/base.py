@@ -435,8 +435,7 @@ class _MultiStartSearch:
         found = *self._status_and_message(), problem.unknown_names, result.x, covariance, estimates, finish.cost, fit
         history = tuple(entry for one in self._fits for entry in one.history)
         count, seconds = sum(one.n_evaluations for one in self._fits), time.perf_counter() - self._begun
-        at_end = finish if finish.ok else None
-        return Solution(*found, history, count, seconds, at_end, self._solver.name, problem)
+        return Solution(*found, history, count, seconds, finish if finish.ok else None, self._solver.name, problem)
 
     def _status_and_message(self) -> tuple[Status, str]:
         result, finish, solver = self._best.result, self._best.evaluation, self._solver

@@ -231,8 +231,7 @@ def _sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, sha
     """Assemble a sparse matrix from entries at distinct positions."""
     order = np.lexsort((row, column))
     start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
-    sparsity = ca.Sparsity(*shape, start.tolist(), row[order].tolist())
-    return ca.MX(sparsity, entries[order.tolist()])
+    return ca.MX(ca.Sparsity(*shape, start.tolist(), row[order].tolist()), entries[order.tolist()])
 
 
 def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:

@@ -349,8 +349,7 @@ class _Maker:
         offset = np.broadcast_to(places["torque_offset"], (steps, nu))
         per_step = [places["torque_error"][of_step.ravel()], offset]
         per_step += [places["angle_error"]] if "angle_error" in places else []
-        first = places.get("first_angle_error", np.zeros((1, 0), np.int64))[0]
-        return np.hstack(per_step), first, priors
+        return np.hstack(per_step), places.get("first_angle_error", np.zeros((1, 0), np.int64))[0], priors
 
     def _begun(self, episode: Episode, places: _Places) -> tuple[MappedFunctionTerm, list[ResidualTerm]]:
         """Constraints of the first state, and the prior of its free part."""
@@ -390,8 +389,7 @@ class _Maker:
             at = np.concatenate([places.free, places.rest, places.state[0], *wrong])[None, :]
             data, shared = np.concatenate([given[:, 0], places.torque[:, 0]])[None, :], places.theta
         labels = (*(f"rest.{k}" for k in range(balance.numel())), *(f"start.{rows[k]}" for k in fixed))
-        value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
-        function = LocalVariableFunction("start", inputs, value)
+        function = LocalVariableFunction("start", inputs, ca.densify(ca.vertcat(balance, (first - state)[fixed])))
         term = MappedFunctionTerm(f"start[{name}]", labels, function, at, data, shared)
         if not loose:
             return term, []

@@ -173,8 +173,7 @@ def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     system, names = found.simulator.step.system, found.joint_names
     if (where := found.point_trajectories.get(findings.result.get("point"))) is not None:
         lines, tolerance = _lines(found.t, "xyz", 1e3 * (where - found.target_position)), findings.result["tolerance"]
-        curve = TimePlotData("from the place [mm]", lines, band_half_height=1e3 * tolerance)
-        yield "", lines_over_time_figure(curve)
+        yield "", lines_over_time_figure(TimePlotData("from the place [mm]", lines, band_half_height=1e3 * tolerance))
     for words, channel, values in (
         ("joints, from the start", "position", found.joint_positions - found.joint_positions[0]),
         ("velocity", "velocity", found.joint_velocities),
