@@ -315,15 +315,15 @@ def test_a_place_that_does_as_well_is_told():
         intervals.append(replace(one, **changed))
     twice = replace(model, intervals=tuple(intervals), unknown_groups=(HERE, LIKE, OTHER))
     variance = {HERE: 50.0, LIKE: 0.0, OTHER: 0.0}
-    state = smoother._run([twice], variance)
-    drop, found = smoother._alternatives([twice], variance, state, Thresholds())
+    none, state = (smoother._run([twice], own) for own in (dict.fromkeys(variance, 0.0), variance))
+    drop, found = smoother._alternatives([twice], variance, none, state, Thresholds())
     assert drop[HERE] > 100
     assert found == {HERE: (LIKE,)}
     strict, better = (
         Thresholds(min_tied_evidence_ratio=1.0, min_log_bayes_factor=1e-9),
         replace(state, log_evidence=1e6),
     )
-    assert LIKE not in smoother._alternatives([twice], variance, better, strict)[1][HERE]
+    assert LIKE not in smoother._alternatives([twice], variance, none, better, strict)[1][HERE]
 
 
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -109,7 +109,8 @@ class _Update(NamedTuple):
     white: Array
 
 
-class _Filtered(NamedTuple):
+@dataclass(frozen=True)
+class _Filtered:
     """Filter of one recording at given variances, with its updates if they were kept."""
 
     model: LinearResidualModel
@@ -117,6 +118,22 @@ class _Filtered(NamedTuple):
     products: Array  # V' S^-1 V, shape (1 + ntheta, 1 + ntheta)
     log_determinant: float  # infinite if large variances make the filter ill-conditioned
     updates: Sequence[_Update]
+
+    @cached_property
+    def moving(self) -> IntArray:
+        """Indices of the states and of the unknowns that have a variance."""
+        ns = len(self.model.initial_state_std)
+        return np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(self.updates[0].p)[ns:] > 0)])
+
+    @cached_property
+    def error_steps(self) -> Sequence[tuple[Array, Array, Array, FilterStateTransition]]:
+        """Of each interval: whitened observation; the same of `moving`, the gain and the transition of their error."""
+        found, kept, ns = [], self.moving, len(self.model.initial_state_std)
+        for step in (update.step for update in self.updates):
+            move, shaped = step.transition, step.whitening @ step.observation
+            follow = FilterStateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
+            found.append((shaped, shaped[:, kept], step.projected_covariance[:, kept].T.copy(), follow))
+        return found
 
 
 class _Smoothed(NamedTuple):
@@ -193,6 +210,14 @@ class _State:
     shift: Array
     spread: Array
     log_evidence: float
+    # largest log evidence with one more group, and the group's variance
+    larger: dict[SmoothedUnknownGroup, tuple[float, float]] = field(default_factory=dict)
+
+    def largest_evidences(self, sources: _Groups) -> list[tuple[float, float]]:
+        """`_largest_evidence` of several groups, each on top of these variances."""
+        new = [source for source in sources if source not in self.larger]
+        self.larger.update(zip(new, map_in_threads(partial(_largest_evidence, self.filtered), new), strict=True))
+        return [self.larger[source] for source in sources]
 
 
 def _run(models: _Models, variance: _Variances) -> _State:
@@ -258,7 +283,7 @@ def _selected(
             promising = promising[:_LATER_GROUP_TRIALS]
         if not promising:
             break
-        reached = zip(map_in_threads(partial(_largest_evidence, state.filtered), promising), promising, strict=True)
+        reached = zip(state.largest_evidences(promising), promising, strict=True)
         (evidence, size), source = max(reached, key=lambda pair: pair[0][0])
         if not evidence > state.log_evidence + limits.min_log_bayes_factor:
             break
@@ -269,25 +294,22 @@ def _selected(
 def _responses(base: _Filtered, chosen: IntArray) -> Array:
     """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, J u)."""
     model, updates = base.model, base.updates
-    ns, count, u = len(model.initial_state_std), len(updates), len(chosen)
-    kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(updates[0].p)[ns:] > 0)])
+    ns, count, u, first = len(model.initial_state_std), len(updates), len(chosen), 0
     # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown;
     # unknowns without variance stay at zero, and so does all before the disturbance
-    behind, unknown = np.zeros((len(kept), count * u)), np.zeros((count, 1))
+    behind, unknown = np.zeros((len(base.moving), count * u)), np.zeros((count, 1))
     behind[:ns, :u] = model.initial_state_jacobian[:, chosen]
-    found = []
-    for k, update in enumerate(updates):
+    found = np.zeros((sum(len(update.white) for update in updates), count * u))
+    for k, (shaped, observation, gain, follow) in enumerate(base.error_steps):
         unknown[:k] *= model.interval_correlation
         unknown[k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         begun, left = unknown[: k + 1], behind[:, : (k + 1) * u]
-        shaped, move = update.step.whitening @ update.step.observation, update.step.transition
-        rows = shaped[:, kept] @ left
-        rows += (shaped[:, None, ns + chosen] * begun).reshape(rows.shape)
-        found.append(np.pad(rows, ((0, 0), (0, (count - k - 1) * u))))
-        follow = FilterStateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
-        left[:] = follow.propagate_state(left - update.step.projected_covariance[:, kept].T @ rows)
-        left[:ns] += (move.state_rows[:, None, ns + chosen] * begun).reshape(left[:ns].shape)
-    return np.vstack(found)
+        rows, first = found[first : first + len(shaped), : left.shape[1]], first + len(shaped)
+        rows[:] = observation @ left + (shaped[:, None, ns + chosen] * begun).reshape(rows.shape)
+        left[:] = follow.propagate_state(left - gain @ rows)
+        drive = updates[k].step.transition.state_rows[:, None, ns + chosen]
+        left[:ns] += (drive * begun).reshape(ns, -1)
+    return found
 
 
 def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) -> tuple[float, float]:
@@ -340,7 +362,7 @@ def select_and_smooth_unknowns(
         variance, state = max(found.values(), key=lambda entry: entry[1].log_evidence)
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
-        drop, alternatives = _alternatives(models, variance, state, limits)
+        drop, alternatives = _alternatives(models, variance, nothing, state, limits)
         traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
         # the variance of a group's scores is the mean rise of r'r by unknowns of the reference size
         scores = {source: max(score, 1e-300) for source, (_, score) in _scores(models, nothing).items()}
@@ -404,20 +426,20 @@ def _explained(models: _Models, variance: _Variances, plain: _State, state: _Sta
 
 
 def _alternatives(
-    models: _Models, variance: _Variances, state: _State, limits: SmootherOptions
+    models: _Models, variance: _Variances, nothing: _State, state: _State, limits: SmootherOptions
 ) -> tuple[_Variances, dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
-    """Fall of the log evidence without each group, and the groups that could replace it."""
+    """Fall of the log evidence without each group, and the groups that could replace it; `nothing` has no group."""
     drop, found = dict.fromkeys(variance, 0.0), {}
     for source in [s for s, v in variance.items() if v]:
         less = variance | {source: 0.0}
-        without = _run(models, less)
+        without = _run(models, less) if any(less.values()) else nothing
         drop[source] = max(state.log_evidence - without.log_evidence, 0.0)
         scores = _scores(models, without)
         # the score at zero variance is a poor predictor here: all groups are tried
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         loss = (1 - limits.min_tied_evidence_ratio) * drop[source]
         least = state.log_evidence - max(limits.min_log_bayes_factor, loss)
-        reached = zip(asked, map_in_threads(partial(_largest_evidence, without.filtered), asked), strict=True)
+        reached = zip(asked, without.largest_evidences(asked), strict=True)
         found[source] = tuple(other for other, (reach, _) in reached if reach >= least)
     return drop, found
 
