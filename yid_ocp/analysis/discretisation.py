@@ -371,29 +371,23 @@ def min_grasp_gaps_at_posture(
     with CASADI_LOCK:
         (q, kinematics), inner = system.symbolic_kinematics, system.effect_internal_coordinate_symbols.values()
         phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps))
+        # a small stiffness prevents the search from winding up the object
+        rows = ca.densify(ca.vertcat(phi, 1e-4 * q[free]))
         symbols = [q, system.parameters.symbols, ca.vertcat(*inner)]
-        function = ca.Function("phi", symbols, [phi, ca.jacobian(phi, q)[:, free]])
+        function = ca.Function("phi", symbols, [rows, ca.densify(ca.jacobian(rows, q)[:, free])])
 
-    def phi_at(x: Array, part: int) -> Array:
+    def at(x: Array, part: int) -> Array:
         full[free] = x
-        return np.array(ca.densify(function(full, theta, 0)[part]))
-
-    # a small stiffness prevents the search from winding up the object
-    def gaps(x: Array) -> Array:
-        return np.concatenate([phi_at(x, 0).ravel(), 1e-4 * x])
-
-    def slopes(x: Array) -> Array:
-        return np.vstack([phi_at(x, 1), 1e-4 * np.eye(len(free))])
+        return np.array(function(full, theta, 0)[part])
 
     best, starts = np.full(phi.numel(), math.inf), [] if near is None else [near[free]]
     starts += [np.random.default_rng(seed).normal(scale=0.1, size=len(free)) for seed in range(4)]
     for start in starts:
-        found = scipy.optimize.least_squares(gaps, start, slopes, max_nfev=100)
-        best = min(best, phi_at(found.x, 0).ravel(), key=np.linalg.norm)
+        found = scipy.optimize.least_squares(lambda x: at(x, 0).ravel(), start, lambda x: at(x, 1), max_nfev=100)
+        best = min(best, found.fun[: phi.numel()], key=np.linalg.norm)
         if np.linalg.norm(best) < 1e-3:
             break
-    distances = np.linalg.norm(best.reshape(-1, 3), axis=1)
-    return {grasp.name: float(distance) for grasp, distance in zip(system.grasps, distances, strict=True)}
+    return {g.name: float(np.linalg.norm(gap)) for g, gap in zip(system.grasps, best.reshape(-1, 3), strict=True)}
 
 
 # Number of nodes at which the step is linearised: in total, and at least per motion.

@@ -116,11 +116,10 @@ class RecordedJointsModel:
 
     @cached_property
     def _effort(self) -> ca.Function:
-        full = [ca.SX.sym(name, self.system.n_coordinates) for name in ("q", "v", "a")]
+        q, kinematics = self.system.symbolic_kinematics
+        full = [q, *(ca.SX.sym(name, self.system.n_coordinates) for name in "va")]
         known = [ca.SX.sym(name, len(self.joint_names)) for name in ("q", "v", "a")]
-        rigid = lagrangian_first_derivatives(
-            forward_kinematics(self.system.mechanism, full[0]), full[1], self.system.gravity
-        )
+        rigid = lagrangian_first_derivatives(kinematics, full[1], self.system.gravity)
         by_v = rigid.lagrangian_by_v
         effort = ca.jtimes(by_v, full[0], full[1]) + ca.jtimes(by_v, full[1], full[2]) - rigid.lagrangian_by_q
         placed = ca.vertcat(*(self._placed(x) for x in known))

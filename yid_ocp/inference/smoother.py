@@ -120,15 +120,10 @@ class _Filtered:
     updates: Sequence[_Update]
 
     @cached_property
-    def moving(self) -> IntArray:
-        """Indices of the states and of the unknowns that have a variance."""
-        ns = len(self.model.initial_state_std)
-        return np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(self.updates[0].p)[ns:] > 0)])
-
-    @cached_property
     def error_steps(self) -> Sequence[tuple[Array, Array, Array, FilterStateTransition]]:
-        """Of each interval: whitened observation; the same of `moving`, the gain and the transition of their error."""
-        found, kept, ns = [], self.moving, len(self.model.initial_state_std)
+        """Of each interval: whitened observation; that of states and unknowns with variance, their gain and motion."""
+        found, ns = [], len(self.model.initial_state_std)
+        kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(self.updates[0].p)[ns:] > 0)])
         for step in (update.step for update in self.updates):
             move, shaped = step.transition, step.whitening @ step.observation
             follow = FilterStateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
@@ -297,7 +292,7 @@ def _responses(base: _Filtered, chosen: IntArray) -> Array:
     ns, count, u, first = len(model.initial_state_std), len(updates), len(chosen), 0
     # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown;
     # unknowns without variance stay at zero, and so does all before the disturbance
-    behind, unknown = np.zeros((len(base.moving), count * u)), np.zeros((count, 1))
+    behind, unknown = np.zeros((len(base.error_steps[0][2]), count * u)), np.zeros((count, 1))
     behind[:ns, :u] = model.initial_state_jacobian[:, chosen]
     found = np.zeros((sum(len(update.white) for update in updates), count * u))
     for k, (shaped, observation, gain, follow) in enumerate(base.error_steps):
@@ -339,10 +334,7 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
 
 
 def select_and_smooth_unknowns(
-    problem: EstimationProblem,
-    x: Array,
-    evaluation: Evaluation,
-    limits: SmootherOptions = DEFAULT_SMOOTHER_OPTIONS,
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: SmootherOptions = DEFAULT_SMOOTHER_OPTIONS
 ) -> SmoothedUnknownsResult:
     """Select groups of unknown forces, offsets and biases by log evidence at a fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread

@@ -456,12 +456,7 @@ class EpisodePredictor:
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 
     def _pull(
-        self,
-        samples: SensorMeasurements,
-        pull: Array,
-        values: NodeStateValues,
-        theta: Array,
-        pulled: dict[str, Array],
+        self, samples: SensorMeasurements, pull: Array, values: NodeStateValues, theta: Array, pulled: dict[str, Array]
     ) -> Array:
         """Add the adjoint of one sensor's samples to `pulled`. Returns the direct derivative by the parameters."""
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameter_names

@@ -188,9 +188,7 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
         return {}
     names = (*system.driven, *system.prescribed)
     posture = dict(zip(names, map(float, episode.initial_known_coordinates), strict=True))
-    theta = problem.theta.copy()
-    for name, value in episode.known_parameters.items():
-        theta[system.parameters.index(name)] = value
+    theta = problem.predictor.theta_with_episode_values(episode, problem.theta)
     start = problem.initial_state_of_episode(episode, theta)
     near = None if start.failure_message else start.state[: system.n_coordinates]
     return min_grasp_gaps_at_posture(system, posture, theta, near)
