@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.discrete import equilibrium_equations
+from yid_ocp.integrator.discrete import RIGID_HOLD_STIFFNESS, equilibrium_equations
 from yid_ocp.integrator.statics import (
-    _HOLD_STIFFNESS,
+    _HOLD_STIFFNESS_WITH_COMMAND,
     _HOLD_STIFFNESS_WITH_TORQUE,
     EquilibriumSolver,
     steady_effect_internal_coordinates,
@@ -16,7 +16,7 @@ from yid_ocp.integrator.statics import (
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
-from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, RobotJointSpring, ServoModelOptions
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
@@ -87,7 +87,7 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
         np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=1e-7, atol=1e-8, err_msg=name)
     if not fast.is_converged:
         return
-    stiffness = _HOLD_STIFFNESS if torque is None else _HOLD_STIFFNESS_WITH_TORQUE
+    stiffness = RIGID_HOLD_STIFFNESS if torque is None else _HOLD_STIFFNESS_WITH_TORQUE
     held = np.zeros(0) if torque is None else torque
     expected = derivatives(steps[1], fast, given, held, stiffness, case.theta)
     for rest in (fast, slow):
@@ -97,11 +97,25 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
         np.testing.assert_allclose(rest.state_by_torque, by_torque, rtol=1e-12)
 
 
+def test_the_equations_of_rest_hold_a_joint_whose_motor_is_off(urdf_folder):
+    robot, servos = read_urdf(urdf_folder / "double_pendulum.urdf"), ServoModelOptions("held", False)
+    step = compile_step(System.build(robot, driven=robot.joint_names, servos=servos), 0.01, use_compiler=False)
+    theta, names = step.system.parameters.vector(), step.system.parameters.names
+    given, held = np.array([0.6, -0.3]), np.array([MOTOR_OFF_COMMAND, 0.2])
+    rest, e = EquilibriumSolver(step).solve(given, theta, held, None, names), equilibrium_equations(step.equations)
+    at = rest.state[:2], given, held, _HOLD_STIFFNESS_WITH_COMMAND, theta, step.time_step
+    residual, state = (np.array(x).ravel() for x in ca.Function("rest", e.inputs, [e.residual, e.state])(*at))
+    np.testing.assert_allclose(residual, 0.0, atol=1e-8)
+    np.testing.assert_allclose(state, rest.state, atol=1e-12)
+    found = np.hstack([rest.state_by_theta, rest.state_by_known_coordinates])
+    np.testing.assert_allclose(found, derivatives(step, rest, given, held, at[3], theta), rtol=1e-7, atol=1e-8)
+
+
 def test_a_measured_torque_that_fits_takes_the_load_off_the_holding_spring(arm):
     theta = arm.step.system.parameters.vector()
     elbow = arm.step.system.mechanism.joint_index("elbow")
     rest = arm.solve([0.4], theta)
-    given = rest.holding_torque[0] / _HOLD_STIFFNESS
+    given = rest.holding_torque[0] / RIGID_HOLD_STIFFNESS
     assert abs(given) > 1e-6
     assert rest.state[elbow] == pytest.approx(0.4 - given, abs=1e-12)
     again = arm.solve([0.4], theta, torque=rest.holding_torque)

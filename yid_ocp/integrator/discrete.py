@@ -36,8 +36,11 @@ from yid_ocp.model.kinematics import (
     lagrangian_second_derivatives,
 )
 from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import ForceWithDerivativeFactors, Grasp, MidpointStateSymbols, System
 
+RIGID_HOLD_STIFFNESS = 1e5
+"""Stiffness of a spring that holds a joint at its measured angle with less deflection than encoder noise [N m/rad]."""
 ForceSplit = Literal["symmetric", "left"]
 ConstraintForcePlacement = Literal["node", "midpoint"]
 
@@ -401,14 +404,16 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
     z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
     held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")
     q = ca.SX(ca.DM.zeros(system.n_coordinates))
-    for indices, values in ((fixed, given[nu:]), (free, sought)):
-        for row, index in enumerate(indices):
-            q[index] = values[row]
+    q[fixed], q[free] = given[nu:], sought
     u = held + stiffness * (given[:nu] - q[driven]) if nu else held
     old, now = [e.q0, e.q1, e.z0, e.z1, e.lam, e.u], [q, q, z, z, h * force, u]
     rows = ca.substitute([e.p1, e.momentum_balance, e.internal_residual_at_rest, e.constraint_residual], old, now)
     p, balance, internal, constraint = (ca.densify(x) for x in rows)
     balance = ca.substitute(balance, e.p0, p) / h
+    if system.servos:  # a spring holds a joint whose motor is off until the motion begins
+        hand = ca.if_else(held >= MOTOR_OFF_COMMAND / 2, RIGID_HOLD_STIFFNESS, 0) * (given[:nu] - q[driven])
+        balance[driven] += hand
+        p[driven] += h / 2 * hand
     inputs = [ca.vertcat(sought, z, force), given, held, stiffness, e.theta, e.time_step]
     residual = ca.vertcat(balance[free, 0], internal, constraint)
     return EquilibriumEquations(inputs, residual, ca.densify(ca.vertcat(q, p, z)))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.integrator.codegen import nonzero_indices
-from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
+from yid_ocp.integrator.discrete import RIGID_HOLD_STIFFNESS, EquilibriumEquations, equilibrium_equations
 from yid_ocp.integrator.step import Step, float_array_with_checked_shape
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import System
@@ -38,8 +38,7 @@ class Equilibrium:
 
 # A spring [N m/rad] holds each driven joint at its measured angle, so that an equilibrium exists even if encoder noise
 # stretches the object slightly beyond its reach. With a measured torque, the stiffness is the ratio of torque error to
-# encoder error. Without one, the spring is stiff: its deflection is below the encoder noise.
-_HOLD_STIFFNESS = 1e5
+# encoder error. Without one, the spring is stiff (`RIGID_HOLD_STIFFNESS`).
 _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 
 # A servo holds its joint at a known command. The value is not zero, so that derivatives with respect to the command
@@ -113,7 +112,7 @@ class EquilibriumSolver:
         nu, nz, m = step.sizes["nu"], step.sizes["nz"], step.sizes["m"]
         held = np.zeros(nu) if torque is None else float_array_with_checked_shape("torque", torque, (nu,))
         is_motor_off = bool(system.servos) & (held >= MOTOR_OFF_COMMAND / 2)
-        hold = _Hold(given, held, stiffness, np.where(is_motor_off, _HOLD_STIFFNESS, 0.0))
+        hold = _Hold(given, held, stiffness, np.where(is_motor_off, RIGID_HOLD_STIFFNESS, 0.0))
         count, h = len(self.free_coordinates) + nz, step.clock_scaled_time_step(theta)
         sought = b"" if guess is not None else np.concatenate([given, theta, held, [torque is None]]).tobytes()
 
@@ -326,7 +325,7 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
 def measured_angle_hold_stiffness(system: System, known: bool) -> float:
     """Stiffness of springs at measured angles [N m/rad]. `known` states whether torques or servo commands are given."""
     if not known:
-        return _HOLD_STIFFNESS
+        return RIGID_HOLD_STIFFNESS
     return _HOLD_STIFFNESS_WITH_COMMAND if system.servos else _HOLD_STIFFNESS_WITH_TORQUE
 
 

@@ -105,10 +105,8 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
     if found and silent:
         what = "the recording has no proportional gain of its servos, but others have it"
         hint = 'write it in all recordings, or set parameters: {"*.servo_gain_factor": {initial: GAIN}}'
-        allowed = "the gain in all recordings, or in none"
-        raise DataError(
-            what, allowed=allowed, where=f"recording '{silent[0]}': joints, attribute proportional_gain", hint=hint
-        )
+        where = f"recording '{silent[0]}': joints, attribute proportional_gain"
+        raise DataError(what, where=where, allowed="the gain in all recordings, or in none", hint=hint)
     return found
 
 

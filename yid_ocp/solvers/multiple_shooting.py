@@ -362,10 +362,8 @@ class _ShootingIntervals:
         for episode in problem.episodes:
             steps = episode.grid.steps
             if steps < node_interval:
-                message = (
-                    f"the recording '{episode.name}' has {steps} steps, fewer than a node interval of {node_interval}"
-                )
-                raise SolverError(message, where="solver.node_interval", allowed=f"1 to {steps}")
+                what = f"recording '{episode.name}' has {steps} steps, fewer than a node interval of {node_interval}"
+                raise SolverError(what, where="solver.node_interval", allowed=f"1 to {steps}")
             if any(s.sensor.effort_joints for s in episode.measurements):
                 message = "multiple shooting without condensing cannot use measured efforts of prescribed joints"
                 where, allowed = f"recording '{episode.name}': joints/effort", "measurements that depend on node states"
