@@ -139,6 +139,8 @@ def test_loads_are_smoothed_and_interpolated():
     found = smoothed_joint_efforts(made, ("b", "a"), grid, LowPassFilter(5.0))
     np.testing.assert_allclose(found[:, 0], 3 * grid.node_times, atol=1e-3)
     np.testing.assert_allclose(found[:, 1], 1.0, atol=1e-9)
+    later = smoothed_joint_efforts(made.with_effort_sampling_kind("mean"), ("b", "a"), grid, LowPassFilter(5.0))
+    np.testing.assert_allclose(later[1:, 0], found[1:, 0] - 3 * np.diff(t)[0] / 2, atol=1e-3)
     for without in (recording(joints(["a"], t, np.zeros((200, 1)))), pointed()):
         with pytest.raises(DataError, match="elastic gears of the model need joint efforts"):
             smoothed_joint_efforts(without, ("a",), grid, PLAIN)

@@ -188,7 +188,9 @@ def smoothed_joint_efforts(
         where, allowed = f"recording '{recording.name}': joints/effort", "the effort of every joint"
         raise DataError(what, where=where, allowed=allowed, hint="leave series_elasticity and backlash out")
     effort = low_pass(joints.t, joints.effort[:, recorded_joint_column_indices(joints, names, recording.name)])
-    return np.stack([np.interp(grid.node_times, joints.t, column) for column in effort.T], axis=1)
+    # the mean of an interval belongs to its centre
+    late = 0.0 if joints.effort_sampling_kind_or_default == "sample" else median_sample_period(joints.t) / 2
+    return np.stack([np.interp(grid.node_times, joints.t + late, column) for column in effort.T], axis=1)
 
 
 def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
