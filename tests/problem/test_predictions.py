@@ -77,6 +77,15 @@ def test_simulated_joints_are_read_with_the_errors_of_the_effects(urdf_folder, h
     assert costs[0] < 1e-3 * costs[1]
 
 
+def test_points_outside_the_duration_are_not_simulated(urdf_folder):
+    step = pendulum_step(urdf_folder)
+    recorded = taken(step, 1)
+    arm, camera = recorded.points
+    late = replace(recorded, points=(arm, replace(camera, t=camera.t + 10.0)))
+    made = EstimationProblem(step, [late], ["elbow.damping"]).simulate_synthetic_recording(seed=1)
+    assert [group.name for group in made.points] == [arm.name]
+
+
 def test_simulated_joints_without_efforts_may_have_stated_noise(urdf_folder):
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
     options = ProblemOptions(path_cutoff=20.0, sensors={"joints.effort": SensorOptions(std=0.3)})

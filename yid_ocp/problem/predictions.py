@@ -182,7 +182,7 @@ def recording_from_prediction(
     system, source = predictor.system, episode.recording
     groups = []
     for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
-        if samples.sensor.point_names:
+        if samples.sensor.point_names and len(samples.value):
             t = episode.grid.start_time + predictor.integrator_step.time_step * (samples.node + samples.fraction)
             shape = (len(t), len(samples.sensor.point_names), 3)
             std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
