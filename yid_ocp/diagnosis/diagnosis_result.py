@@ -394,7 +394,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
     mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
-    said = "What remains on held-out motions is noise."
+    said = "What remains on held-out motions is within noise and the uncertainty of the parameters."
     if result.remaining_test.p_value < result.thresholds.significance_level:
         said = f"What remains on held-out motions is model error: {', '.join([*worst.values(), *mostly])}."
     moved = [
