@@ -116,7 +116,11 @@ class RecordedJointsModel:
 
     @cached_property
     def _effort(self) -> ca.Function:
-        q, kinematics = self.system.symbolic_kinematics
+        (q, kinematics), tree, count = self.system.symbolic_kinematics, self.system.mechanism, len(self.joint_names)
+        if self._has_no_unknown_descendants and self.system_configuration_indices == tuple(range(count)):
+            frames = {name: frame for name, frame in tree.frames.items() if frame.joint_index < count}
+            moved = replace(tree, joints=tree.joints[:count], frames=frames, link_chains={})
+            kinematics = replace(kinematics, mechanism=moved)  # without what these joints do not move
         full = [q, *(ca.SX.sym(name, self.system.n_coordinates) for name in "va")]
         known = [ca.SX.sym(name, len(self.joint_names)) for name in ("q", "v", "a")]
         rigid = lagrangian_first_derivatives(kinematics, full[1], self.system.gravity)

@@ -249,7 +249,7 @@ def _happened(
         return NO_EVENTS, None
     test = _null_test(judged, residual.residual, len(fit.values), limits)
     is_flagged = any(window.is_flagged for window in test.windows)
-    evaluation = own.evaluate(x, is_flagged, guesses)
+    evaluation = residual if judged is own and not is_flagged else own.evaluate(x, is_flagged, guesses)
     if not evaluation.ok:
         return NO_EVENTS, None
     smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits) if is_flagged else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import math
 import site
@@ -58,7 +59,7 @@ def _example_robot_urdf(robot: str) -> Path:
     if folder is None:
         what, hint = "the package example-robot-data is not installed", "pip install example-robot-data"
         raise ModelError(what, where=f"package:{robot}", allowed="package:NAME if it is installed", hint=hint)
-    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.urdf"))}
+    files = _urdf_files(folder)
     by_stem: dict[str, list[str]] = {}
     for name, path in files.items():
         by_stem.setdefault(path.stem.lower(), []).append(name)
@@ -76,6 +77,12 @@ def _example_robot_urdf(robot: str) -> Path:
     what, stems = f"example-robot-data has no robot '{robot}'", sorted({path.stem for path in files.values()})
     said = unknown_name_error_arguments(robot, stems, "write package:NAME, such as package:xarm7")
     raise ModelError(what, where=where, **said)
+
+
+@functools.cache
+def _urdf_files(folder: Path) -> Mapping[str, Path]:
+    """URDF files of a folder by their paths in it. A run asks for its robot five times."""
+    return {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.urdf"))}
 
 
 def urdf_path_from_robot_name(robot: str | Path) -> Path:
