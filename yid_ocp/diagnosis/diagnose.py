@@ -141,7 +141,7 @@ def _examined(
     excess = _excess_of(residual)
     # neither events nor candidates are sought while the step makes most of the gap
     is_poor = excess >= limits.min_excess_chi2_per_dof * len(residual)
-    tried, fall = nominal, _fall_at_half_time_step(search, nominal) if is_poor else -math.inf
+    tried, fall = (nominal, _fall_at_half_time_step(search, nominal)) if is_poor else (None, -math.inf)
     if fall > excess / 2:
         return _examined(*_at_half_time_step(search, nominal, fall), known)
     search, nominal, cuts = _followed(search, nominal, known)
@@ -161,7 +161,7 @@ def _examined(
     _end_stage(search, "screening")
     if evidence.has_gap(limits) and evidence.are_data_sufficient(limits):
         gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
-        if not is_poor or tried is not nominal:
+        if tried is not nominal:
             fall = _fall_at_half_time_step(search, nominal, events)
         if fall > gap / 2:
             return _examined(*_at_half_time_step(search, nominal, fall), cuts)

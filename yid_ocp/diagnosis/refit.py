@@ -117,19 +117,15 @@ class RefitStore(Protocol):
 
     def stored_refit(self, name: str) -> StoredFit | None:
         """The refit stored under a name, or None."""
+        return None
 
     def put(self, name: str, refitted: StoredFit) -> None:
         """Store a refit under a name."""
+        return None
 
 
-class _NoStore:
-    """Keeps nothing."""
-
-    def stored_refit(self, name: str) -> None:
-        """There is none."""
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Keep nothing."""
+class _NoStore(RefitStore):
+    """Keeps nothing: the interface's own methods."""
 
 
 NO_REFIT_STORE: RefitStore = _NoStore()
@@ -244,7 +240,7 @@ def refit_with_effects(
             return _model(stored, effects, placed, at_stored)
     runs = [_attempt(problem, effects, start)]
     runs += [_attempt(problem, effects, other) for other in _other_starts(problem, effects, start, runs[0], limits)]
-    own, outcome, finish = min(runs, key=_cost)
+    own, outcome, finish = min(runs, key=lambda run: run[-1].cost)
     if not finish.ok:
         return None
     values = own.named_values(outcome.x)
@@ -298,10 +294,6 @@ def _other_starts(
     return [{**start, **values} for values in moved if values is not None]
 
 
-def _cost(attempt: _Attempt) -> float:
-    return attempt[-1].cost
-
-
 def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:
     """One run from one start; its evaluation is not `ok` if the model cannot be rolled out."""
     neutral = neutral_effect_parameter_values(effects)
@@ -328,7 +320,7 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
 
     # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
     again = _seen(problem, effects, REFIT_SOLVER.minimize_cost(moving, outcome.x, None, evaluate))
-    return min(found, again, key=_cost)
+    return min(found, again, key=lambda run: run[-1].cost)
 
 
 def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt:

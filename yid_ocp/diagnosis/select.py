@@ -21,9 +21,9 @@ from yid_ocp.errors import SolverError
 
 _MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not noise
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
-_RESPONSE_RTOL = 0.05  # relative error of a model's response to an effect: links and time step are finite
-_MIN_CHI2_FRACTION = _RESPONSE_RTOL**2  # of what effects explain; such an error leaves it, so less proves nothing
-_RESPONSE_REST = 4e-4  # of the whole gap; so little can be an error of the response, and no further effect is sought
+# of what effects explain: a model's response to them errs by 5 %, as links and time step are finite, and leaves this
+_MIN_CHI2_FRACTION = 0.05**2
+_MIN_REST_FRACTION = 4e-4  # of the whole gap: so little can be an error of the response to the effects found
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
@@ -83,7 +83,7 @@ def leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
 
 def _leaves_little(nominal: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether a fit leaves so little of the held-out gap that errors in the response to its effects can be the rest."""
-    most = max(limits.min_excess_chi2_per_dof, _RESPONSE_REST * nominal.held_out_loss.excess_chi2_per_sample)
+    most = max(limits.min_excess_chi2_per_dof, _MIN_REST_FRACTION * nominal.held_out_loss.excess_chi2_per_sample)
     return fit.held_out_loss.excess_chi2_per_sample < most
 
 
