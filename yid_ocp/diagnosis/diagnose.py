@@ -286,7 +286,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):
-        search.progress.begin_stage("locating the gap", 1.0, 8.5)
+        search.progress.begin_stage("locating the gap", 1.0, 2.0)
         # without events, the smoother already ran on all fitted data
         smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed, limits.gap_window_z)

@@ -199,6 +199,13 @@ def _beside(effects: Sequence[EffectBase], fit: RefitStatistics) -> list[EffectB
     return [effect for effect in fit.effects if effect.label not in known]
 
 
+def _plausible_beside(
+    base: Sequence[EffectBase], fits: Sequence[RefitStatistics], limits: Thresholds
+) -> list[RefitStatistics]:
+    """Fits whose effects beside `base` are plausible; others would correct errors of the effects in `base`."""
+    return [fit for fit in fits if all(_is_plausible(effect, fit, limits) for effect in _beside(base, fit))]
+
+
 # -- several effects --------------------------------------------------------------------------------------------------
 
 _Start = tuple[tuple[EffectBase, ...], Mapping[str, float]]
@@ -260,9 +267,7 @@ def select_effects(
         if len(base) == 1:
             pairs = _pairs_to_refit(search, alone, base[0])
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
-        # an effect of implausible size would correct errors of earlier effects
-        fits = [fit for fit in fits if not base or all(_is_plausible(e, fit, limits) for e in _beside(base, fit))]
-        near = _near_best_models(nominal, fits, limits)
+        near = _near_best_models(nominal, _plausible_beside(base, fits, limits) if base else fits, limits)
         first = first or sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
         better = next((fit for fit, _ in near if _is_needed(current, fit, limits)), None)
         if better is None:
@@ -346,7 +351,7 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     tried = [pair for pair in best if pair[0][0].label != label]
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
-    near = _near_best_models(nominal, [own, *(f for f in others if _is_plausible(f.effects[-1], f, limits))], limits)
+    near = _near_best_models(nominal, [own, *_plausible_beside(rest, others, limits)], limits)
     better = next((fit for fit, _ in near if _is_needed(without, fit, limits)), own)
     found = chosen.replaced(better, [(fit.effects[-1], distance) for fit, distance in near])
     if better is own:
