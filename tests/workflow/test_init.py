@@ -358,7 +358,7 @@ def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsy
 
 def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
     tree = ("--object", "tree", "--branch", "up=0.5,0.05,0.004", "--branch", "side=0.3,0.03,0.004,0,1.57,0")
-    run = proposed(moved(SHORT, parts=(0.4, 1.0)), *tree)
+    run = proposed(moved(SHORT, parts=(0.4, 1.0, np.nan)), *tree)  # the third was never seen
     assert run.sensors["points"].frame_by_recorded_name == {"m1": "up:40%", "m2": "w_up"}
     assert {"w_up", "w_side", "up:40%"} == set(build_system(run).point_frames)
 

@@ -192,7 +192,7 @@ def quantization_step(values: Array) -> float:
     """Estimate a channel's quantization step from the gaps between sorted values. Zero if it is not quantized."""
     levels = np.unique(values)
     apart = np.diff(levels)
-    step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
+    step = float(np.min(apart[apart > 1e-9 * np.sum(apart)], initial=np.inf))
     if not math.isfinite(step):
         return 0.0
     count = apart / step

@@ -117,7 +117,7 @@ class _CalibratedModel:
         effects = tuple(effect for effect in run.model.effects if f"{effect.kind}@{effect.location}" in kept)
         # names of parameters start with that of their effect
         names = [n for n in self.parameter_values if "@" not in n or n.rpartition(".")[0] in kept]
-        parameters = {key: said for key, said in run.parameters.items() if fnmatch.filter(names, key)}
+        parameters = {key: said for key, said in run.parameters.items() if key in names or fnmatch.filter(names, key)}
         return build_system(replace(run, model=replace(run.model, effects=effects), parameters=parameters))
 
     def values_for(self, system: System) -> dict[str, float]:

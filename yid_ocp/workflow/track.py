@@ -203,6 +203,10 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
+    if not system.driven:
+        what, allowed = "a virtual experiment drives joints, but the model drives none", "a model with driven joints"
+        hint = "set track.frames_path to frames of a camera, or model.arms.mode: driven"
+        raise run.config_error(what, "track", "virtual_frames", allowed=allowed, hint=hint)
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
     for name in settings.gripper_start_from_object_end:
         if name not in grasps:
