@@ -26,13 +26,8 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
         "\n"
         "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
     )
-    recording = read_any(
-        path,
-        recorded_or_nominal_times="nominal",
-        point_sensor_name="camera",
-        point_frame="base",
-        description="two joints",
-    )
+    said = {"point_sensor_name": "camera", "point_frame": "base", "description": "two joints"}
+    recording = read_any(path, recorded_or_nominal_times="nominal", **said)
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert joints.clock == "nominal"
@@ -53,9 +48,8 @@ def test_csv_columns_of_sensors_on_links(tmp_path: Path) -> None:
     rows = ["0.0,0.1,1,2,3,,,", "0.5,0.2,,,,0.1,0.2,0.3", "1.0,0.3,4,5,6,0.4,0.5,0.6"]
     (tmp_path / "run.csv").write_text("\n".join([header, *rows]))
     columns = {f"w{i + 1}": f"angular_velocity_{axis}:imu_link" for i, axis in enumerate("xyz")}
-    imu, wrist = sorted(
-        read_csv(tmp_path / "run.csv", CsvOptions(column_meanings=columns)).channel_groups, key=lambda g: g.name
-    )
+    recording = read_csv(tmp_path / "run.csv", CsvOptions(column_meanings=columns))
+    imu, wrist = sorted(recording.channel_groups, key=lambda g: g.name)
     assert (imu.name, imu.names, wrist.name, wrist.names) == ("imu", ("imu_link",), "wrist", ("ft",))
     np.testing.assert_allclose(wrist.t, [0.0, 1.0])
     np.testing.assert_allclose(wrist.values_by_quantity["force"][:, 0], [[1, 2, 3], [4, 5, 6]])

@@ -478,6 +478,11 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     assert (bench / "run.yaml").read_text() == "kept: true\n"
 
 
+def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    proposed(moved(SHORT[:1]))
+    assert "joints has 1 sample" in capsys.readouterr().out
+
+
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
     assert "is it in the same frame?" in capsys.readouterr().out

@@ -242,8 +242,7 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
         own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.residual_rows.measurements[i]])
         kept = np.setdiff1d(np.arange(len(fitted.residual)), own)
         step = size_limited_damped_step(problem, solution.x, fitted.jacobian[kept], fitted.residual[kept], 1e-10)
-        x = np.clip(solution.x + step, *problem.bounds)
-        parts = problem.theta_and_initial_state_deviation(x, i)
+        parts = problem.theta_and_initial_state_deviation(np.clip(solution.x + step, *problem.bounds), i)
         found = problem.predictor.predict_episode(problem.episodes[i], *parts, False)
         if isinstance(found, str):
             return np.inf

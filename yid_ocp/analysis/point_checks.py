@@ -341,8 +341,7 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
     suspects = sorted({name for edge, bad in zip(edges, off, strict=True) if bad for name in edge})
     best, least = ("", ""), int(off.sum())
     for one, two in itertools.combinations(suspects, 2):
-        swapped = {**at, one: at[two], two: at[one]}
-        left = int(np.sum(np.abs(np.log(_lengths(swapped, edges) / known)) > most))
+        left = int(np.sum(np.abs(np.log(_lengths({**at, one: at[two], two: at[one]}, edges) / known)) > most))
         if left < least:
             best, least = (one, two), left
     worst = int(np.argmax(np.abs(np.log(ratio))))

@@ -160,8 +160,7 @@ def _answers(
         for i, sensor in enumerate(sensors):
             read = sensor.by_state @ x + sensor.by_effort @ effort + (sensor.by_theta if held else 0.0)
             largest[i] = np.maximum(largest[i], np.max(np.abs(read), axis=0, initial=0.0))
-        momentum = p_new @ y + p_old @ x + added[nt:]
-        x = np.vstack([y[:n], momentum, y[n : n + nz]])
+        x = np.vstack([y[:n], p_new @ y + p_old @ x + added[nt:], y[n : n + nz]])
     return largest
 
 

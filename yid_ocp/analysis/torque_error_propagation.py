@@ -136,8 +136,7 @@ class _Motion:
 
     def __init__(self, course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        shift = course.model_functions.effect_momentum_shift
-        momentum = shift.momentum_derivative_by_previous_torque(course.theta)
+        momentum = course.model_functions.effect_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
         self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
         nu, count = len(errors.torque_std), len(errors.sample_of_step)
         known, pulled = np.tile(np.eye(nu), (count, 1, 1)), np.zeros((count, nu, nu))

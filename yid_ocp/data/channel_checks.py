@@ -229,8 +229,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
                 advice = "exclude the saturated samples, or record within the sensor's range; if it is what a "
                 advice += "controller commanded, set sensors.joints.effort.kind: command"
-                ratio = at.sum() / least
-                yield Issue("saturated", what, "not_trusted", ratio, advice, "", group, channel, begin, end)
+                yield Issue("saturated", what, "not_trusted", at.sum() / least, advice, "", group, channel, begin, end)
 
 
 def typical_point_pair_distances(

@@ -193,8 +193,7 @@ class PositionServo:
             return ca.if_else(on, _clipped(self.gain * error - drag, self.torque_limit_tightness), 0)
         torque = _clipped(self.gain * error - self.derivative * v, self.torque_limit_tightness) - drag
         if self.torque_constant is not None and not self.current_limit_tightness.is_zero():
-            current = torque / self.torque_constant
-            torque = self.torque_constant * _clipped(current, self.current_limit_tightness)
+            torque = self.torque_constant * _clipped(torque / self.torque_constant, self.current_limit_tightness)
         return ca.if_else(on, torque, 0)
 
     def position_error_beyond_dead_band(self, command: ca.SX, q: ca.SX) -> ca.SX:

@@ -318,7 +318,7 @@ def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | 
     From standstill, the held-out part can be predicted from equilibrium, and so tests the model on held-out data.
     """
     first, duration = min(group.t[0] for group in recording.joint_and_point_groups), recording.duration
-    for part in np.arange(0.75, 0.5, -0.01):
+    for part in np.arange(0.75, 0.5, -0.01) if duration > 0 else ():
         time = first + float(part) * duration
         if not any(_moving_joint_or_point(recording, joints, at) for at in (time, time + _REST_WINDOW)):
             later = recording.time_slice(time, first + duration)
