@@ -189,7 +189,7 @@ def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[
     for name in names:
         if name not in joints.names:
             what = f"joint '{name}' of the model is not recorded"
-            said = unknown_name_error_arguments(name, joints.names)
+            said = unknown_name_error_arguments(name, joints.names, "record it, or leave it out of model.arms.joints")
             raise DataError(what, where=f"recording '{where}': joints", **said)
     return [joints.names.index(name) for name in names]
 

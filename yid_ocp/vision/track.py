@@ -19,6 +19,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
+from yid_ocp.sensors.base import recorded_joint_column_indices
 from yid_ocp.vision import frame_selection, point_cloud, sequence_calibration, surface_meshes
 from yid_ocp.vision.calibration import (
     CameraCalibration,
@@ -471,11 +472,7 @@ def _joint_angles(
         what, where = f"the recording has no joint angles, {need}", f"recording '{recording.name}'"
         hint = "give the recording with the joints, or set model.robot to null"
         raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
-    for name in known:
-        if name not in joints.names:
-            where, said = f"recording '{recording.name}': joints", unknown_name_error_arguments(name, joints.names)
-            raise DataError(f"joint '{name}' of the model is not recorded", where=where, **said)
-    t, position = joints.t, joints.position[:, [joints.names.index(name) for name in known]]
+    t, position = joints.t, joints.position[:, recorded_joint_column_indices(joints, tuple(known), recording.name)]
     return (float(t[0]), float(t[-1])), lambda at: np.array([np.interp(at, t, column) for column in position.T])
 
 
