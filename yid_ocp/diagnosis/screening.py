@@ -307,8 +307,8 @@ def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityM
     inverses = [np.linalg.pinv(gram[np.ix_(b, b)], rcond=1e-8, hermitian=True) for b in blocks]
     matrix = np.zeros((len(blocks), len(blocks)))
     for j, row in enumerate(blocks):
-        size = float(np.trace(gram[np.ix_(row, row)]))
-        for i, column in enumerate(blocks if size > 0 else ()):
+        size = max(float(np.trace(gram[np.ix_(row, row)])), 1e-300)
+        for i, column in enumerate(blocks):
             cross = gram[np.ix_(row, column)]
             matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size
     return ConfusabilityMatrix(tuple(effect.label for effect in everything.effects), np.clip(matrix, 0.0, 1.0))
