@@ -235,8 +235,10 @@ def of(label, values, stds, effects=(SPRING,)):
     ("first", "second", "agrees"),
     [
         # 3 apart, with 0.6 and 0.8 together 1: 3 standard deviations
-        ((2.0, 0.6), (5.0, 0.8), True),
-        ((2.0, 0.6), (5.4, 0.8), False),
+        ((5.0, 0.6), (8.0, 0.8), True),
+        ((5.0, 0.6), (8.4, 0.8), False),
+        # apart as far as from neutral
+        ((4.2, 0.6), (7.2, 0.8), False),
         # sure, and by no more than three tenths of the larger
         ((10.0, 0.01), (7.1, 0.01), True),
         ((10.0, 0.01), (6.9, 0.01), False),

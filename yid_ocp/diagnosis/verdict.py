@@ -45,12 +45,23 @@ class EffectAmplitudeTransferCheck:
         """Text of both estimates with their standard deviations and unit."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
-        return f"{self.effect_label}.{self.parameter} is {here} and {there}"
+        return f"{self.name} is {here} and {there}"
 
     @property
     def estimate_difference_and_std(self) -> tuple[float, float]:
         """Absolute difference between the two estimates, and its standard deviation."""
         return abs(self.estimation_value - self.held_out_value), math.hypot(self.estimation_std, self.held_out_std)
+
+    @property
+    def disagreement_std(self) -> float:
+        """Difference of the estimates over sqrt(2) if it is significant, else 0."""
+        apart, spread = self.estimate_difference_and_std
+        return apart / math.sqrt(2.0) * (apart > _DISAGREEMENT_Z * spread)
+
+    @property
+    def name(self) -> str:
+        """Name of the effect's parameter in the model."""
+        return f"{self.effect_label}.{self.parameter}"
 
 
 @dataclass(frozen=True)
@@ -243,16 +254,13 @@ def _compare(
         allowed = max(limits.always_allowed_transfer_z * spread, limits.transfer_rtol * size * width[name])
         # an unknown standard deviation is no evidence against transfer
         found.append(replace(entry, is_consistent=not apart > allowed))
-    return found
+    # recordings that disagree by as much as the effect differs from neutral do not determine it
+    moved = any(abs(e.estimation_value - neutral[e.name]) > _DISAGREEMENT_Z * e.disagreement_std for e in found)
+    return [replace(entry, is_consistent=entry.is_consistent & moved) for entry in found]
 
 
 def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
     """The fit with stds of at least |difference|/sqrt(2) for amplitudes that disagree between recordings."""
-    std = dict(fit.std)
-    for entry in entries:
-        (apart, spread), name = entry.estimate_difference_and_std, f"{entry.effect_label}.{entry.parameter}"
-        if apart > _DISAGREEMENT_Z * spread:
-            std[name] = max(std[name], apart / math.sqrt(2.0))
-    return replace(fit, std=std)
+    return replace(fit, std={**fit.std, **{e.name: max(fit.std[e.name], e.disagreement_std) for e in entries}})
