@@ -19,14 +19,7 @@ from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data import (
-    JointGroup,
-    PointGroup,
-    Recording,
-    SensorChannelGroup,
-    read_recording,
-    write_recording,
-)
+from yid_ocp.data import JointGroup, PointGroup, Recording, SensorChannelGroup, read_recording, write_recording
 from yid_ocp.model.servos_and_springs import MotorModelOptions
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.workflow.build import build_system, free_parameter_names
@@ -200,6 +193,15 @@ def test_the_low_pass_lies_above_motion_that_exceeds_the_noise_of_the_encoders(b
     assert proposed(moved(uneven, moving=True)).problem.path_cutoff == 10.0, "an uneven clock does not show the noise"
 
 
+def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fixed = '<link name="{0}"/><joint name="{0}" type="fixed"><parent link="hub"/><child link="{0}"/></joint></robot>'
+    # of two last frames none is: the frame that carries both
+    for end, holder, others in (("mount", "mount", "hub"), ("finger", "hub", "finger, mount")):
+        (bench / "wrist.urdf").write_text((bench / "wrist.urdf").read_text().replace("</robot>", fixed.format(end)))
+        assert proposed(moved(SHORT)).model.object.mount.parent_frame == holder
+        assert f"held by: {holder} (frames there, for --holder: {others})" in capsys.readouterr().out
+
+
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     beam = ("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05")
     run = proposed(moved(SHORT, parts=(), effort=True), *beam)
@@ -215,9 +217,9 @@ def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
     run = proposed(moved(SHORT, effort=True))
     assert run.sensors["joints.effort"].use is False
     assert not run.model.effects
+    assert run.model.damping == {"object": pytest.approx(2e-3, rel=2), "roll": 0.0, "pitch": 0.0}
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
-    limit = 50.0
-    assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * limit)
+    assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
     assert "use: true looks for friction and payload of the arm" in text
     assert "# friction: {law: coulomb}" in text

@@ -176,8 +176,8 @@ def timestamp_correction_advice(late: float, drift: float, middle: float) -> str
 
 def point_clock_offset_and_drift(
     path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
-) -> tuple[float, float]:
-    """Find the clock offset [s] and relative drift for which measured points are nearest to a known path.
+) -> tuple[float, float, float]:
+    """Find the clock offset [s] and relative drift at which points are nearest to a known path, and how near [m] (rms).
 
     The search goes from coarse to fine steps. The path is known from the first to the last time in `knots` [s]. The
     points `seen` (N, np, 3) [m] were measured at the times `t` (N,). With `drifts`, a drift of up to `_MAX_DRIFT` is
@@ -200,13 +200,14 @@ def point_clock_offset_and_drift(
 
     width = 0.5 * (knots[1] - knots[0])
     if not drifts:
-        return nearest(0.0, (width / 100, 100), (width / 1000, 12), (width / 10000, 12))[1], 0.0
+        square, late = nearest(0.0, (width / 100, 100), (width / 1000, 12), (width / 10000, 12))
+        return late, 0.0, math.sqrt(square)
     trials = np.linspace(-_MAX_DRIFT, _MAX_DRIFT, 1 + 2 * int(np.clip(_MAX_DRIFT * span / _DRIFT_SEARCH_STEP, 10, 100)))
     _, late, drift = min((*nearest(float(rate), (width / 48, 12), (width / 400, 8)), float(rate)) for rate in trials)
     fine = scipy.optimize.minimize(
         lambda x: min(error(x[0], x[1] / span), 1e300), [late, drift * span], method="Nelder-Mead"
     )
-    return float(fine.x[0]), float(fine.x[1]) / span
+    return float(fine.x[0]), float(fine.x[1]) / span, math.sqrt(fine.fun)
 
 
 def clock_drift_and_overstated_noise_issues(

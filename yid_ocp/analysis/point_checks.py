@@ -152,21 +152,13 @@ def _changed_times(
 ) -> Iterator[_Change]:
     """Corrections for points recorded earlier or later than the angles, or by a faster or slower clock."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
-
-    def left(late: float, drift: float) -> float:
-        at = t - late - drift * (t - middle)
-        inside = (at >= knots[0]) & (at <= knots[1])
-        return _rms(seen[inside] - path(at[inside]))
-
-    late, _ = point_clock_offset_and_drift(path, knots, t, seen)
-    error = left(late, 0.0)
+    late, _, error = point_clock_offset_and_drift(path, knots, t, seen)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
         return
-    late, drift = point_clock_offset_and_drift(path, knots, t, seen, drifts=True)
-    error = left(late, drift)
+    late, drift, error = point_clock_offset_and_drift(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words = f"taken {late:+.3g} s from the joints, by a clock that runs {1e3 * drift:+.3g} parts per thousand fast,"
         yield _Change("clock_drift", words, timestamp_correction_advice(late, drift, middle), error)

@@ -217,9 +217,10 @@ def _torque_bias_std(tree: Mechanism, recorded: JointGroup, joints: Sequence[str
 def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
     for j in range(len(tree.joints)):
         if j not in tree.parent_joint_indices:
-            own = [name for name, frame in tree.frames.items() if frame.joint_index == j]
-            joints = tuple(tree.joint_names[i] for i in tree.ancestor_joint_indices(j))
-            yield _ArmChain(joints, tuple(sorted(own, key=_tool_rank)))
+            own = sorted([name for name, frame in tree.frames.items() if frame.joint_index == j], key=_tool_rank)
+            ends = [name for name in own if tree.frames[name].proximal_names.issuperset({*own} - {name})]
+            own = [*ends, *(name for name in own if name not in ends)] if len(ends) == 1 else own
+            yield _ArmChain(tuple(tree.joint_names[i] for i in tree.ancestor_joint_indices(j)), tuple(own))
 
 
 def _tool_rank(frame: str) -> tuple[int, bool]:

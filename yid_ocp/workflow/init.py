@@ -175,10 +175,11 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
 def _summary_lines(
     proposal: ProposedConfigChoices, out: Path, recordings: Sequence[Recording], has_picture: bool
 ) -> list[str]:
-    held = ", ".join(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
+    held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
+    others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
     lines = [
         f"joints: {', '.join(proposal.joints)}",
-        f"held by: {held}",
+        f"held by: {', '.join(held)}" + f" (frames there, for --holder: {', '.join(others)})" * bool(others),
         f"mode: {proposal.arm_mode}: {proposal.arm_mode_reason}",
         f"start: {proposal.initial_state}: {proposal.initial_state_reason}",
     ]
