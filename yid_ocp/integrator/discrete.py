@@ -404,7 +404,7 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
     z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
     held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")
     q = ca.SX(ca.DM.zeros(system.n_coordinates))
-    q[fixed], q[free] = given[nu:], sought
+    q[[*fixed, *free]] = ca.vertcat(given[nu:, 0], sought)
     u = held + stiffness * (given[:nu] - q[driven]) if nu else held
     old, now = [e.q0, e.q1, e.z0, e.z1, e.lam, e.u], [q, q, z, z, h * force, u]
     rows = ca.substitute([e.p1, e.momentum_balance, e.internal_residual_at_rest, e.constraint_residual], old, now)
