@@ -96,14 +96,17 @@ def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, op
             *_changed_zeros(arm, places, course(t), seen, (place, by_angle)),
             *_moved(seen, place),
         ]
-        yield _explained(changes, error, allowed, recording.name, group.name)
+        yield _explained(changes, seen - place, tuple(frames), allowed, recording.name, group.name)
 
 
-def _explained(changes: Sequence[_Change], error: float, allowed: float, recording: str, group: str) -> Issue:
-    """Issue for the change that explains most; the first of equally good changes."""
+def _explained(
+    changes: Sequence[_Change], apart: Array, names: Sequence[str], allowed: float, recording: str, group: str
+) -> Issue:
+    """Issue for the change that explains most; the first of equally good changes. It names points that are far off."""
+    error, far = _rms(apart), ", ".join(name for i, name in enumerate(names) if _rms(apart[:, i]) > allowed)
     best = min((change.error for change in changes), default=math.inf)
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
-    words, depth = f"points are {error:.3g} m (rms) from where the model has them", error / allowed
+    words, depth = f"points ({far or 'all'}) are {error:.3g} m (rms) from where the model has them", error / allowed
     for chosen in good:
         words, where = f"{words}; {chosen.words} it is {chosen.error:.2g} m", "joints" if chosen.channel else group
         place = recording, where, chosen.channel
@@ -279,7 +282,7 @@ def object_point_rollout_issues(episode: Episode, result: EpisodePrediction, siz
         best = min(changes, key=lambda change: change.error)
         # a rollout with unknown stiffness only supports a clear correction
         if best.error < _MAX_REMAINING_FRACTION * error and best.error < allowed:
-            yield _explained([best], error, allowed, episode.name, samples.sensor.group_name)
+            yield _explained([best], seen - place, names, allowed, episode.name, samples.sensor.group_name)
 
 
 def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
