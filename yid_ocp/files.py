@@ -209,8 +209,7 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 def attributes_to_dict(value: Any, names: str) -> dict[str, Any]:
     """Return attributes of `value` listed in `names` (blank-separated), by name. `key=name` stores one under `key`."""
-    pairs = [name.partition("=") for name in names.split()]
-    return {key: getattr(value, name or key) for key, _, name in pairs}
+    return {key: getattr(value, name or key) for key, _, name in [name.partition("=") for name in names.split()]}
 
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:

@@ -490,8 +490,7 @@ def test_a_search_without_drifts_finds_a_lateness_alone():
         return np.sin(np.multiply.outer(at, rates))
 
     seen = path(t - 0.2 - 0.02 * (t - 5.0))
-    alone = point_clock_offset_and_drift(path, (0.0, 10.0), t, seen)
-    assert alone[:2] == (pytest.approx(0.2, abs=5e-3), 0.0)
+    assert point_clock_offset_and_drift(path, (0.0, 10.0), t, seen)[:2] == (pytest.approx(0.2, abs=5e-3), 0.0)
     both = point_clock_offset_and_drift(path, (0.0, 10.0), t, seen, drifts=True)
     assert both == pytest.approx((0.2, 0.02, 0.0), abs=1e-4)
 

@@ -165,8 +165,7 @@ def test_all_rows_are_listed_the_short_ones_whole(symbols):
     text = "\n".join(lines)
     for name in symbols.row_names:
         assert any(line.startswith(f"{name}: ") for line in lines), name
-    long = symbols.equation_or_derivative("del[T1_0_z]")
-    assert long.text_lines[0] in lines
+    assert symbols.equation_or_derivative("del[T1_0_z]").text_lines[0] in lines
     inner = symbols.row_blocks[1].full_names[0]
     assert f"  {inner} = " in text
     assert "  del[T1_0_z] = " not in text

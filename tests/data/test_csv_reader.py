@@ -353,8 +353,7 @@ def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are
     assert group.t == pytest.approx([0, 0.01])
     np.testing.assert_allclose(group.position[0], [[1, 2, 3], [0.1, 0.2, 0.3]])
     np.testing.assert_array_equal(np.isnan(group.position[1]).all(axis=1), [False, True])
-    kept = read_any(tmp_path / name, point_names={"tip": "w_rod"})
-    assert kept.points[0].names == ("w_rod",)
+    assert read_any(tmp_path / name, point_names={"tip": "w_rod"}).points[0].names == ("w_rod",)
     assert [source.name for source in preview_file(tmp_path / name).sources] == list(names)
     without_rate = (
         text.replace("\n100\n", "\n0\n").replace("Y\t100", "Y\t0").replace(",Time (Seconds),X,Y,Z,W,X,Y,Z,,X,Y,Z", "")

@@ -291,8 +291,7 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     monkeypatch.setattr(blind, "refit_with_effects", refit)
     ensemble = SimpleNamespace(_nominal_problem=lambda recording: SimpleNamespace(system="system"))
     case, told = UnlabelledCase("c", "estimate", "held out", ()), CaseGroundTruth("c", "single", injected, 1.0, {})
-    found = blind.true_effects_gap_closure(ensemble, case, told)
-    assert found == pytest.approx(expected, nan_ok=True)
+    assert blind.true_effects_gap_closure(ensemble, case, told) == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
     assert asked == [["held out"], ("settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
 

@@ -70,8 +70,7 @@ def runs(monkeypatch):
 
 @needs_compiler
 def test_the_second_compilation_reads_the_cache(cache, runs):
-    first = compiler.compile_and_load_library(SOURCE % 42)
-    assert first.yid_answer() == 42
+    assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
     compilations = [command for command in runs if "-shared" in command]
     assert len(compilations) == 1
     assert [path.suffix for path in cache.iterdir()] == [".so"]
@@ -262,8 +261,7 @@ def test_a_function_is_compiled_once_and_keeps_its_sparsity(cache, runs):
         assert function.sparsity_out(1) == plain.sparsity_out(1)
         for actual, expected in zip(function([1.0, 2.0, 3.0]), plain([1.0, 2.0, 3.0]), strict=True):
             np.testing.assert_allclose(np.array(actual), np.array(expected), rtol=1e-15)
-    other = compiler.compiled_casadi_function(polynomial(5.0))
-    assert float(other([1.0, 2.0, 3.0])[0][2]) == 45.0
+    assert float(compiler.compiled_casadi_function(polynomial(5.0))([1.0, 2.0, 3.0])[0][2]) == 45.0
     assert float(made[0]([1.0, 2.0, 3.0])[0][2]) == 18.0
 
 

@@ -53,8 +53,7 @@ def test_a_percentage_is_that_part_of_the_length_however_many_links(links, perce
     tree = branched(links).mechanism
     first, second, junction = places(tree, [f"T1:{percent:g}%", f"T2:{percent:g}%", "w_T1"])
     np.testing.assert_allclose(first[:3, 3], [0.1, 0.2, 0.3 + 0.8 * percent / 100], atol=1e-12)
-    away = np.linalg.norm(second[:3, 3] - junction[:3, 3])
-    assert away == pytest.approx(0.5 * percent / 100, abs=1e-12)
+    assert np.linalg.norm(second[:3, 3] - junction[:3, 3]) == pytest.approx(0.5 * percent / 100, abs=1e-12)
 
 
 @pytest.mark.parametrize(("percent", "before", "after", "part"), [(40, 0, 1, 0.6), (85, 2, 3, 0.4)])

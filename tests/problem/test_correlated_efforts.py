@@ -214,8 +214,7 @@ def test_deviations_are_those_of_repeats(efforts_of):
         found.append([solution.parameters[name].value for name in DAMPING])
         stated.append([solution.parameters[name].std for name in DAMPING])
     error = np.array(found) - list(DAMPING.values())
-    inside = np.mean(np.abs(error) <= 1.96 * np.array(stated))
-    assert 0.90 <= inside <= 0.99
+    assert 0.90 <= np.mean(np.abs(error) <= 1.96 * np.array(stated)) <= 0.99
     np.testing.assert_allclose(np.std(error, axis=0), np.median(stated, axis=0), rtol=0.2)
 
 

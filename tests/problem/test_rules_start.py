@@ -319,8 +319,7 @@ def rod_problem(step, state, first=0.1, std=1e-3, **options):
 def test_a_recording_starts_in_the_shape_that_its_first_points_show(buckled, which):
     step, *states = buckled
     problem = rod_problem(step, states[which - 1])
-    found = problem.evaluate(problem.initial_unknowns)
-    assert np.abs(found.residual).max() < 0.05
+    assert np.abs(problem.evaluate(problem.initial_unknowns).residual).max() < 0.05
     assert (problem.episodes[0].equilibrium_guess is None) is (which == 1)
     [(_, held)] = problem.predict_held_out(problem.initial_unknowns)
     np.testing.assert_allclose(held.rollout.state[0], states[which - 1], atol=1e-6)

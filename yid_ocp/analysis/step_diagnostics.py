@@ -257,8 +257,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
         full[known] = y
         direct = np.hstack([block("p1", column) for column in columns])
         p1 = direct | _times(np.hstack([block("p1", c) for c in ("q1", "z1", "lam")]), full)
-        nz = len(system.effect_internal_coordinate_symbols)
-        return np.vstack([full[:nc], p1, full[nc : nc + nz]])
+        return np.vstack([full[:nc], p1, full[nc : nc + len(system.effect_internal_coordinate_symbols)]])
 
     unknowns = _blocks(symbols, "q1", "z1", "lam", kept=free)
     residual = _blocks(symbols, "del", "internal", "constraint", kept=free)

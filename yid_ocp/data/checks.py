@@ -318,8 +318,7 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
         again_twice += float(np.sum(follow * (follow - 1.0))) / 2
         pairs += len(values) * (len(values) - 1.0) / 2
     first = (again + 1) / (pairs + 1)
-    going_on = (again_twice + first) / (again + 1)
-    return math.log(len(one) * len(other) * first) + (length - 1) * math.log(going_on)
+    return math.log(len(one) * len(other) * first) + (length - 1) * math.log((again_twice + first) / (again + 1))
 
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:

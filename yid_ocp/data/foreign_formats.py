@@ -302,8 +302,7 @@ def joint_values_at_field_paths(content: Any, paths: Mapping[str, str], where: s
         except (TypeError, ValueError) as error:
             allowed, hint = "an array of numbers, one for each joint", "choose another field with --field"
             raise DataError(f"the field '{path}' holds no numbers", where=where, allowed=allowed, hint=hint) from error
-    count = max((len(values) for values in found.values()), default=0)
-    return _values([str(i + 1) for i in range(count)], found)
+    return _values([str(i + 1) for i in range(max((len(values) for values in found.values()), default=0))], found)
 
 
 def _franka_state(content: Any) -> SimpleNamespace:

@@ -157,7 +157,7 @@ def _examined(
     # the whitening of all hypotheses is fixed here
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
     screened = screen_candidates(composed, (), nominal.values, limits)
-    evidence = NominalModelGapEvidence(nominal, *tests, screened)
+    evidence = NominalModelGapEvidence(nominal, *tests, screened, _offsets_stated(nominal.problem))
     _end_stage(search, "screening")
     if evidence.has_gap(limits) and evidence.are_data_sufficient(limits):
         gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
@@ -202,6 +202,12 @@ def _followed(
         name = f"the nominal model, limited to the part that it can follow ({margin:g})"
         nominal = _fitted_nominal_model(search, nominal.values, name)
     return search, nominal, tuple(found.values())
+
+
+def _offsets_stated(problem: EstimationProblem) -> bool:
+    """Whether the size of torque offsets or of constant sensor errors is stated."""
+    torques = (np.any(e.input_errors.torque_bias_std > 0) for e in problem.episodes if e.input_errors is not None)
+    return any(torques) | any(episode.has_biases_treated_as_noise for episode in problem.episodes)
 
 
 def _undivided(composed: AllCandidatesProblem) -> EstimationProblem:

@@ -315,8 +315,7 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
         x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
         nonlocal moving
-        moving = problem_relinearized_at_torque_bias(moving, x, x)
-        return moving.evaluate(x, derivatives, equilibrium_guesses)
+        return problem_relinearized_at_torque_bias(moving, x, x).evaluate(x, derivatives, equilibrium_guesses)
 
     # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
     again = _seen(problem, effects, REFIT_SOLVER.minimize_cost(moving, outcome.x, None, evaluate))
@@ -327,8 +326,7 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
     """The end of a run, linearised about the torques there."""
     values = problem.with_nominal_and_effects_free(effects).named_values(outcome.x)
     placed = problem.with_effects_and_relinearized_filters(effects, values)
-    finish = placed.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses)
-    return placed, outcome, finish
+    return placed, outcome, placed.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses)
 
 
 def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:

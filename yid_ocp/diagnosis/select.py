@@ -162,8 +162,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
         return 0.0
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
     spread = float(np.std(ratios, ddof=1)) / math.sqrt(count)
-    least = _LOSS_RTOL * best.chi2_per_sample
-    return max(lost / max(error, least), float(ratios.mean()) / max(spread, _LOSS_RTOL))
+    return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
 
 
 def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:

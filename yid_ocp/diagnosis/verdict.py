@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, leaves_noise, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
@@ -45,7 +45,7 @@ class EffectAmplitudeTransferCheck:
         """Text of both estimates with their standard deviations and unit."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
-        return f"{self.name} is {here} and {there}"
+        return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
     def estimate_difference_and_std(self) -> tuple[float, float]:
@@ -58,11 +58,6 @@ class EffectAmplitudeTransferCheck:
         apart, spread = self.estimate_difference_and_std
         return apart / math.sqrt(2.0) * (apart > _DISAGREEMENT_Z * spread)
 
-    @property
-    def name(self) -> str:
-        """Name of the effect's parameter in the model."""
-        return f"{self.effect_label}.{self.parameter}"
-
 
 @dataclass(frozen=True)
 class NominalModelGapEvidence:
@@ -72,17 +67,22 @@ class NominalModelGapEvidence:
     nominal_test: NullTestResult  # test on the estimation recordings
     nominal_held_out_test: NullTestResult
     screening: ScreeningResult
+    are_offsets_stated: bool = False  # whether the size of torque offsets or of constant sensor errors is
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
 
     def has_gap(self, limits: Thresholds) -> bool:
-        """Whether the residual exceeds noise significantly: as a whole and by a relevant amount, or along a candidate.
+        """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
 
-        A candidate's signature is one direction: along it, a few deviating samples show that the sum of all hides.
+        Along a signature, some channel must also exceed noise: with many samples, errors far below the noise are
+        significant. A torque offset beyond its stated size counts without: it is one number among thousands.
         """
-        level, tests = limits.gap_significance_level, (self.nominal_test, self.nominal_held_out_test)
-        along = bonferroni_corrected_min_candidate_p_value(self.screening.candidate_scores)
+        tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
+        largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
+        is_seen, level = largest > 1 + limits.min_channel_excess_chi2_per_dof, limits.gap_significance_level
+        along = filter(lambda s: is_seen | (self.are_offsets_stated & s.effect.is_torque_offset), ranked)
+        p_value = min((s.p_value for s in along), default=math.inf) * len(ranked)
         whole = ExcessResidualCriteria(level, limits.min_excess_chi2_per_dof)
-        return along < level or residuals_exceed_noise(tests, whole)
+        return p_value < level or residuals_exceed_noise(tests, whole)
 
     def are_data_sufficient(self, limits: Thresholds) -> bool:
         """Whether the degrees of freedom suffice for the nominal model's unknowns, and a candidate is detectable."""
@@ -241,7 +241,7 @@ def _compare(
     effect: EffectBase, first: RefitStatistics, second: RefitStatistics, limits: Thresholds
 ) -> list[EffectAmplitudeTransferCheck]:
     """Comparison of the amplitudes of one effect in two fits."""
-    neutral, found = effect.neutral_values, []
+    neutral, found, moved = effect.neutral_values, [], False
     width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
     size = max(
         abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_parameter_names
@@ -252,10 +252,10 @@ def _compare(
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
         apart, spread = entry.estimate_difference_and_std
         allowed = max(limits.always_allowed_transfer_z * spread, limits.transfer_rtol * size * width[name])
+        # recordings that disagree by as much as the effect differs from neutral do not determine it
+        moved |= abs(entry.estimation_value - neutral[name]) > _DISAGREEMENT_Z * entry.disagreement_std
         # an unknown standard deviation is no evidence against transfer
         found.append(replace(entry, is_consistent=not apart > allowed))
-    # recordings that disagree by as much as the effect differs from neutral do not determine it
-    moved = any(abs(e.estimation_value - neutral[e.name]) > _DISAGREEMENT_Z * e.disagreement_std for e in found)
     return [replace(entry, is_consistent=entry.is_consistent & moved) for entry in found]
 
 
@@ -263,4 +263,5 @@ def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
     """The fit with stds of at least |difference|/sqrt(2) for amplitudes that disagree between recordings."""
-    return replace(fit, std={**fit.std, **{e.name: max(fit.std[e.name], e.disagreement_std) for e in entries}})
+    std = {f"{e.effect_label}.{e.parameter}": max(e.estimation_std, e.disagreement_std) for e in entries}
+    return replace(fit, std={**fit.std, **std})

@@ -84,8 +84,7 @@ class SmoothedUnknownsResult:
     def explainable_gap_fraction(self) -> float:
         """Fraction of the gap that the smoothed unknowns can explain. The gap is G = max(0, chi2/n - 1)."""
         gap = self.chi2_before / self.dof_before - 1
-        rest = max(self.chi2_after / self.dof_after - 1, 0.0)
-        return float(np.clip(1 - rest / gap, 0.0, 1.0)) if gap > 0 else 0.0
+        return float(np.clip(1 - max(self.chi2_after / self.dof_after - 1, 0.0) / gap, 0.0, 1.0)) if gap > 0 else 0.0
 
     @property
     def plant_or_sensor_origin(self) -> str:

@@ -472,8 +472,7 @@ def max_torque_bias_change_in_stds(
     some: Sequence[ProcessNoiseWhitener | None], others: Sequence[ProcessNoiseWhitener | None]
 ) -> float:
     """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""
-    pairs = zip(some, others, strict=True)
-    return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)
+    return max((_apart(one, other) for one, other in zip(some, others, strict=True) if one and other), default=0.0)
 
 
 def _apart(one: ProcessNoiseWhitener, other: ProcessNoiseWhitener) -> float:

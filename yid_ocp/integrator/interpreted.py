@@ -76,8 +76,7 @@ class InterpretedKernel:
         effort = -e.momentum_balance[list(self._model.system.prescribed_coordinate_indices), 0] / e.h
         outputs = ca.cse(ca.vertcat(e.momentum_balance, e.internal_residual, e.constraint_residual, e.p1, effort))
         slope = ca.jacobian(outputs[self._residual.tolist()], e.newton_unknowns)
-        wanted = (outputs, slope, ca.jacobian(outputs, point))
-        return [ca.Function("f", [point], [ca.densify(x)]) for x in wanted]
+        return [ca.Function("f", [point], [ca.densify(x)]) for x in (outputs, slope, ca.jacobian(outputs, point))]
 
     def _point(self, theta: Array, before: Array, after: Array, lam: Array, u: Array) -> Array:
         n = self._model.sizes["n"]

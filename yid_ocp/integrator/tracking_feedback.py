@@ -348,8 +348,7 @@ class _Memory:
 
 def _columns(expression: ca.SX, theta: ca.SX) -> list[int]:
     """Which entries of theta an expression depends on."""
-    pattern = np.array(ca.DM(ca.jacobian_sparsity(expression, theta), 1))
-    return [int(i) for i in np.flatnonzero(pattern.any(axis=0))]
+    return [int(i) for i in np.flatnonzero(np.array(ca.DM(ca.jacobian_sparsity(expression, theta), 1)).any(axis=0))]
 
 
 def _one_before(values: Array) -> Array:

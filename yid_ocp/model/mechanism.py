@@ -341,8 +341,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """Rotation matrix (3, 3) from roll, pitch, yaw [rad] as in URDF: Rz(yaw) Ry(pitch) Rx(roll)."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
-    y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
-    return np.array([x, y, [-sp, cp * sr, cp * cr]])
+    return np.array([x, [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], [-sp, cp * sr, cp * cr]])
 
 
 def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:

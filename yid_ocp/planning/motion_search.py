@@ -342,8 +342,7 @@ class EffectDiscriminationCriterion:
         prior = _prior(rows.shape[1], self.parameter_columns)[others]
         used = scipy.linalg.solve(basis.T @ basis + np.diag(prior), basis.T @ change, assume_a="pos")
         rest = change - basis @ used
-        square = float(np.sum(rest**2) + np.sum(prior[:, None] * used**2)) / change.shape[1]
-        return square, rest, others, used
+        return float(np.sum(rest**2) + np.sum(prior[:, None] * used**2)) / change.shape[1], rest, others, used
 
 
 DOptimalityOrDiscriminationCriterion = DOptimalityCriterion | EffectDiscriminationCriterion

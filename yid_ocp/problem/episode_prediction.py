@@ -158,8 +158,7 @@ class EpisodePredictor:
         slopes += self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
             slopes += self._delay_in_steps(samples, theta, wanted) or ()
-        moved = any(x is not None and np.any(x) for x in slopes)
-        return not moved and all(map(np.array_equal, true, recorded))
+        return not any(x is not None and np.any(x) for x in slopes) and all(map(np.array_equal, true, recorded))
 
     @property
     def _follows_momenta(self) -> bool:

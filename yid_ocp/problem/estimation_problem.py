@@ -193,8 +193,7 @@ class EstimationProblem(ReprMixin):
         lower, upper = self.bounds
         size = np.abs(self.initial_unknowns)
         width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
-        fallback = np.where(np.isfinite(self._prior_std), self._prior_std, 0.1 * width)
-        return np.where(size > 0, size, fallback)
+        return np.where(size > 0, size, np.where(np.isfinite(self._prior_std), self._prior_std, 0.1 * width))
 
     @property
     def positive_unknowns_mask(self) -> BoolArray:

@@ -271,8 +271,7 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
     inside = size <= scale
     with np.errstate(invalid="ignore"):
         cost = np.where(inside, 0.5 * residual**2, scale * (size - 0.5 * scale) if np.isfinite(scale) else 0.0)
-    factor = np.where(inside, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
-    return float(np.sum(cost)), factor
+    return float(np.sum(cost)), np.where(inside, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
 
 
 def whiten_against_sensor_biases(slopes: Array, columns: Array) -> Array:

@@ -157,8 +157,7 @@ class FirstOrderLag:
         by_time = self._following(np.zeros(value.shape), decay_slope * gap, decay)
         mean_by_time = (gap * share_slope + share * by_time)[:, :, None] * self.time_constant_sensitivity
         followed = self._following(by_value, np.zeros(by_value.shape), decay[:, None])
-        through = by_value + share[:, None] * (followed - by_value)
-        return value + share * gap, through + mean_by_time
+        return value + share * gap, by_value + share[:, None] * (followed - by_value) + mean_by_time
 
     def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
         """Output of the lag at nodes, with derivatives, for an input x (N, k) that is linear between nodes.

@@ -349,8 +349,7 @@ def _step_bounds(problem: EstimationProblem, x: Array, size: Array) -> tuple[Arr
     lower, upper = problem.bounds
     largest = np.maximum(x, 1e-3 * problem.unknown_scales) * _MAX_CHANGE_FACTOR
     low = np.where(problem.positive_unknowns_mask, np.maximum(lower, x / _MAX_CHANGE_FACTOR), lower)
-    high = np.where(problem.positive_unknowns_mask, np.minimum(upper, largest), upper)
-    return (low - x) / size, (high - x) / size
+    return (low - x) / size, (np.where(problem.positive_unknowns_mask, np.minimum(upper, largest), upper) - x) / size
 
 
 class _ShootingIntervals:

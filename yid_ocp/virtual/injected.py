@@ -431,8 +431,7 @@ def _saturating_drive(scene: _EffectContext, model: Any, joint: str, size: float
 
 def _load_shifted(size: float, memory: Array, q: float, v: float, step: float) -> Array:
     begin, s = memory
-    goal = math.tanh((q - begin) / _LOAD_SLIDE_ANGLE)
-    return np.array([begin, s + step / _LOAD_SLIDE_TIME * (goal - s)])
+    return np.array([begin, s + step / _LOAD_SLIDE_TIME * (math.tanh((q - begin) / _LOAD_SLIDE_ANGLE) - s)])
 
 
 def _slipping_grasp(scene: _EffectContext, model: Any, grasp: str, size: float) -> _ForceCallback:

@@ -272,8 +272,7 @@ def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: fl
         both = summed(frame * (patch.max() + 1) + patch)
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
     curvature = max(bent / max(float(weight.sum()), 1e-12), _MIN_CURVATURE_FRACTION)
-    hessian = jacobian.T @ (weight[:, None] * jacobian)
-    return RobustCostDerivatives(scores.sum(axis=0), hessian, curvature, blocks)
+    return RobustCostDerivatives(scores.sum(axis=0), jacobian.T @ (weight[:, None] * jacobian), curvature, blocks)
 
 
 def _at_least(least: Array, matrix: Array) -> Array:

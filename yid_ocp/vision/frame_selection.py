@@ -316,5 +316,4 @@ def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
     ways = [along[np.ix_(2 * link + a, 2 * link + b)] + to[a][:, None] + to[b] for a in (0, 1) for b in (0, 1)]
     reach = radius[link][:, None] + radius[link]
     far = (np.min(ways, axis=0) > _MIN_CROSSING_SEPARATION_RADII * reach) & (link[:, None] != link)
-    apart = np.linalg.norm(places[:, None] - places, axis=2)
-    return bool((far & (apart < reach)).any())
+    return bool((far & (np.linalg.norm(places[:, None] - places, axis=2) < reach)).any())

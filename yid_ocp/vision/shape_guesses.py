@@ -128,8 +128,7 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
         joined.append(int(part[other[k]]))
     kept = np.flatnonzero(np.isin(part, joined))
     every = _renumbered(kept, len(points))[np.concatenate([edges, np.array(bridges, np.int64).reshape(-1, 2)])]
-    both = np.unique(np.sort(every[(every >= 0).all(axis=1)], axis=1), axis=0)
-    return points[kept], _graph(points[kept], both)
+    return points[kept], _graph(points[kept], np.unique(np.sort(every[(every >= 0).all(axis=1)], axis=1), axis=0))
 
 
 def _renumbered(kept: IntArray, count: int) -> IntArray:

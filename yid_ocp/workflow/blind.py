@@ -51,8 +51,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `blind` and return its exit code."""
     if arguments.rescore is not None:
         folder, target = arguments.rescore, arguments.out or Path(arguments.rescore) / "rescored"
-        again = functools.partial(rescore_blind, folder, target, arguments.overrides)
-        return run_command_and_print(arguments, again)
+        return run_command_and_print(arguments, functools.partial(rescore_blind, folder, target, arguments.overrides))
     if arguments.join:
         together = functools.partial(score_joined_slices, arguments.join, arguments.out or "joined-slices")
         return run_command_and_print(arguments, together)

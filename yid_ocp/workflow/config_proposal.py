@@ -244,8 +244,7 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
         said = unknown_name_error_arguments(frame, tree.frames) | {"allowed": allowed}
         raise ConfigError(f"there is no frame '{frame}'", where="--holder", **said)
     carried = tree.frames[frame].joint_index
-    own = next((arm for arm in arms if carried >= 0 and tree.joint_names[carried] in arm.joints), arms[0])
-    return frame, own
+    return frame, next((arm for arm in arms if carried >= 0 and tree.joint_names[carried] in arm.joints), arms[0])
 
 
 def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bool) -> tuple[str, str]:

@@ -63,8 +63,7 @@ class IdentifiabilityOptions:
             "--unknown-start": self.start_knowledge == "unknown",
             "--unknown-grasp": self.grasp_offset_std is not None,
         }
-        asked = [flag for flag, given in said.items() if given]
-        return asked + ([] if names == "auto" else ["--intervals", names])
+        return [flag for flag, given in said.items() if given] + ([] if names == "auto" else ["--intervals", names])
 
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:

@@ -312,8 +312,7 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         "sensors cannot distinguish a pair with 100 %, for any residual.",
         f"Similar signatures: {listed}." if close else f"No two signatures are similar; the closest are {said[0][1]}.",
     ]
-    figure = figures.confusability_matrix_figure(names, values)
-    return "What could be mistaken for what", sentences, [("", figure)]
+    return "What could be mistaken for what", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
 
 def _curves(
