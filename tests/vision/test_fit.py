@@ -88,7 +88,8 @@ def test_surface_and_centre_line_are_told_apart(alone, whole):
     sight = seen(whole, q)
     # with tubes of no thickness the fit would lie on the surface, on the camera's side
     thin = ShapeFitter(alone, values={"T1.radius": 1e-4, "T2.radius": 1e-4, "T3.radius": 1e-4})
-    assert 0.012 < thin.fit_frame(sight, q).point_positions - whole.points_at_configuration(q)[0, 0] < 0.04
+    flat = thin.fit_frame(sight, q).point_positions - whole.points_at_configuration(q)
+    assert 0.012 < flat[0, 0] < 0.04
     assert off(whole.fit_frame(sight, q), whole, q) < 0.003
 
 
