@@ -207,7 +207,7 @@ def _followed(
 def _offsets_stated(problem: EstimationProblem) -> bool:
     """Whether the size of torque offsets or of constant sensor errors is stated."""
     torques = (np.any(e.input_errors.torque_bias_std > 0) for e in problem.episodes if e.input_errors is not None)
-    return any(torques) | any(episode.has_biases_treated_as_noise for episode in problem.episodes)
+    return any(torques) or any(episode.has_biases_treated_as_noise for episode in problem.episodes)
 
 
 def _undivided(composed: AllCandidatesProblem) -> EstimationProblem:

@@ -56,7 +56,7 @@ class EffectAmplitudeTransferCheck:
     def disagreement_std(self) -> float:
         """Difference of the estimates over sqrt(2) if it is significant, else 0."""
         apart, spread = self.estimate_difference_and_std
-        return apart / math.sqrt(2.0) * (apart > _DISAGREEMENT_Z * spread)
+        return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class NominalModelGapEvidence:
         tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
         largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
         is_seen, level = largest > 1 + limits.min_channel_excess_chi2_per_dof, limits.gap_significance_level
-        along = filter(lambda s: is_seen | (self.are_offsets_stated & s.effect.is_torque_offset), ranked)
-        p_value = min((s.p_value for s in along), default=math.inf) * len(ranked)
+        along = [s.p_value for s in ranked if is_seen or (self.are_offsets_stated and s.effect.is_torque_offset)]
+        p_value = min(along, default=math.inf) * len(ranked)
         whole = ExcessResidualCriteria(level, limits.min_excess_chi2_per_dof)
         return p_value < level or residuals_exceed_noise(tests, whole)
 
@@ -256,7 +256,7 @@ def _compare(
         moved |= abs(entry.estimation_value - neutral[name]) > _DISAGREEMENT_Z * entry.disagreement_std
         # an unknown standard deviation is no evidence against transfer
         found.append(replace(entry, is_consistent=not apart > allowed))
-    return [replace(entry, is_consistent=entry.is_consistent & moved) for entry in found]
+    return [replace(entry, is_consistent=entry.is_consistent and moved) for entry in found]
 
 
 def _inflate_fit_stds_by_disagreement(
