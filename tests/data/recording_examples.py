@@ -31,7 +31,7 @@ def example() -> Recording:
     seen = generator.normal(size=(4, 3, 3))
     seen[1, 2] = np.nan
     own = np.array([0.0, 0.1, 0.35, 0.9]), seen, np.full((4, 3, 3), 0.01), "camera", "world", turned(0.3)
-    camera = PointGroup("points_camera", ("w_T1", "w_T2", "w_T3"), *own)
+    camera = PointGroup("points_camera", ("w_T1", "w_T2", "w_T3"), *own, clock_offset_std=0.02)
     arm = PointGroup("points_arm", ("w_T2",), t, generator.normal(size=(50, 1, 3)), sensor_name="arm", clock="nominal")
     truth = {"T1.bend": 22.0, "T1.twist": 3}
     return Recording(joints, (arm, camera), "a test", "nowhere", "example", true_parameters=truth)

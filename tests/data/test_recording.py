@@ -118,6 +118,7 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
     "shape of points": (lambda: with_camera(position=CAMERA.position[..., :2]), r"shape \(4, 3, 2\)"),
     "shape of std": (lambda: with_camera(std=np.ones((4, 3))), r"shape \(4, 3\)"),
     "shape of joint std": (lambda: with_joints(effort_std=np.ones(3)), r"shape \(3,\)"),
+    "clock offset": (lambda: with_camera(clock_offset_std=-1.0), "clock_offset_std is -1.0"),
     "shape of pose": (lambda: with_camera(camera_pose=np.eye(3)), r"shape \(3, 3\)"),
     "infinite time": (lambda: with_joints(t=changed(T, 7, np.inf)), "time at index 7 is inf"),
     "time going back": (lambda: with_joints(t=changed(T, 4, 0.02)), r"from index 3 to 4: 0\.03 s, then 0\.02 s"),

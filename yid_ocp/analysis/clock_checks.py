@@ -28,11 +28,13 @@ from yid_ocp.data.channel_checks import (
     median_sample_period,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup
-from yid_ocp.inference.null_test import channels_with_residual_indices
+from yid_ocp.inference.null_test import channels_with_residual_indices, times_since_recording_start
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.sensors import SensorOptions
+from yid_ocp.solvers import base as solvers
 
 # From times on the joints' clock (N,) to positions (N, np, 3) [m].
 PositionsAtTimesFunction = Callable[[Array], Array]
@@ -208,6 +210,47 @@ def point_clock_offset_and_drift(
         lambda x: min(error(x[0], x[1] / span), 1e300), [late, drift * span], method="Nelder-Mead"
     )
     return float(fine.x[0]), float(fine.x[1]) / span, math.sqrt(fine.fun)
+
+
+def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[EstimationProblem, list[Issue]]:
+    """Correct points whose clock offset is uncertain by more than half a sample to where a fit has them, and say so.
+
+    So large an offset is not linear in the residual. Fits, with what is left of it as a linear error of unknown size,
+    alternate with steps along the predicted paths, also of held-out recordings, which keep `clock_offset_std`.
+    """
+    recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
+    sensors, count, late = problem.options.sensors, len(problem.episodes), dict[tuple[int, str], tuple[float, float]]()
+    for i, recording in enumerate(recordings):
+        for group in recording.points:
+            stated = sensors.get(group.name, SensorOptions()).clock_offset_std
+            std = group.clock_offset_std if stated is None else stated
+            if std is not None and len(group.t) > 1 and std > 0.5 * median_sample_period(group.t):
+                late[i, group.name] = 0.0, float(std)
+    for _ in range(_N_RELINEARIZATIONS if late else 0):
+        fit = solvers.solve(problem, restarts=False, verdicts=False)
+        if fit.evaluation is None:
+            break
+        held_out = problem.predict_held_out(fit.x)
+        known = [*zip(problem.episodes, fit.evaluation.episode_predictions, strict=True), *held_out]
+        for i, (episode, result) in enumerate(known):
+            for k, samples in enumerate(episode.measurements):
+                name, seen = samples.sensor.group_name, samples.positive_weight_mask
+                if (i, name) in late and not isinstance(result, str):
+                    (before, std), path = late[i, name], result.predicted_outputs[k]
+                    rate = np.gradient(path, times_since_recording_start(episode, samples), axis=0)
+                    rate, left = (samples.weight * rate)[seen], (samples.weight * (path - samples.value))[seen]
+                    more = float((rate @ left - before / std**2) / (rate @ rate + std**-2))
+                    late[i, name] = before + more, std
+                    groups = (replace(g, t=g.t - more) if g.name == name else g for g in recordings[i].points)
+                    recordings[i] = replace(recordings[i], points=tuple(groups))
+        made = recordings[:count], problem.free, problem.options, None, recordings[count:]
+        problem = EstimationProblem(problem.step, *made)
+    issues, advice = list[Issue](), "import it with --clock-offset where the offset is known"
+    for (i, name), (shift, std) in late.items():
+        own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
+        words = f"{name} of {own}, known to ± {1e3 * std:.3g} ms, come {said} by a fit, which is corrected"
+        issues.append(Issue("clock_offset", words, "warning", abs(shift) / std, advice, own, name, "t"))
+    return problem, issues
 
 
 def clock_drift_and_overstated_noise_issues(

@@ -22,6 +22,7 @@ _MAX_LEFT_RATIO = 0.7  # ratio of residuals with and without a lag, below which 
 _MIN_SAID_LAG = 0.02  # [s]
 _LAG_SEARCH = 0.3  # range of lags for a shared clock, and around the lag of speeds [s]
 _MIN_TURN, _MIN_TRAVEL, _MIN_SAMPLES, _MIN_SEEN_FRACTION = 0.05, 0.005, 20, 0.5  # [rad], [m]
+_ALIGNED_CLOCK_STD = 0.03  # of an offset that the motion tells, which an object that swings behind shifts [s]
 _LARGEST_START = 1e6  # larger times are counted from the first sample [s]
 
 
@@ -35,10 +36,10 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
 
     Recordings whose time ranges overlap are assumed to share one clock and are not shifted; a note reports a remaining
     lag between points and joints. Recordings without overlap are aligned by the motion: the lag is chosen for which the
-    joint angles explain the points best. Joints of several recordings are interpolated to the fastest clock. Points and
-    other sensors keep their clocks. `clock_offsets` [s] are added to the times of the recordings that they name, which
-    are then not aligned. Raises `DataError` if two recordings have a joint in common, if clocks cannot be aligned, or
-    if an offset names no recording. Notes report clocks, offsets and interpolation.
+    joint angles explain the points best, and `clock_offset_std` says how well. Joints of several recordings are
+    interpolated to the fastest clock. Points and other sensors keep their clocks. `clock_offsets` [s] are added to the
+    times of the recordings that they name, which are then not aligned. Raises `DataError` if two recordings have a
+    joint in common, if clocks cannot be aligned, or if an offset names no recording. Notes report all of this.
     """
     offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
     where = ", ".join(names)
@@ -54,6 +55,9 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
             shift, said = offsets[recording.name], "as asked"
         else:
             shift, said = (0.0, "") if recording is lead else _shift(first, recording)
+            if shift:
+                points = tuple(replace(group, clock_offset_std=_ALIGNED_CLOCK_STD) for group in recording.points)
+                recording = replace(recording, points=points)
         if said:
             notes.append(f"times of {recording.name} were shifted by {shift:+.10g} s: {said}" if shift else said)
         shifted.append(_with_times_shifted(recording, shift))
@@ -111,7 +115,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         hint = f"--clock-offset {other.name}=SECONDS adds to its times; {begin - start:.10g} lets both begin at once"
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
     why = "the recording times do not overlap; with this offset the points follow the joint angles best "
-    why += f"({best.explained:.1%} of the motion), to some hundredths of a second, which are left to `check`"
+    why += f"({best.explained:.1%} of the motion), to ± {_ALIGNED_CLOCK_STD:g} s, which a fit of the model corrects"
     return begin - start - best.lag, why
 
 

@@ -139,6 +139,8 @@ class PointGroup(ReprMixin):
         For a camera: the transform from camera to world coordinates [m].
     clock : {'recorded', 'nominal'}
         As in `JointGroup`.
+    clock_offset_std : float or None
+        Standard deviation of a constant offset of `t` from the joints' clock [s], if that was only estimated.
     """
 
     name: str
@@ -150,6 +152,7 @@ class PointGroup(ReprMixin):
     frame: str = "world"
     camera_pose: Array | None = None
     clock: RecordedOrNominalTimes = "recorded"
+    clock_offset_std: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -458,6 +461,8 @@ def _validate_points(group: PointGroup, where: str) -> None:
         raise_data_error_unless(wrong.size == 0, what, f"{where}/std", f"0 to {_LARGEST_SPREAD:g} m")
     if group.camera_pose is not None:
         _check_pose(group.camera_pose, f"{where}, attribute pose")
+    if group.clock_offset_std is not None:
+        _validate_std(group.clock_offset_std, 0, "clock_offset_std", f"{where}, attribute", "one number [s]")
 
 
 def _check_distances(positions: Array, where: str, remedy: str = "") -> None:

@@ -46,7 +46,7 @@ _GAIN = "proportional_gain"
 _JOINT_UNITS = {"t": "s", **JOINT_CHANNEL_UNITS}
 _POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
 _JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_NOISE_AND_SERVO_CONSTANT_NAMES)
-_POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
+_POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "clock_offset_std", "std")
 
 
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
@@ -185,7 +185,7 @@ def _read_group(
         elif name in ("clock", "effort_kind", "sensor", "frame"):
             values[name] = _text(value, place)
         else:
-            values[name] = read_only_copy(value, place)
+            values[name] = read_only_copy(value, place)[()]
     return values
 
 

@@ -59,7 +59,8 @@ class SensorOptions:
         _NonNegative | None,
         OptionInfo(
             "standard deviation of a constant offset between the clocks of a point group and the joints, "
-            "independent in every recording; default: half a sample if damping is free, else 0",
+            "independent in every recording, which a fit corrects first if it exceeds half a sample; default: the "
+            "recording's, or else half a sample if damping is free, or else 0",
             "s",
         ),
     ] = None
@@ -131,6 +132,8 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
     def std(self) -> Array | None: ...
     @property
     def camera_pose(self) -> Array | None: ...
+    @property
+    def clock_offset_std(self) -> float | None: ...
 
 
 class RecordedJointsInterface(Protocol):

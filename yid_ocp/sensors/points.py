@@ -98,9 +98,10 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
 def _clock_offset_std(
     around: SensorDataInputs, sensor: PointSensor, group: RecordedPointGroup, choice: SensorOptions
 ) -> float:
-    """Standard deviation of the clock's offset [s]; zero if an effect of the model delays the group."""
-    if choice.clock_offset_std is not None:
-        return choice.clock_offset_std
+    """Standard deviation of the clock's offset [s]: stated, recorded, or half a sample unless an effect delays it."""
+    stated = group.clock_offset_std if choice.clock_offset_std is None else choice.clock_offset_std
+    if stated is not None:
+        return stated
     seen = [(channel, sensor.camera_pose is not None) for channel in sensor.channel_names]
     late = (effect.added_channel_delay(*own) for effect in around.system.effects for own in seen)
     own = is_point_group_measured_by_arm(group) or around.recording.joints is None or not around.has_uncertain_clocks

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
+from yid_ocp.analysis.clock_checks import problem_with_fitted_point_clocks
 from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_grasp_gaps_at_posture
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
@@ -175,9 +176,14 @@ def build_problem(
         problem = EstimationProblem(step, estimate, free, said, None, held_out)
     _check_grasps_close(run, problem)
     more = _object_point_issues(problem)
-    if more:
-        _raise_for_issues(run, more)
-        problem = problem.with_options(replace(said, data_issues=(*issues, *more)))
+    _raise_for_issues(run, more)
+    problem, clocks = problem_with_fitted_point_clocks(problem)
+    if clocks:  # what an uncertain clock alone put in doubt is in doubt no longer
+        corrected = ([episode.recording for episode in group] for group in (problem.episodes, problem.held_out))
+        left = {(doubt.cause, doubt.recording) for doubt in _check_recordings(run, system, free, *corrected)[2]}
+        issues = tuple(own for own in issues if own.weight == "warning" or (own.cause, own.recording) in left)
+    if more or clocks:
+        problem = problem.with_options(replace(said, data_issues=(*issues, *more, *clocks)))
     return problem
 
 

@@ -190,7 +190,7 @@ def propose_config_choices(
         _noise(first, recorded, joints),
         _time_step(period),
         _path_cutoff(recordings, joints, period) if branches and mode == "prescribed" else min(_CUTOFF, 0.2 / period),
-        {group.name: _clock(group.t, group.clock) for group in first.joint_and_point_groups},
+        {group.name: _clock(group) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
         *_motor_and_gain(robot, mode, recordings),
         bool(branches),
@@ -541,10 +541,11 @@ def _path_cutoff(recordings: Sequence[Recording], joints: Sequence[str], period:
     return cutoff
 
 
-def _clock(t: Array, clock: str) -> str:
-    steps = np.diff(t)
+def _clock(group: JointGroup | PointGroup) -> str:
+    steps = np.diff(group.t)
     if not len(steps):
         return "one sample"
     uneven = float(np.std(steps) / np.mean(steps))
-    said = f"{mean_sample_rate(t):.4g} Hz, a {clock} clock"
-    return said if uneven < 0.01 else f"{said}, uneven by {uneven:.0%}"
+    said = f"{mean_sample_rate(group.t):.4g} Hz, a {group.clock} clock" + f", uneven by {uneven:.0%}" * (uneven >= 0.01)
+    std = getattr(group, "clock_offset_std", None)
+    return said if std is None else f"{said}, known to ± {std:g} s (clock_offset_std), which a fit corrects"
