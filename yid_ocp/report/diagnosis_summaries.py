@@ -81,7 +81,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((channel, made, *sizes, entry["unit"]))
     yield SummaryTable(rows, "Without the effects, and with them")
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
-    if result.get("doubts"):
+    if any(own["weight"] != "warning" for own in result.get("doubts", ())):
         yield "issues of the recordings may have caused this verdict"
     if result["next_plan"] is not None:
         yield "to separate these effects, plan a motion:"

@@ -180,6 +180,7 @@ def build_problem(
     problem, clocks = problem_with_fitted_point_clocks(problem)
     if clocks:  # what an uncertain clock alone put in doubt is in doubt no longer
         corrected = ([episode.recording for episode in group] for group in (problem.episodes, problem.held_out))
+        _raise_for_issues(run, clocks)
         left = {(doubt.cause, doubt.recording) for doubt in _check_recordings(run, system, free, *corrected)[2]}
         issues = tuple(own for own in issues if own.weight == "warning" or (own.cause, own.recording) in left)
     if more or clocks:
