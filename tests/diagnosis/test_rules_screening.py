@@ -8,9 +8,10 @@ import pytest
 import scipy.stats
 from factories import alike, amplitude, cases, effect, point, score, shape, signature, visible
 from made_series import series
-from small_problems import PENDULUM, pendulum_step, taken
+from small_problems import PENDULUM, H, pendulum_step, taken
 
 from yid_ocp.diagnosis import screening
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.screening import (
     _candidate_detectable_amplitudes,
     _confusability_matrix,
@@ -19,10 +20,17 @@ from yid_ocp.diagnosis.screening import (
     _newey_west_covariance,
     _score_candidates,
     _shape_grid,
+    linearize_candidates,
+    screen_candidates,
 )
+from yid_ocp.effects import make_effect
 from yid_ocp.inference import null_test
 from yid_ocp.inference.null_test import channels_with_residual_indices, encoder_noise_residual_factor
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model.system import System
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.options import ProblemOptions
 
 CHI2 = scipy.stats.chi2
 ONE_SIDED = effect("friction@elbow", amplitude(lower=0.0, expected=(0.0, 1.0)))
@@ -80,6 +88,33 @@ def test_scores_scatter_with_the_encoders_noise_that_moves_an_arm(urdf_folder, h
         own = EstimationProblem(step, [noisy], ("elbow.damping",))
         scatter.append((own.evaluate(x, False).residual - problem.evaluate(x, False).residual)[rows])
     assert np.sum(found[rows] ** 2) == pytest.approx(np.mean(np.sum(np.square(scatter), axis=1)), rel=0.5)
+
+
+@pytest.mark.parametrize("kind", ["effort_gain", "effort_lag"])
+def test_noise_that_moves_an_arm_and_predicts_its_efforts_biases_no_score(kind, urdf_folder):
+    """What damps a predicted effort damps the noise of its acceleration, and is no effect for that."""
+    robot, damping = read_urdf(urdf_folder / "servo_pendulum.urdf"), {"joint": 0.05}
+    step = compile_step(System.build(robot, prescribed=["joint"], damping=damping), H, use_compiler=False)
+    smooth, options = replace(taken(step, 4, steps=300), points=()), ProblemOptions(path_cutoff=40.0)
+    problem, group = EstimationProblem(step, [smooth], ("joint.damping",), options), smooth.joints
+    [exact] = problem.evaluate(problem.initial_unknowns, False).episode_predictions
+    effort = np.interp(group.t, group.t[:-1] + H / 2, exact.rollout.effort[:, 0])[:, None]
+    z, p_values = [], []
+    for seed in range(4):
+        position, read = np.random.default_rng(seed).standard_normal((2, *effort.shape)) * [[[6e-4]], [[0.01]]]
+        noisy = {"position": group.position + position, "effort": effort + read, "position_std": 6e-4}
+        own = replace(smooth, joints=replace(group, **noisy, effort_std=0.01))
+        made = EstimationProblem(step, [own], problem.free, options)
+        made = AllCandidatesProblem.from_problem(made, [make_effect(kind, "joint", step.system)])
+        found = linearize_candidates(made, (), {"joint.damping": 0.05})
+        [signature], [score] = found.signatures, screen_candidates(made, (), {"joint.damping": 0.05}).candidate_scores
+        raw = (signature.projected_sensitivity.T @ found.projected_residual).item()
+        z.append([part / signature.score_noise_covariance.item() ** 0.5 for part in (raw, signature.score_bias.item())])
+        p_values.append(score.p_value)
+    raw, bias = np.mean(z, axis=0)
+    assert abs(raw) > 5.0
+    assert bias == pytest.approx(raw, abs=1.0)
+    assert min(p_values) > 0.01
 
 
 @pytest.mark.parametrize("colour", [(1.0,), (1.0, 0.6), (1.0, 0.5, -0.3), (1.0, *[0.1] * 40)])

@@ -106,7 +106,8 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     columns = (column, column - lean * residual)
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
     signatures = tuple(
-        _EffectSignature(effect, values, x, x.T @ x, 0 * x.T @ x) for values, x in zip(grid, columns, strict=True)
+        _EffectSignature(effect, own, x, x.T @ x, 0 * x.T @ x, np.zeros(1))
+        for own, x in zip(grid, columns, strict=True)
     )
     point = ProjectedCandidatesLinearization(residual[:, 0], signatures)
     best = _score_candidates(point, [series(range(200))], _candidate_detectable_amplitudes(point))[0]

@@ -98,7 +98,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "bad lines alone": ("run.csv", "t,q_a\n0,x\n", "--skip-bad-lines", "no rows"),
     "an unknown unit": ("run.csv", GOOD, "--units furlong", "the unit 'furlong' is unknown"),
     "a joint that is not there": ("run.csv", GOOD, "--joints b", "no joint 'b'"),
-    "text in place of a pair": ("run.csv", GOOD, "--points tip", "'tip' is not NAME=VALUE"),
+    "text in place of a pair": ("run.csv", GOOD, "--points tip=", "'tip=' is not NAME=VALUE"),
     "text in place of a number": ("run.csv", GOOD, "--gear-ratios a=fast", "'fast' is not a number"),
     "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "not that of a"),
     "an option of another format": ("run.csv", GOOD, "--joint-topic /j", "no option 'joint_topics'"),

@@ -6,7 +6,9 @@ the amplitudes of candidate j, and P = I - J_theta J_theta^+:
     G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
 
 S_j = G_j for white noise of unit standard deviation. Encoders' noise that moves prescribed arms adds E_j E_j', where
-E_j = J_j' P e for draws e of what it does to the residual. For autocorrelated noise, S_j is the sum of the scores'
+E_j = J_j' P e for draws e of what it does to the residual. In efforts it changes sensitivity and residual together,
+which biases s_j by -E[dJ_j' P dr] (errors in variables). Further draws of it give the bias, which is subtracted (Cook
+and Stefanski 1994, doi:10.1080/01621459.1994.10476871). For autocorrelated noise, S_j is the sum of the scores'
 autocovariances after the candidate's step (Bartlett weights, Newey and West 1987, doi:10.2307/1913610). The linear
 model predicts a decrease of r'r by s_j' G_j^-1 s_j, or less if an amplitude would leave its bounds. Shape parameters
 are tried on a grid, and the best p-value is corrected for that many trials (Davies 1987, doi:10.1093/biomet/74.1.33,
@@ -33,7 +35,12 @@ from yid_ocp.inference.null_test import (
     channels_with_residual_indices,
     chi2_p_value,
     encoder_noise_residual_factor,
+    episodes_with_path_noise_redrawn,
 )
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+
+_N_BIAS_DRAWS = 2  # of encoder noise, for the bias of scores
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,7 @@ class _EffectSignature:
     projected_sensitivity: Array  # X = P J_j, shape (nr, p), by its amplitudes
     score_noise_covariance: Array  # shape (p, p): covariance of X'r under the noise's own autocorrelation
     score_prior_covariance: Array  # shape (p, p): the part of it that stated priors make
+    score_bias: Array  # E[X'r] - E[X]'E[r], shape (p,): encoder noise moves both X and r
 
 
 @dataclass(frozen=True)
@@ -98,6 +106,10 @@ def linearize_candidates(
     placed = problem.with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
     scatter = encoder_noise_residual_factor(placed, placed.unknown_vector(values))[rows.data]
+    is_in_scatter = np.any(scatter, axis=1)
+    is_noisy = placed.system.prescribed and not is_in_scatter.all()
+    rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
+    redrawn = [episodes_with_path_noise_redrawn(placed, rng) for _ in draws]
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
     for shapes in itertools.zip_longest(*(_shape_grid(effect, grid) for effect in tried)):
         chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]
@@ -112,15 +124,39 @@ def linearize_candidates(
         places = [trial.unknown_names.index(name) for name in amplitudes]
         basis = _basis(np.delete(jacobian, places, axis=1))
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
+        changes = _changes_by_path_noise(trial, redrawn, values, (data, jacobian))
+        errors = [change[rows.data] * ~is_in_scatter for change, _ in changes]
+        shifts = [part - basis @ (basis.T @ part) for part in (change[:, places] for _, change in changes)]
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
-        for (effect, shape), part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
-            columns = np.ascontiguousarray(part)
+        parts = zip(*(np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, *shifts)), strict=True)
+        for (effect, shape), (columns, *shifted) in zip(chosen, parts, strict=True):
             driven = columns[rows.data].T @ scatter
             priors = columns[rows.stated_priors] / problem.problem.options.stated_std_factor
             by_priors = priors.T @ priors
             noise = _covariance_of_scores(columns, series) + driven @ driven.T + by_priors
-            signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors))
+            bias = np.zeros(columns.shape[1])
+            for own, error in zip(shifted, errors, strict=True):
+                noise += _covariance_of_scores(own, series) / len(errors) ** 2
+                bias += own[rows.data].T @ error / len(errors)
+            signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors, bias))
     return ProjectedCandidatesLinearization(residual, tuple(signatures))
+
+
+def _changes_by_path_noise(
+    trial: EstimationProblem,
+    draws: Sequence[Sequence[Episode]],
+    values: Mapping[str, float],
+    before: tuple[Array, Array],
+) -> list[tuple[Array, Array]]:
+    """Changes of residual and Jacobian by each draw of the noise that moves an arm, without draws that fail."""
+    found = []
+    for episodes in draws:
+        again = trial.with_episodes(episodes, ())
+        evaluation = again.evaluate(again.unknown_vector(values))
+        if evaluation.ok:
+            after = residual_and_jacobian_without_weak_priors(again, evaluation)
+            found.append((after[0] - before[0], after[1] - before[1]))
+    return found
 
 
 def _basis(matrix: Array) -> Array:
@@ -212,7 +248,7 @@ def _promised(information: Array, slope: Array, room: Array) -> tuple[Array, flo
 
 def _score(signature: _EffectSignature, residual: Array, series: Sequence[ChannelResidualIndices]) -> CandidateScore:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
-    slope = -(x.T @ residual)
+    slope = signature.score_bias - x.T @ residual
     room = _room(effect)
     step, decrease = _promised(x.T @ x, slope, room)
     # without the candidate's share of the residual, which would hide its significance
@@ -295,7 +331,8 @@ def _make_joint_score_model(
         kept.append(next((s for s in group if s.shape_values == shape.get(label)), group[len(group) // 2]))
     every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
     effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
-    return AllCandidatesScoreModel(effects, shapes, every.T @ every, -(every.T @ point.projected_residual))
+    bias = np.concatenate([np.zeros(0), *(s.score_bias for s in kept)])
+    return AllCandidatesScoreModel(effects, shapes, every.T @ every, bias - every.T @ point.projected_residual)
 
 
 def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:

@@ -162,16 +162,19 @@ def encoder_noise_residual_factor(
         return nothing
     rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
     for _ in range(_N_PATH_NOISE_DRAWS):
-        drawn = [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
-        after = residual_of(problem.with_episodes(drawn, ()))
+        after = residual_of(problem.with_episodes(episodes_with_path_noise_redrawn(problem, rng), ()))
         if after is not None:
             found.append(np.zeros(len(before)))
             found[-1][at] = (after - before)[at]
     return np.stack(found, axis=1) / np.sqrt(len(found)) if found else nothing
 
 
+def episodes_with_path_noise_redrawn(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
+    """Episodes moved by their recorded angles with one more draw of their encoders' noise. Measurements stay."""
+    return [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
+
+
 def _with_path_noise_redrawn(episode: Episode, problem: EstimationProblem, rng: np.random.Generator) -> Episode:
-    """The episode moved by its recorded angles with one more draw of their encoders' noise. Measurements stay."""
     joints, system, options = episode.recording.joints, problem.system, problem.options
     names = () if joints is None else tuple(name for name in system.prescribed if name in joints.names)
     if joints is None or not names:

@@ -221,12 +221,13 @@ def _flag(key: str) -> str:
 
 
 def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
-    """`KEY=VALUE` entries as a mapping; for columns also values without a key, in order."""
+    """`KEY=VALUE` entries as a mapping; for columns also values without a key, in order; a point alone is itself."""
     if option == "column_meanings" and not any("=" in entry for entry in entries):
         return {str(i + 1): entry for i, entry in enumerate(entries)}
     pairs: dict[str, Any] = {}
     for entry in entries:
-        key, equals, value = (part.strip() for part in entry.rpartition("="))
+        text = f"{entry}={entry}" if option == "point_names" and "=" not in entry else entry
+        key, equals, value = (part.strip() for part in text.rpartition("="))
         try:
             pairs[key] = _MAPPINGS[option](value)
         except ValueError as error:
