@@ -37,6 +37,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
@@ -139,7 +140,7 @@ def examined(law: str, seed: int, size: str, changes: Sequence[str]) -> dict[str
         write_recording(recorded(seed, truth), file)
         chi2, value, std, of_noise = fitted(law, file, truth, changes, amplitude)
         if size == "small":
-            truth = {**truth, amplitude: 3 * DEFAULT_THRESHOLDS.detectable_amplitude_z * of_noise}
+            truth = {**truth, amplitude: 3 * DETECTABLE_AMPLITUDE_Z * of_noise}
             write_recording(recorded(seed, truth), file)
             chi2, value, std, of_noise = fitted(law, file, truth, changes, amplitude)
         simpler = {name: own for name, own in truth.items() if name in of_law(neighbour)}

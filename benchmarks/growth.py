@@ -33,7 +33,6 @@ from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis.diagnose import fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.files import write_strict_json
 from yid_ocp.integrator import compiled
 from yid_ocp.parallel import Task, WorkerConfig, process_pool, run_tasks
@@ -108,9 +107,9 @@ def screening(settings: Sequence[str], count: int) -> dict[str, float]:
     before = peak()
     composed = AllCandidatesProblem.from_problem(problem, effects)
     nominal = fit_nominal_model(problem, composed)
-    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_parameter_grid_size)  # compiles
+    linearize_candidates(composed, (), nominal.values)  # compiles
     begun = time.process_time()
-    linearize_candidates(composed, (), nominal.values, DEFAULT_THRESHOLDS.shape_parameter_grid_size)
+    linearize_candidates(composed, (), nominal.values)
     return {"cpu": time.process_time() - begun, "memory": peak() - before, "candidates": len(effects)}
 
 

@@ -220,11 +220,11 @@ def test_an_effort_behind_a_filter_is_noisier_than_what_is_left_of_it(twin, push
 
 
 def test_a_force_that_is_never_sure_is_no_event():
-    limits, std = Thresholds(), np.full((10, 1), 0.1)
+    std = np.full((10, 1), 0.1)
     for sure, expected in ((0, []), (1, ["T1.0"]), (9, [])):
         mean = np.zeros((10, 1))
         mean[:sure] = 5.0
-        assert _short(smoothed({FORCE: 1.0}, traces=[trace([FORCE], mean, std)]), 0, limits) == expected
+        assert _short(smoothed({FORCE: 1.0}, traces=[trace([FORCE], mean, std)]), 0) == expected
 
 
 def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
@@ -277,8 +277,8 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
     monkeypatch.setattr(module, "find_force_and_fault_events", lambda *_: events)
     heavy = [bench.recording({"link_mass@elbow": {"scale": 1.3}}, seed, 2.0) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
-        limits = Thresholds(min_force_event_gap_fraction=share)
-        finding = diagnose(bench.problem(heavy[:1]), ["effort_offset@elbow"], heavy[1:], thresholds=limits)
+        monkeypatch.setattr(module, "_MIN_FORCE_EVENT_GAP_FRACTION", share)
+        finding = diagnose(bench.problem(heavy[:1]), ["effort_offset@elbow"], heavy[1:])
         assert finding.verdict == "unknown"
         assert finding.events.disturbances == expected
 

@@ -123,7 +123,7 @@ def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     monkeypatch.setattr(ensemble, "_nominal_problem", lambda recordings: SimpleNamespace(system="system"))
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
     monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
-    monkeypatch.setattr(module, "linearize_candidates", lambda of, base, values, grid: of)
+    monkeypatch.setattr(module, "linearize_candidates", lambda of, base, values: of)
     assert ensemble._linearize_clean_recordings().problem == "by all noise"
 
 

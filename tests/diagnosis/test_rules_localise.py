@@ -49,8 +49,6 @@ def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
     seen = smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces)
     found = {p.location: p.time_windows for p in gap_locations_by_smoother_evidence(seen)}
     assert found == {"T1": ((0.0, 1.0), (1.5, 2.0)), "T2": ((0.5, 1.5),)}
-    first, second = gap_locations_by_smoother_evidence(seen, 5.0)
-    assert (first.time_windows, second.time_windows) == ((), ((0.5, 1.5),))
 
 
 @cases(
@@ -108,18 +106,18 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
 
 
 @cases(
-    "variance, std, mean, mapped, expected",
+    "variance, std, mean, expected",
     {
-        "informed": (4.0, 1.0, 3.0, 0.5, 3.0),
-        "at the limit": (4.0, 1.0, 3.0, 0.75, math.nan),
-        "just above": (4.0, 1.0, 3.0, 0.74, 3.0),
-        "not at work": (0.0, 1.0, 3.0, 0.5, math.nan),
-        "not informed": (1.0, 0.9, 3.0, 0.5, math.nan),
+        "informed": (4.0, 1.0, 3.0, 3.0),
+        "at the limit": (2.0, 1.0, 3.0, math.nan),
+        "just above": (2.1, 1.0, 3.0, 3.0),
+        "not at work": (0.0, 1.0, 3.0, math.nan),
+        "not informed": (1.0, 0.9, 3.0, math.nan),
     },
 )
-def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expected):
+def test_only_informed_values_are_on_the_map(variance, std, mean, expected):
     found = smoothed({FORCE: 1.0}, variance={FORCE: variance}, traces=[trace([FORCE], [[mean]], [[std]])])
-    edges, names, values = z_scores_of_smoothed_unknowns(found, informed_fraction=mapped)
+    edges, names, values = z_scores_of_smoothed_unknowns(found)
     np.testing.assert_allclose(values, [[expected]])
     assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
 

@@ -39,6 +39,11 @@ PAIR = effect("tilt@world", amplitude("x", lower=-9.0, upper=9.0), amplitude("y"
 SHAPED = effect("branch@T1", amplitude(), shape())
 
 
+@pytest.fixture(autouse=True)
+def detectable_at_two_standard_deviations(monkeypatch):
+    monkeypatch.setattr(screening, "DETECTABLE_AMPLITUDE_Z", 2.0)
+
+
 def only(of, columns, residual, noise=None, **shapes):
     """The score of one candidate that is visible."""
     at = point(residual, signature(of, columns, noise, **shapes))
@@ -157,21 +162,21 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
 )
 def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
     of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
-    [found] = _candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)), z=2.0)
+    [found] = _candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)))
     assert found.detectable_amplitudes == {"friction@elbow.a": pytest.approx(size)}
     assert found.is_detectable is seen
 
 
 def test_the_range_counts_from_the_neutral_value():
     of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
-    found = [_candidate_detectable_amplitudes(point([0.0], signature(of, [c])), 2.0)[0] for c in (6.0, 8.0)]
+    found = [_candidate_detectable_amplitudes(point([0.0], signature(of, [c])))[0] for c in (6.0, 8.0)]
     assert [entry.is_detectable for entry in found] == [False, True]
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
 def test_the_best_shape_tells_what_is_detectable(order):
     at = point([0.0], *(signature(SHAPED, [size], s=size) for size in order))
-    [found] = _candidate_detectable_amplitudes(at, z=2.0)
+    [found] = _candidate_detectable_amplitudes(at)
     assert found.detectable_amplitudes["branch@T1.a"] == pytest.approx(0.5)
     assert found.is_detectable
 
@@ -186,7 +191,7 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
         ((seen, weaker), "y", 0.5, True),
         ((hidden, larger), "x", 0.1, False),
     ):
-        [found] = _candidate_detectable_amplitudes(point([0.0], *pair), z=2.0)
+        [found] = _candidate_detectable_amplitudes(point([0.0], *pair))
         assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
 
 

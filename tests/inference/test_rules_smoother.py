@@ -14,7 +14,6 @@ import threadpoolctl
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
 from yid_ocp.inference.smoother import (
     gap_locations_by_smoother_evidence,
@@ -141,17 +140,8 @@ class Dense:
 
 def smoothed(monkeypatch, models, **limits):
     """The smoother on linear models as they are."""
-    told = {}
-
-    def linear_model(problem, x, evaluation, given):
-        told["limits"] = given
-        return tuple(models)
-
-    monkeypatch.setattr(smoother, "residual_models_with_smoother_unknowns", linear_model)
-    chosen = Thresholds(**limits)
-    found = smoother.select_and_smooth_unknowns(SimpleNamespace(), np.zeros(0), None, chosen)
-    assert told["limits"] == chosen
-    return found
+    monkeypatch.setattr(smoother, "residual_models_with_smoother_unknowns", lambda *_: tuple(models))
+    return smoother.select_and_smooth_unknowns(SimpleNamespace(), np.zeros(0), None, **limits)
 
 
 NOTHING = dict.fromkeys(SOURCES, 0.0)
@@ -224,8 +214,9 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
         less = Dense(models, found.group_variance | {source: 0.0}).log_evidence
         assert found.log_evidence_drop[source] == pytest.approx(full - less, rel=1e-6)
     assert found.plant_or_sensor_origin == "both"
-    assert sum(v > 0 for v in smoothed(monkeypatch, models, max_smoother_unknown_groups=2).group_variance.values()) == 2
-    assert not any(smoothed(monkeypatch, models, min_log_bayes_factor=1e6).group_variance.values())
+    assert not any(smoothed(monkeypatch, models, least=1e6).group_variance.values())
+    monkeypatch.setattr(smoother, "_MAX_GROUPS", 2)
+    assert sum(v > 0 for v in smoothed(monkeypatch, models).group_variance.values()) == 2
 
 
 def test_noise_alone_takes_nothing_in(monkeypatch):
@@ -278,8 +269,6 @@ def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
     for column, source in enumerate(SOURCES):
         expected = math.sqrt(10.0 / reference.scores(0, column)[1])
         assert found.detectable_std[source] == pytest.approx(expected, rel=1e-8)
-    more = smoothed(monkeypatch, models, detectable_unknown_chi2_rise=40.0)
-    assert more.detectable_std == {s: pytest.approx(2 * v) for s, v in found.detectable_std.items()}
 
 
 @pytest.mark.parametrize("unknown", [0, 2])
@@ -316,14 +305,11 @@ def test_a_place_that_does_as_well_is_told():
     twice = replace(model, intervals=tuple(intervals), unknown_groups=(HERE, LIKE, OTHER))
     variance = {HERE: 50.0, LIKE: 0.0, OTHER: 0.0}
     none, state = (smoother._run([twice], own) for own in (dict.fromkeys(variance, 0.0), variance))
-    drop, found = smoother._alternatives([twice], variance, none, state, Thresholds())
+    drop, found = smoother._alternatives([twice], variance, none, state, 5.0)
     assert drop[HERE] > 100
     assert found == {HERE: (LIKE,)}
-    strict, better = (
-        Thresholds(min_tied_evidence_ratio=1.0, min_log_bayes_factor=1e-9),
-        replace(state, log_evidence=1e6),
-    )
-    assert LIKE not in smoother._alternatives([twice], variance, none, better, strict)[1][HERE]
+    better = replace(state, log_evidence=state.log_evidence + 0.2 * drop[HERE])
+    assert LIKE not in smoother._alternatives([twice], variance, none, better, 1e-9)[1][HERE]
 
 
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():

@@ -18,7 +18,11 @@ from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import ProjectedCandidatesLinearization, linearize_candidates
+from yid_ocp.diagnosis.screening import (
+    DETECTABLE_AMPLITUDE_Z,
+    ProjectedCandidatesLinearization,
+    linearize_candidates,
+)
 from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_within_segment
@@ -302,7 +306,7 @@ class BlindCaseGenerator:
         nominal = fit_nominal_model(problem, composed, limits=self._limits)
         # whitened by all noise, including torque noise
         composed = replace(composed, problem=nominal.problem)
-        return linearize_candidates(composed, (), nominal.values, self._limits.shape_parameter_grid_size)
+        return linearize_candidates(composed, (), nominal.values)
 
     @cached_property
     def _detectable(self) -> tuple[_Detectable, ...]:
@@ -398,10 +402,10 @@ class BlindCaseGenerator:
         if seen <= 0:
             return None
         reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
-        times = min(wanted * self._limits.detectable_amplitude_z / seen, float(reach))
+        times = min(wanted * DETECTABLE_AMPLITUDE_Z / seen, float(reach))
         values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
         reported = {name: told.value for name, told in effect.parameters_as_reported(values).items()}
-        relative_size = times * seen / self._limits.detectable_amplitude_z
+        relative_size = times * seen / DETECTABLE_AMPLITUDE_Z
         return InjectedEffect(effect.kind, effect.location, reported), relative_size
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:

@@ -283,7 +283,6 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
         min_excess_chi2_per_dof=-1.0,
         min_channel_excess_chi2_per_dof=-1.0,
         min_log_bayes_factor=1e-9,
-        max_smoother_unknown_groups=1,
         min_gap_closed=-math.inf,
         max_effects=1,
     )

@@ -60,6 +60,7 @@ from yid_ocp.problem.measurements import ResidualAndJacobian, subtract_estimated
 from yid_ocp.solvers import GaussNewton, Solution, solve
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
+_MIN_FORCE_EVENT_GAP_FRACTION = 0.1  # of the gap that force events must remove
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
@@ -156,7 +157,7 @@ def _examined(
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     # the whitening of all hypotheses is fixed here
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
-    screened = screen_candidates(composed, (), nominal.values, limits)
+    screened = screen_candidates(composed, (), nominal.values)
     evidence = NominalModelGapEvidence(nominal, *tests, screened, _offsets_stated(nominal.problem))
     _end_stage(search, "screening")
     if evidence.has_gap(limits) and evidence.are_data_sufficient(limits):
@@ -260,7 +261,7 @@ def _happened(
         return NO_EVENTS, None
     smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
-    (pushed, others), share = found.split_force_from_other_events(), 1 - limits.min_force_event_gap_fraction
+    (pushed, others), share = found.split_force_from_other_events(), 1 - _MIN_FORCE_EVENT_GAP_FRACTION
     if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
         found = others
     return found, smoothed
@@ -295,7 +296,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         search.progress.begin_stage("locating the gap", 1.0, 2.0)
         # without events, the smoother already ran on all fitted data
         smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
-        located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed, limits.gap_window_z)
+        located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     end_stage("localisation")
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selections:
@@ -380,7 +381,7 @@ def _after(
     """Held-out null test with the accepted effects, locations of the gap, and locations of the residual gap."""
     tests, rest = (_estimation_null_test(last, limits), _held_out_null_test(last, limits)), tuple[GapLocation, ...]()
     if null_test.residuals_exceed_noise(tests, limits.null_test_limits):
-        rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.gap_window_z)
+        rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits))
     windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
     where = smoother.gap_locations_from_effects_and_smoother(where, judged.closure_by_location, rest, windows)
     return tests[1], where, rest
@@ -415,8 +416,8 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 
 def _null_test(problem: EstimationProblem, residual: Array, fitted: float, limits: Thresholds) -> NullTestResult:
     """The null test of a residual after a fit of the given number of parameters."""
-    samples, level = null_test.channels_with_residual_indices(problem), limits.significance_level
-    return null_test.residual_chi2_null_test(samples, residual, fitted, level, limits.residual_test_window)
+    samples = null_test.channels_with_residual_indices(problem)
+    return null_test.residual_chi2_null_test(samples, residual, fitted, limits.significance_level)
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
@@ -468,4 +469,4 @@ def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnkno
         ]
         problem = problem.with_episodes(less, ())
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
-    return smoother.select_and_smooth_unknowns(problem, x, evaluation, limits)
+    return smoother.select_and_smooth_unknowns(problem, x, evaluation, limits.min_log_bayes_factor)

@@ -32,6 +32,7 @@ from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
 from yid_ocp.inference.smoother import (
+    SIGNIFICANT_Z,
     SmoothedUnknownsResult,
     force_log_likelihood_coefficients,
     generalised_force_unit,
@@ -50,6 +51,7 @@ from yid_ocp.sensors.joints import quantization_step
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of that."""
 
+_INVERSE_DYNAMICS_RTOL = 0.03  # relative torque error of a good model
 _FORCE_INTERVAL = 0.05  # interval of constant unknown force in the search for events [s]
 _MAX_SPAN_POINTS = 250  # maximum number of points of a force history processed together
 _MAX_WRONG_SAMPLES = 3  # largest number of consecutive wrong samples; more are a gap or a stuck channel
@@ -154,7 +156,7 @@ def find_force_and_fault_events(
     torques = InverseDynamicsTerms(problem.step)
     histories = [history for run in runs for history in _read_forces(problem, run, torques, limits)]
     if smoothed is not None:
-        histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques, limits)
+        histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques)
     cut = [entry for entry in (_before_overspeed(history, ends) for history in histories) if entry is not None]
     sought = [(history, *detect_force_pulses(history, limits)) for history in cut]
     found, tries = [(history, pulse) for history, own, _ in sought for pulse in own], sum(n for *_, n in sought)
@@ -191,16 +193,14 @@ def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate |
     return None if len(keep) < 10 else history.subset_at_indices(keep)
 
 
-def _allowed(
-    torques: InverseDynamicsTerms, run: _RecordingRollout, nodes: IntArray, limits: Thresholds
-) -> tuple[Array, Array]:
+def _allowed(torques: InverseDynamicsTerms, run: _RecordingRollout, nodes: IntArray) -> tuple[Array, Array]:
     """Assumed model error of every coordinate's torque, and the torque that friction can hold, (M, n)."""
     episode, result, theta = run
     terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
     joints = episode.recording.joints
     # the time of a torque is known to one sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
-    error = np.hypot(limits.inverse_dynamics_rtol * terms.rss_torque, late * terms.torque_rate)
+    error = np.hypot(_INVERSE_DYNAMICS_RTOL * terms.rss_torque, late * terms.torque_rate)
     return error, terms.static_friction_limit
 
 
@@ -213,7 +213,7 @@ def _read_forces(
     for samples, predicted in zip(unbiased, result.predicted_outputs, strict=True):
         if not samples.sensor.effort_joints or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
-        error, held = _allowed(torques, run, samples.node, limits)
+        error, held = _allowed(torques, run, samples.node)
         unit_effort = samples.sensor.effort_per_unit_reading
         weight = np.where(samples.positive_weight_mask, samples.weight, 0.0) / unit_effort
         value = np.where(samples.positive_weight_mask, predicted - samples.value, 0.0) * unit_effort
@@ -246,20 +246,19 @@ def _driving_forces(
     runs: Sequence[_RecordingRollout],
     smoothed: SmoothedUnknownsResult,
     torques: InverseDynamicsTerms,
-    limits: Thresholds,
 ) -> list[ForceEstimate]:
     """Force estimates of coordinates moved by unknown forces, if the smoother found some for a part of the time."""
-    sought = {trace.recording: _short(smoothed, i, limits) for i, trace in enumerate(smoothed.smoothed_unknowns)}
+    sought = {trace.recording: _short(smoothed, i) for i, trace in enumerate(smoothed.smoothed_unknowns)}
     found: list[ForceEstimate] = []
     if not any(sought.values()):
         return found
     with threadpoolctl.threadpool_limits(1):
-        models = residual_models_with_smoother_unknowns(problem, x, evaluation, limits, _FORCE_INTERVAL)
+        models = residual_models_with_smoother_unknowns(problem, x, evaluation, _FORCE_INTERVAL)
         for model, run in zip(models, runs, strict=False):
             if not sought[model.recording]:
                 continue
             middle = (model.interval_edges[:-1] + model.interval_edges[1:]) / 2
-            error, held = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
+            error, held = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64))
             # the last interval is shorter
             full = slice(0, max(len(middle) - 1, 1))
             for name in sought[model.recording]:
@@ -273,11 +272,11 @@ def _driving_forces(
     return found
 
 
-def _short(smoothed: SmoothedUnknownsResult, recording: int, limits: Thresholds) -> list[str]:
+def _short(smoothed: SmoothedUnknownsResult, recording: int) -> list[str]:
     """Unknown forces that are significant, but only for a small part of the time."""
     trace, names = smoothed.smoothed_unknowns[recording], []
     for i, source in enumerate(trace.unknown_groups):
-        sure = smoothed_unknown_significance_mask(trace, [i], limits.gap_window_z)
+        sure = smoothed_unknown_significance_mask(trace, [i])
         is_force = source.kind == "force" and not source.is_confounded_with_bias and smoothed.group_variance[source]
         if is_force and 0 < np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
             names.append(trace.unknown_names[i])
@@ -308,7 +307,7 @@ def _without_forces_of_motion(
     A force comes with the motion if more recordings than by chance have the same force, or if one recording has more
     than by chance of the same forces as its own recording. Numbers by chance are Poisson distributed.
     """
-    pairs = np.array([[_recurrence(one, other, durations, limits.gap_window_z) for other in forces] for one in forces])
+    pairs = np.array([[_recurrence(one, other, durations) for other in forces] for one in forces])
     pairs = pairs.reshape(len(forces), len(forces), 2)
     names = list(dict.fromkeys(force.recording for force in forces))
     recording = np.array([names.index(force.recording) for force in forces], int)
@@ -325,16 +324,14 @@ def _without_forces_of_motion(
     return [force for force, is_common in zip(forces, common, strict=True) if not is_common]
 
 
-def _recurrence(
-    one: ForceOrFaultEvent, other: ForceOrFaultEvent, durations: Mapping[str, float], z: float
-) -> tuple[bool, float]:
+def _recurrence(one: ForceOrFaultEvent, other: ForceOrFaultEvent, durations: Mapping[str, float]) -> tuple[bool, float]:
     """Whether another recording has the same force, and the probability of that if `other` came at a random time.
 
-    The same force acts on the same coordinate at the same time, with the same impulse within `z` standard deviations.
+    The same force acts on the same coordinate at the same time, with the same impulse within `SIGNIFICANT_Z` stds.
     """
     shorter, longer = sorted(force.end_time - force.start_time for force in (one, other))
     apart, std = abs(one.impulse - other.impulse), math.hypot(one.impulse_std, other.impulse_std)
-    is_alike = one.channel == other.channel and one.impulse * other.impulse > 0 and apart <= z * std
+    is_alike = one.channel == other.channel and one.impulse * other.impulse > 0 and apart <= SIGNIFICANT_Z * std
     if one.recording == other.recording or not is_alike or shorter <= _MIN_RECURRENCE_OVERLAP * longer:
         return False, 0.0
     return one._overlap(other) > _MIN_RECURRENCE_OVERLAP * longer, shorter / durations[other.recording]

@@ -194,8 +194,7 @@ class RefitContext:
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
         """Screen all candidates in addition to some effects. `name` says which fit provides `values`."""
-        asked = (self.problem, base, values, self.thresholds)
-        return self._answer(self.record.screenings, name, lambda: screen_candidates(*asked))
+        return self._answer(self.record.screenings, name, lambda: screen_candidates(self.problem, base, values))
 
     def ranked_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, without one label. See `_MAX_RECORDED_PAIRS`."""

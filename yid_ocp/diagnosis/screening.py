@@ -26,7 +26,6 @@ import scipy.linalg
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
@@ -40,6 +39,8 @@ from yid_ocp.inference.null_test import (
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 
+DETECTABLE_AMPLITUDE_Z = 2.576 + 1.282  # found with 90 % power at the 1 % level [standard deviations]
+_SHAPE_GRID_SIZE = 4  # values tried per shape parameter
 _N_BIAS_DRAWS = 2  # of encoder noise, for the bias of scores
 
 
@@ -83,7 +84,7 @@ class CandidateScore:
     p_value: float
 
 
-def _shape_grid(effect: EffectBase, size: int = DEFAULT_THRESHOLDS.shape_parameter_grid_size) -> list[dict[str, float]]:
+def _shape_grid(effect: EffectBase, size: int = _SHAPE_GRID_SIZE) -> list[dict[str, float]]:
     """Grid values of a candidate's shape parameters, uniform or log-uniform over the prior range."""
     ranges = {name: effect.prior_ranges[name] for name in effect.shape_parameter_names}
     axes = [(np.geomspace if low > 0 else np.linspace)(low, high, size) for low, high in ranges.values()]
@@ -94,12 +95,11 @@ def linearize_candidates(
     problem: AllCandidatesProblem,
     base: Sequence[EffectBase],
     values: Mapping[str, float],
-    grid: int = DEFAULT_THRESHOLDS.shape_parameter_grid_size,
 ) -> ProjectedCandidatesLinearization:
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
     The model contains the effects in `base`, with all their parameters free. `values` are the fitted unknowns of this
-    model. `grid` is the number of values per shape parameter. Raises `SolverError` if the rollout at `values` fails.
+    model. Raises `SolverError` if the rollout at `values` fails.
     """
     labels = {effect.label for effect in base}
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
@@ -111,7 +111,7 @@ def linearize_candidates(
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
     redrawn = [episodes_with_path_noise_redrawn(placed, rng) for _ in draws]
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
-    for shapes in itertools.zip_longest(*(_shape_grid(effect, grid) for effect in tried)):
+    for shapes in itertools.zip_longest(*map(_shape_grid, tried)):
         chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]
         amplitudes = [name for effect, _ in chosen for name in effect.amplitude_parameter_names]
         trial = placed.with_free_parameters_without_recompiling((*placed.free, *amplitudes))
@@ -167,16 +167,17 @@ def _basis(matrix: Array) -> Array:
 
 
 def _candidate_detectable_amplitudes(
-    point: ProjectedCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
+    point: ProjectedCandidatesLinearization,
 ) -> tuple[CandidateDetectability, ...]:
-    """Smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
+    """Smallest amplitudes of every candidate that are detectable at `DETECTABLE_AMPLITUDE_Z` stds."""
     found: dict[str, list[CandidateDetectability]] = {}
     for signature in point.signatures:
         effect, names = signature.effect, signature.effect.amplitude_parameter_names
         information = signature.projected_sensitivity.T @ signature.projected_sensitivity
         inverse = _pinv(information)
         variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
-        sizes = np.where(np.diag(information) > 1e-16, z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
+        sizes = DETECTABLE_AMPLITUDE_Z * np.sqrt(np.maximum(variance, 0.0))
+        sizes = np.where(np.diag(information) > 1e-16, sizes, np.inf)
         room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
         least = dict(zip(names, map(float, sizes), strict=True))
         found.setdefault(effect.label, []).append(CandidateDetectability(effect, least, bool(np.any(sizes < room))))
@@ -365,11 +366,10 @@ def screen_candidates(
     problem: AllCandidatesProblem,
     base: Sequence[EffectBase],
     values: Mapping[str, float],
-    limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> ScreeningResult:
     """Screen all candidates not in `base` at `values` for detectability, scores and confusability."""
-    point = linearize_candidates(problem, base, values, limits.shape_parameter_grid_size)
-    visible = _candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
+    point = linearize_candidates(problem, base, values)
+    visible = _candidate_detectable_amplitudes(point)
     ranked = _score_candidates(point, channels_with_residual_indices(problem.problem), visible)
     everything = _make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)

@@ -7,19 +7,22 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, RESIDUAL_WINDOW_SECONDS
-from yid_ocp.inference.smoother_model import SmootherOptions
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
+from yid_ocp.inference.smoother import DEFAULT_MIN_LOG_BAYES_FACTOR
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.options import ExcessResidualCriteria
 
 
 @dataclass(frozen=True)
-class Thresholds(SmootherOptions):
+class Thresholds:
     """Thresholds of every step of a diagnosis, from the null test to the events.
 
     Each field has a description, repeated in the section `diagnosis` of the settings reference.
     """
 
+    min_log_bayes_factor: Annotated[
+        float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")
+    ] = DEFAULT_MIN_LOG_BAYES_FACTOR
     # is there a gap
     significance_level: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance level at which a candidate is tried and a window is flagged")
@@ -34,14 +37,7 @@ class Thresholds(SmootherOptions):
         float, Gt(0), Lt(1), OptionInfo("significance level of a gap, of all residuals or along a candidate")
     ] = 1e-4
     min_samples_per_unknown: Annotated[float, Gt(0), OptionInfo("effective samples needed for every unknown")] = 3.0
-    residual_test_window: Annotated[float, Gt(0), OptionInfo("length of the windows of the residual", "s")] = (
-        RESIDUAL_WINDOW_SECONDS
-    )
     # which candidates are worth a refit
-    detectable_amplitude_z: Annotated[
-        float, Gt(0), OptionInfo("ratio of amplitude to std at which an amplitude is detectable")
-    ] = 2.576 + 1.282
-    shape_parameter_grid_size: Annotated[int, Ge(1), OptionInfo("number of values tried per shape parameter")] = 4
     n_refit_per_round: Annotated[int, Ge(1), OptionInfo("number of candidates refitted per round")] = 6
     n_refit_pairs: Annotated[int, Ge(0), OptionInfo("pairs of candidates refitted if one effect leaves a gap")] = 4
     signature_overlap: Annotated[
@@ -62,16 +58,8 @@ class Thresholds(SmootherOptions):
     min_explained_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("fraction of the gap that an effect must explain")
     ] = 0.75
-    # where the gap lies
-    gap_window_z: Annotated[float, Gt(0), OptionInfo("standard deviations from zero that mark a gap window")] = 3.0
-    informed_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("1 - posterior/prior variance, if informed")] = 0.5
-
-    # events
-    inverse_dynamics_rtol: Annotated[float, Ge(0), Lt(1), OptionInfo("relative torque error of a good model")] = 0.03
+    # where the gap lies, and when
     max_event_duration: Annotated[float, Gt(0), OptionInfo("largest duration of an event", "s")] = 1.0
-    min_force_event_gap_fraction: Annotated[
-        float, Ge(0), Lt(1), OptionInfo("smallest fraction of the gap that force events must remove")
-    ] = 0.1
     max_joint_speed: Annotated[
         float, Gt(0), OptionInfo("speed of a joint above which the rest of a recording is ignored", "rad/s or m/s")
     ] = 20.0

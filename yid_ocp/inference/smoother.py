@@ -29,10 +29,8 @@ import threadpoolctl
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.kalman import FilterStateTransition, KalmanStepMatrices, kalman_matrices_and_next_covariance
 from yid_ocp.inference.smoother_model import (
-    DEFAULT_SMOOTHER_OPTIONS,
     LinearResidualModel,
     SmoothedUnknownGroup,
-    SmootherOptions,
     residual_models_with_smoother_unknowns,
 )
 from yid_ocp.model.system import System
@@ -44,6 +42,12 @@ _Models = Sequence[LinearResidualModel]
 _Groups = Sequence[SmoothedUnknownGroup]
 _Variances = dict[SmoothedUnknownGroup, float]  # [squared reference]
 
+DEFAULT_MIN_LOG_BAYES_FACTOR = 5.0  # rise of the log evidence that selects a group: odds of 150 to 1
+SIGNIFICANT_Z = 3.0  # standard deviations from zero beyond which an unknown is significant
+_INFORMED_FRACTION = 0.5  # of the prior variance that the data remove, above which they inform an unknown
+_DETECTABLE_CHI2_RISE = 10.0  # rise of r'r that shows an unknown
+_MIN_TIED_EVIDENCE_RATIO = 0.9  # share of a location's evidence at which an alternative is named
+_MAX_GROUPS = 4  # selected at most
 _MAX_ITERATIONS = 12  # fixed-point iterations on the standard deviations
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
 _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
@@ -76,7 +80,7 @@ class SmoothedUnknownsResult:
     dof_after: float
     # log evidence of forces and offsets ("plant"), biases ("sensor") and "both", relative to neither ("none", 0)
     log_evidence: dict[str, float]
-    min_log_bayes_factor: float = DEFAULT_SMOOTHER_OPTIONS.min_log_bayes_factor  # smallest significant rise
+    min_log_bayes_factor: float = DEFAULT_MIN_LOG_BAYES_FACTOR  # smallest significant rise
     # groups that could replace each selected group almost as well
     alternative_groups: Mapping[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]] = field(default_factory=dict)
 
@@ -266,10 +270,10 @@ def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]
 
 
 def _selected(
-    models: _Models, sources: _Groups, variance: _Variances, state: _State, limits: SmootherOptions
+    models: _Models, sources: _Groups, variance: _Variances, state: _State, least: float
 ) -> tuple[_Variances, _State]:
     """Add the group that raises the evidence most, repeatedly, while the rise exceeds chance."""
-    while sum(v > 0 for v in variance.values()) < limits.max_smoother_unknown_groups:
+    while sum(v > 0 for v in variance.values()) < _MAX_GROUPS:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
         promising.sort(key=lambda s: -found[s][0] / max(found[s][1], 1e-300))
@@ -279,7 +283,7 @@ def _selected(
             break
         reached = zip(state.largest_evidences(promising), promising, strict=True)
         (evidence, size), source = max(reached, key=lambda pair: pair[0][0])
-        if not evidence > state.log_evidence + limits.min_log_bayes_factor:
+        if not evidence > state.log_evidence + least:
             break
         variance, state = _refined(models, variance | {source: size})
     return variance, state
@@ -333,12 +337,15 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
 
 
 def select_and_smooth_unknowns(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: SmootherOptions = DEFAULT_SMOOTHER_OPTIONS
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float = DEFAULT_MIN_LOG_BAYES_FACTOR
 ) -> SmoothedUnknownsResult:
-    """Select groups of unknown forces, offsets and biases by log evidence at a fit `x`, and estimate them."""
+    """Select groups of unknown forces, offsets and biases by log evidence at a fit `x`, and estimate them.
+
+    `least` is the smallest rise of the log evidence for which a group is selected (5: odds of 150 to 1).
+    """
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
-        models = residual_models_with_smoother_unknowns(problem, x, evaluation, limits)
+        models = residual_models_with_smoother_unknowns(problem, x, evaluation)
         sources = tuple(dict.fromkeys(source for model in models for source in model.unknown_groups))
         none = dict.fromkeys(sources, 0.0)
         nothing = _run(models, none)
@@ -347,19 +354,18 @@ def select_and_smooth_unknowns(
         found: dict[str, tuple[_Variances, _State]] = {}
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
-            found[side] = done[0] if done else _selected(models, own, none, nothing, limits)
+            found[side] = done[0] if done else _selected(models, own, none, nothing, least)
         gain = {side: state.log_evidence - nothing.log_evidence for side, (_, state) in found.items()}
         # a greedy choice among all groups may be worse than a choice among fewer
         variance, state = max(found.values(), key=lambda entry: entry[1].log_evidence)
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
-        drop, alternatives = _alternatives(models, variance, nothing, state, limits)
+        drop, alternatives = _alternatives(models, variance, nothing, state, least)
         traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
         # the variance of a group's scores is the mean rise of r'r by unknowns of the reference size
         scores = {source: max(score, 1e-300) for source, (_, score) in _scores(models, nothing).items()}
-        detectable = {s: math.sqrt(limits.detectable_unknown_chi2_rise / score) for s, score in scores.items()}
+        detectable = {s: math.sqrt(_DETECTABLE_CHI2_RISE / score) for s, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
-        least = limits.min_log_bayes_factor
         return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
 
 
@@ -417,7 +423,7 @@ def _explained(models: _Models, variance: _Variances, plain: _State, state: _Sta
 
 
 def _alternatives(
-    models: _Models, variance: _Variances, nothing: _State, state: _State, limits: SmootherOptions
+    models: _Models, variance: _Variances, nothing: _State, state: _State, least: float
 ) -> tuple[_Variances, dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
     """Fall of the log evidence without each group, and the groups that could replace it; `nothing` has no group."""
     drop, found = dict.fromkeys(variance, 0.0), {}
@@ -428,10 +434,9 @@ def _alternatives(
         scores = _scores(models, without)
         # the score at zero variance is a poor predictor here: all groups are tried
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
-        loss = (1 - limits.min_tied_evidence_ratio) * drop[source]
-        least = state.log_evidence - max(limits.min_log_bayes_factor, loss)
+        loss = max(least, (1 - _MIN_TIED_EVIDENCE_RATIO) * drop[source])
         reached = zip(asked, without.largest_evidences(asked), strict=True)
-        found[source] = tuple(other for other, (reach, _) in reached if reach >= least)
+        found[source] = tuple(other for other, (reach, _) in reached if reach >= state.log_evidence - loss)
     return drop, found
 
 
@@ -459,13 +464,11 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
     return tuple(sorted(places, key=lambda place: (-place.gap_share, not place.is_observable)))
 
 
-def gap_locations_by_smoother_evidence(
-    smoothed: SmoothedUnknownsResult, gap_window_z: float = 3.0
-) -> tuple[GapLocation, ...]:
+def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tuple[GapLocation, ...]:
     """Rank all locations by their share of the log evidence. At equal shares, observable locations come first.
 
-    The time windows of a location are those in which one of its unknowns is over `gap_window_z` standard deviations
-    from zero.
+    The time windows of a location are those in which one of its unknowns is over three standard deviations from
+    zero.
     """
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
@@ -476,7 +479,7 @@ def gap_locations_by_smoother_evidence(
     for location, own in groups.items():
         share = weight[location] / total if total > 0 else 0.0
         seen = any(smoothed.detectable_std[s] < 1.0 or drop[s] > 0 for s in own)
-        when = _windows(smoothed, [s for s in own if smoothed.group_variance[s]], gap_window_z)
+        when = _windows(smoothed, [s for s in own if smoothed.group_variance[s]])
         # locations that could replace every selected group of this location
         also = [{e.location for e in smoothed.alternative_groups[s]} for s in own if s in smoothed.alternative_groups]
         others = tuple(sorted(set.intersection(*also) - {location})) if also else ()
@@ -484,19 +487,19 @@ def gap_locations_by_smoother_evidence(
     return _by_share(found)
 
 
-def smoothed_unknown_significance_mask(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
-    """Mask (J, columns) of the unknowns of `trace` that are more than `limit` standard deviations from zero."""
+def smoothed_unknown_significance_mask(trace: SmoothedUnknowns, columns: Sequence[int]) -> BoolArray:
+    """Mask (J, columns) of the unknowns of `trace` that are more than `SIGNIFICANT_Z` stds from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
-    return np.asarray(np.abs(trace.posterior_mean[:, columns]) > limit * std)
+    return np.asarray(np.abs(trace.posterior_mean[:, columns]) > SIGNIFICANT_Z * std)
 
 
 def _windows(
-    smoothed: SmoothedUnknownsResult, sources: Sequence[SmoothedUnknownGroup], limit: float
+    smoothed: SmoothedUnknownsResult, sources: Sequence[SmoothedUnknownGroup]
 ) -> tuple[tuple[float, float], ...]:
     spans: list[tuple[float, float]] = []
     for trace in smoothed.smoothed_unknowns:
         own = [i for i, source in enumerate(trace.unknown_groups) if source in sources]
-        sure = np.flatnonzero(np.any(smoothed_unknown_significance_mask(trace, own, limit), axis=1))
+        sure = np.flatnonzero(np.any(smoothed_unknown_significance_mask(trace, own), axis=1))
         spans += [(float(trace.interval_edges[j]), float(trace.interval_edges[j + 1])) for j in sure]
     return merge_time_intervals(spans)
 
@@ -542,17 +545,17 @@ def gap_locations_from_effects_and_smoother(
 
 
 def z_scores_of_smoothed_unknowns(
-    smoothed: SmoothedUnknownsResult, recording: int = 0, informed_fraction: float = 0.5
+    smoothed: SmoothedUnknownsResult, recording: int = 0
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Return the z scores (J, nd) of nd smoothed unknowns in J intervals: posterior mean over standard deviation.
 
     The result is the interval edges (J + 1,) [s], the names of the unknowns, and the scores. A score is NaN if the data
-    reduced the variance of the unknown by a fraction of `informed_fraction` or less.
+    reduced the variance of the unknown by half or less.
     """
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
     with np.errstate(divide="ignore", invalid="ignore"):
-        informed = (prior > 0) & (1 - trace.posterior_std**2 / prior > informed_fraction)
+        informed = (prior > 0) & (1 - trace.posterior_std**2 / prior > _INFORMED_FRACTION)
         values = np.where(informed, trace.posterior_mean / trace.posterior_std, np.nan)
     return trace.interval_edges, trace.unknown_names, values
 

@@ -15,13 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from annotated_types import Ge, Gt, Le
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects.base import arm_joint_names
@@ -37,7 +36,6 @@ from yid_ocp.integrator.step import (
 )
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal_at_zero
 from yid_ocp.problem.evaluation import Evaluation
@@ -49,27 +47,9 @@ _UnknownKind = Literal["force", "push", "offset", "bias"]
 _CORRELATION_TIME = 0.5  # memory of the unknowns [s]
 _MIN_INTERVAL = 0.1  # shortest time over which unknowns are constant [s]
 _MAX_INTERVAL_COUNT = 150  # largest number of intervals; longer recordings have longer intervals
+# Reference sizes of unknowns: a force over the load at its place, an offset of a grasp [m], a bias over its noise.
+_FORCE_STD_OVER_LOAD, _GRASP_OFFSET_STD, _BIAS_STD_OVER_NOISE = 0.1, 2e-3, 3.0
 _FORCE_POINT = "75%"  # point of the push by arc length: a compromise of tip and distributed loads
-
-
-@dataclass(frozen=True)
-class SmootherOptions:
-    """Prior sizes of unknowns, and the log evidence that a group requires (5 means odds of 150 to 1)."""
-
-    min_log_bayes_factor: Annotated[
-        float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")
-    ] = 5.0
-    max_smoother_unknown_groups: Annotated[int, Ge(1), OptionInfo("largest number of selected groups of unknowns")] = 4
-    detectable_unknown_chi2_rise: Annotated[float, Gt(0), OptionInfo("rise of r'r that shows an unknown")] = 10.0
-    force_prior_std_over_load: Annotated[float, Gt(0), OptionInfo("unknown force over the load at its place")] = 0.1
-    grasp_offset_prior_std: Annotated[float, Gt(0), OptionInfo("unknown offset of a grasp", "m")] = 2e-3
-    bias_prior_std_over_noise: Annotated[float, Gt(0), OptionInfo("unknown bias over its sensor's noise")] = 3.0
-    min_tied_evidence_ratio: Annotated[
-        float, Gt(0), Le(1), OptionInfo("share of a location's evidence at which an alternative is named")
-    ] = 0.9
-
-
-DEFAULT_SMOOTHER_OPTIONS = SmootherOptions()
 
 
 @dataclass(frozen=True)
@@ -116,21 +96,21 @@ class _SmootherUnknowns(NamedTuple):
         return self.loading + 3 * len(self.pushed)
 
 
-def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherOptions) -> _SmootherUnknowns:
+def _smoother_unknowns(course: _LinearizedEpisode) -> _SmootherUnknowns:
     """Unknowns of one recording, with their groups and reference sizes."""
-    names, sources, reference, forced = _unknown_forces(course, limits.force_prior_std_over_load)
+    names, sources, reference, forced = _unknown_forces(course)
     grasped, row = [], 0
     for grasp in course.system.grasps:
         grasped += [row, row + 1, row + 2]
         names += [f"{grasp.name}.{axis}" for axis in "xyz"]
         sources += [SmoothedUnknownGroup(grasp.name, "offset")] * 3
-        reference += [limits.grasp_offset_prior_std] * 3
+        reference += [_GRASP_OFFSET_STD] * 3
         row += grasp.n_constraint_equations
     pushed = _segment_weights(course.system, course.nominal.theta)
     for segment, weight in pushed.items():
         names += [f"{segment}.push_{axis}" for axis in "xyz"]
         sources += [SmoothedUnknownGroup(segment, "push")] * 3
-        reference += [limits.force_prior_std_over_load * weight] * 3
+        reference += [_FORCE_STD_OVER_LOAD * weight] * 3
     biased = []
     for k, samples in enumerate(course.episode.measurements):
         sensor = samples.sensor
@@ -143,13 +123,13 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherOptions) -> _
             biased.append((k, column))
             names.append(name)
             sources.append(SmoothedUnknownGroup(sensor_bias_location_name(course.system, sensor, frame), "bias"))
-            reference.append(limits.bias_prior_std_over_noise * float(np.nanmedian(samples.std[:, column])))
+            reference.append(_BIAS_STD_OVER_NOISE * float(np.nanmedian(samples.std[:, column])))
     held, biases = np.array(grasped, int), tuple(biased)
     return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
 
 
 def _unknown_forces(
-    course: _LinearizedEpisode, part: float
+    course: _LinearizedEpisode,
 ) -> tuple[list[str], list[SmoothedUnknownGroup], list[float], IntArray]:
     """Names, sources, reference sizes and coordinates of the unknown forces."""
     system, joint_names = course.system, course.system.mechanism.joint_names
@@ -164,9 +144,9 @@ def _unknown_forces(
     for name, index in zip(names, forced, strict=True):
         of_place.setdefault(place[name], []).append(load[index])
     largest = max((max(v) for v in of_place.values()), default=1.0)
-    size = {p: part * max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
+    rms = {p: max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
     sources = [SmoothedUnknownGroup(place[name], "force", name in measured) for name in names]
-    return names, sources, [size[place[name]] for name in names], forced
+    return names, sources, [_FORCE_STD_OVER_LOAD * rms[place[name]] for name in names], forced
 
 
 def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str:
@@ -264,7 +244,6 @@ def residual_models_with_smoother_unknowns(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
-    limits: SmootherOptions = DEFAULT_SMOOTHER_OPTIONS,
     interval: float = _MIN_INTERVAL,
 ) -> tuple[LinearResidualModel, ...]:
     """Linearize every recording's residual with respect to unknown forces, offsets and biases.
@@ -284,7 +263,7 @@ def residual_models_with_smoother_unknowns(
         blocks = [samples.residual_and_jacobian(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)
         factor = np.concatenate([block.robust_factor for block in blocks])
-        found.append(_recording(course, factor, observed, limits, interval))
+        found.append(_recording(course, factor, observed, interval))
     prior = columns[problem.residual_rows.stated_priors]
     # stated priors of the free parameters are observations on which no unknown acts
     first, *later = found[0].intervals
@@ -337,14 +316,12 @@ def _steps(
     return np.concatenate(a), np.concatenate(e), np.concatenate(effort)
 
 
-def _recording(
-    course: _LinearizedEpisode, factor: Array, observed: Array, limits: SmootherOptions, shortest: float
-) -> LinearResidualModel:
+def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, shortest: float) -> LinearResidualModel:
     """Linear model of one recording from its whitened residuals and their derivatives."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
     length = int(max(round(shortest / h), math.ceil(steps * _MIN_INTERVAL / (_MAX_INTERVAL_COUNT * shortest)), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
-    unknowns = _smoother_unknowns(course, limits)
+    unknowns = _smoother_unknowns(course)
     loads, forces = _loads_of(course, unknowns), len(unknowns.forced)
     nodes = course.nominal.rollout.state[:, : course.system.n_coordinates]
     pushes = _generalized_forces_per_newton(course.system, course.nominal.theta, nodes, unknowns.pushed)

@@ -153,7 +153,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
-    _, _, values = z_scores_of_smoothed_unknowns(smoothed, i, finding.thresholds.informed_fraction)
+    _, _, values = z_scores_of_smoothed_unknowns(smoothed, i)
     units = smoothed_unknown_units(finding.nominal_model.problem.system, trace)
     mean, std = trace.posterior_mean * trace.reference_std, trace.posterior_std * trace.reference_std
     axis = "value in its standard deviations"
