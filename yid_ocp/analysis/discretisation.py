@@ -72,7 +72,8 @@ class _FinerDiscretisationProblem:
         fine = np.zeros(len(tree.joints))
         for name, angle in zip(coarse.mechanism.joint_names, q, strict=True):
             parts = self.subdivided_joints.get(name, (name,))
-            fine[[tree.joint_index(part) for part in parts]] = angle / len(parts)
+            # a neutral effect of the coarse model may add a joint
+            fine[[tree.joint_index(part) for part in parts if part in tree.joint_names]] = angle / len(parts)
         return fine
 
 
@@ -149,6 +150,38 @@ def predicted_refit_residual_at_finer_step(
         return made[1]
     fitted = fine.evaluate(GaussNewton().minimize_cost(fine, start, None).x, False, at_x.equilibrium_guesses)
     return fitted.residual if fitted.ok and fitted.cost < before.cost else made[1]
+
+
+def problem_without_error_of_links(problem: EstimationProblem, x: Array, at_x: Evaluation) -> EstimationProblem | None:
+    """Subtract from all data, held-out ones included, what twice the links change in the predictions at `x` (nx,).
+
+    `at_x` is the evaluation at `x`. Returns None if the object cannot be divided or the finer model does not follow.
+    """
+    if problem.options.divided_links_model is None or not problem.system.segment_layouts:
+        return None
+    try:
+        refined = _refined_problem(problem, "links")
+        point, guesses = refined._unknowns(problem.unknown_names, x), at_x.equilibrium_guesses
+        warm = tuple(None if q is None else refined._guess(problem.system, q) for q in guesses)
+        fine = refined.problem.evaluate(point, False, warm)
+    except YidError:
+        return None
+    if not fine.ok:
+        return None
+    held_out = (own.predict_held_out(at) for own, at in ((problem, x), (refined.problem, point)))
+    coarse, finer = (
+        [*own.episode_predictions, *(found for _, found in others)]
+        for own, others in zip((at_x, fine), held_out, strict=True)
+    )
+    episodes, count = [], len(problem.episodes)
+    for episode, before, after in zip((*problem.episodes, *problem.held_out), coarse, finer, strict=True):
+        measurements = list(episode.measurements)
+        if not isinstance(before, str) and not isinstance(after, str):
+            for k, pair in enumerate(zip(before.predicted_outputs, after.predicted_outputs, strict=True)):
+                if pair[0].shape == pair[1].shape:
+                    measurements[k] = replace(measurements[k], value=measurements[k].value - (pair[1] - pair[0]))
+        episodes.append(replace(episode, measurements=tuple(measurements)))
+    return problem.with_episodes(episodes[:count], episodes[count:])
 
 
 def longest_accurate_time_step(problem: EstimationProblem) -> float:
@@ -260,7 +293,8 @@ def _refined_problem(problem: EstimationProblem, what: RefinementKind) -> _Finer
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)
-    made = EstimationProblem(step, recordings, problem.free, options)
+    held_out = [episode.recording for episode in problem.held_out]
+    made = EstimationProblem(step, recordings, problem.free, options, None, held_out)
     return _FinerDiscretisationProblem(made, factors, _fine_joints_by_coarse_joint(problem.system, step.system))
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step
+from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step, problem_without_error_of_links
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
@@ -132,12 +132,16 @@ class _Examined:
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all its recordings, if it was run
     evidence: NominalModelGapEvidence
+    is_corrected_for_links: bool  # whether the data lack the error of the finite number of links
 
 
 def _examined(
-    search: RefitContext, nominal: RefittedModel, known: tuple[TruncatedHeldOutRecording, ...] = ()
+    search: RefitContext,
+    nominal: RefittedModel,
+    known: tuple[TruncatedHeldOutRecording, ...] = (),
+    is_corrected_for_links: bool = False,
 ) -> _Examined:
-    """Null tests and screening of the nominal model on data without events, at a time step that makes no gap."""
+    """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
     limits, residual = search.thresholds, nominal.evaluation.residual
     excess = _excess_of(residual)
     # neither events nor candidates are sought while the step makes most of the gap
@@ -148,7 +152,7 @@ def _examined(
     search, nominal, cuts = _followed(search, nominal, known)
     _end_stage(search, "nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
-    whole = _undivided(search.problem)
+    whole, with_events = _undivided(search.problem), search
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
     _end_stage(search, "events")
     angles = _largest_joint_angles(nominal)
@@ -166,7 +170,11 @@ def _examined(
             fall = _fall_at_half_time_step(search, nominal, events)
         if fall > gap / 2:
             return _examined(*_at_half_time_step(search, nominal, fall), cuts)
-    return _Examined(replace(search, problem=composed), nominal, cuts, whole, events, smoothed, evidence)
+        corrected = None if is_corrected_for_links else _without_error_of_links(with_events, nominal, gap)
+        if corrected is not None:
+            return _examined(*corrected, cuts, True)
+    found = nominal, cuts, whole, events, smoothed, evidence, is_corrected_for_links
+    return _Examined(replace(search, problem=composed), *found)
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet = NO_EVENTS) -> float:
@@ -183,6 +191,27 @@ def _at_half_time_step(search: RefitContext, fit: RefittedModel, fall: float) ->
     h = fit.problem.step.time_step / 2
     search.progress.begin_stage(f"half the time step lowers chi2 by {fall:.3g}: going on at {h:g} s")
     search = replace(search, problem=search.problem.with_time_step(h))
+    return search, _fitted_nominal_model(search, fit.values)
+
+
+def _without_error_of_links(
+    search: RefitContext, fit: RefittedModel, gap: float
+) -> tuple[RefitContext, RefittedModel] | None:
+    """Hypotheses and nominal fit on data that lack what twice the links change, if this closes half of the gap."""
+    search.progress.begin_stage("trying twice the links", 1.0, 8.5)
+    composed, x = search.problem.problem, fit.problem.unknown_vector(fit.values)
+    corrected = problem_without_error_of_links(composed, x, fit.evaluation)
+    if corrected is None:
+        return None
+    judged = fit.problem.with_episodes(corrected.episodes, corrected.held_out, fit.problem.whitening_filters)
+    left, jacobian = judged.evaluate(x, False, fit.evaluation.equilibrium_guesses).residual, fit.evaluation.jacobian
+    assert jacobian is not None
+    left = left - jacobian @ np.linalg.lstsq(jacobian, left, rcond=1e-10)[0]
+    fall = _excess_of(fit.evaluation.residual) - _excess_of(left)
+    if not fall > gap / 2:
+        return None
+    search.progress.begin_stage(f"twice the links lower chi2 by {fall:.3g}: going on without this error")
+    search = replace(search, problem=replace(search.problem, problem=corrected))
     return search, _fitted_nominal_model(search, fit.values)
 
 
@@ -332,6 +361,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         counterfactual=earlier.prediction_errors_with_and_without_effects(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_used_time_step=steps,
+        is_corrected_for_links=seen.is_corrected_for_links,
         search_seconds=ends["refits"] - ends[""],
         law=law,
     )

@@ -74,6 +74,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     search_seconds: float = 0.0  # from the start to the end of the search for effects
     # [s]; they differ if the stated step's error was part of the gap
     stated_and_used_time_step: tuple[float, float] = (0.0, 0.0)
+    is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprLineAndTableRows:
@@ -253,6 +254,10 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     if stated != used:
         used = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
         text.append(f"The discretisation error of {stated} s steps looks like a gap, {used}.")
+    if result.is_corrected_for_links:
+        text.append(
+            "The error of the number of links looks like a gap and was removed (other commands need more links)."
+        )
     if result.verdict not in ("insufficient_data", "no_gap"):
         text += [_places(result), *_causes(result), *_remains(result)]
     if result.law is not None:
