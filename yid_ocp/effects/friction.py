@@ -41,6 +41,11 @@ class _JointFriction(EffectBase):
     required_excitation = "how fast it moves"
     possible_locations = base.arm_joint_names
 
+    @property
+    def sticking_speed(self) -> float:
+        """Three times v_s, where tanh(v/v_s) is 0.995."""
+        return 3 * self.sign_smoothing_speed
+
     def _sign(self, v: ca.SX) -> ca.SX:
         return ca.tanh(v / self.sign_smoothing_speed)
 
@@ -68,6 +73,8 @@ class _JointViscous(_JointFriction):
 
     equation = "F = -b v"
     declared_parameters = (effort_limit_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
+
+    sticking_speed = 0.0
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["b"] * v

@@ -13,6 +13,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import Recording
+from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, float_array_with_checked_shape, generalized_momentum_from_velocity
@@ -242,7 +243,9 @@ def prepare_episode(
         arm = smoothed_joint_angles_at_nodes(*read, LowPassFilter(math.inf))
         smooth = smoothed_joint_angles_at_nodes(*read, low_pass) if options.arm_tracking_feedback == "lqr" else arm
     uncertain = options.has_uncertain_point_clocks and any("damping" in name for name in free)
-    samples = _samples(step, recording, options, theta, grid, uncertain)
+    effects = [own for own in system.effects if isinstance(own, EffectBase) and own.is_active(system, free, theta)]
+    sticking = {effect.location: effect.sticking_speed for effect in effects if effect.sticking_speed}
+    samples = _samples(step, recording, options, theta, grid, uncertain, sticking)
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))
     if functions.input_corrections.angles_depend_on_effort:
@@ -321,7 +324,13 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
 
 
 def _samples(
-    step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: TimeGrid, has_uncertain_clocks: bool
+    step: Step,
+    recording: Recording,
+    options: ProblemOptions,
+    theta: Array,
+    grid: TimeGrid,
+    has_uncertain_clocks: bool,
+    sticking_speeds: Mapping[str, float],
 ) -> tuple[SensorMeasurements, ...]:
     around = SensorDataInputs(
         step.system,
@@ -333,6 +342,7 @@ def _samples(
         LowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
         has_uncertain_clocks,
+        sticking_speeds,
     )
     found = [data for kind in SENSOR_READERS for data in SENSOR_READERS[kind](around)]
     if options.weighting == "paper":

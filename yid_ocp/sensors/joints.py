@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 import scipy.special
 
-from yid_ocp.arrays import Array, IntArray
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
@@ -142,6 +142,7 @@ def filtered_effort_measurements(
     """
     # the mean of an interval belongs to its centre
     kept, measured = nodes_and_decorrelated_values(inputs, t, values, "efforts", at_centres=not is_sample)
+    measured[_may_stick(inputs, sensor.joint_names, inputs.node_times[kept])] = np.nan
     times, last = inputs.node_times[kept], len(inputs.node_times) - 1
     unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
     total, correlation = _smoothed_effort_noise(inputs, sensor.joint_names, std * np.abs(unit), period, times)
@@ -247,6 +248,24 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
         raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
     mean_square = np.mean(np.diff(values, order, axis=0) ** 2, axis=0)
     return np.asarray(np.sqrt(mean_square / scipy.special.comb(2 * order, order)))
+
+
+def _may_stick(inputs: SensorDataInputs, names: tuple[str, ...], times: Array) -> BoolArray:
+    """Mask (K, k) of joints whose dry friction is unknown at `times` (K,), because they stop within the filter's reach.
+
+    A joint that stands still is held by any torque up to its friction, so that its effort says little about the model.
+    """
+    joints = inputs.recording.joints
+    assert joints is not None
+    limits = np.array([inputs.sticking_speeds.get(name, 0.0) for name in names])
+    if not np.any(limits):
+        return np.zeros((len(times), len(names)), bool)
+    position = joints.position[:, recorded_joint_column_indices(joints, names, inputs.recording.name)]
+    speed = np.abs(np.gradient(inputs.path_filter(joints.t, position), joints.t, axis=0))
+    reach = inputs.effort_filter.decorrelation_stride(inputs.time_step) * inputs.time_step
+    first, last = np.searchsorted(joints.t, times - reach), np.searchsorted(joints.t, times + reach)
+    slowest = np.array([speed[i : max(j, i + 1)].min(axis=0) for i, j in zip(first, last, strict=True)])
+    return np.asarray(slowest < limits)
 
 
 def _smoothed_effort_noise(
