@@ -180,6 +180,19 @@ def test_dry_friction_needs_no_time_to_turn(urdf_folder):
     assert np.abs(np.diff(samples.value[:, 1])).max() > 30 * samples.std.max()
 
 
+@pytest.mark.parametrize("free", [True, False])
+def test_an_effort_where_an_estimated_dry_friction_may_hold_the_joint_is_no_measurement(free, urdf_folder):
+    friction = [("joint_coulomb", "elbow", {"tau_c": 0.4}), ("joint_viscous", "shoulder", {"b": 0.1})]
+    step, path = pendulum_step(urdf_folder, friction, prescribed=JOINTS), motion()
+    names = ("joint_viscous@shoulder.b", *(("joint_coulomb@elbow.tau_c",) if free else ()))
+    [samples] = arm(step, path, np.ones_like(path), angle=0.0, free=names).episodes[0].measurements
+    speed, reach = np.abs(np.gradient(path[:, 1], 0.01)), round(1 / (2 * CUTOFF) / 0.01)
+    slowest = np.array([speed[node - reach : node + reach].min() for node in samples.node])
+    assert not np.isnan(samples.value[:, 0]).any()
+    np.testing.assert_array_equal(np.isnan(samples.value[:, 1]), free & (slowest < 0.06))
+    assert 5 < np.count_nonzero(slowest < 0.06) < 0.5 * len(slowest)
+
+
 JOINTS = ("shoulder", "elbow")
 DAMPING = {"shoulder.damping": 0.3, "elbow.damping": 0.2}
 EFFORT_NOISE = 0.05  # of the efforts [N m]

@@ -180,6 +180,24 @@ def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: 
     return np.asarray((found.residual[1:, :n] + found.p1[:-1]) / step.time_step)
 
 
+def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[EstimationProblem]:
+    """Return problems of the same recordings without samples that one of them lacks, so that errors are comparable."""
+    found = []
+    for problem in problems:
+        episodes = [
+            replace(
+                episode,
+                measurements=tuple(
+                    replace(own, weight=own.weight * np.all([s.positive_weight_mask for s in others], axis=0))
+                    for own, *others in zip(episode.measurements, *(o.measurements for o in alike), strict=True)
+                ),
+            )
+            for episode, *alike in zip(problem.episodes, *(other.episodes for other in problems), strict=True)
+        ]
+        found.append(problem.with_episodes(episodes, ()))
+    return found
+
+
 def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
     """Return the problem with its held-out recordings among the recordings for estimation."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)

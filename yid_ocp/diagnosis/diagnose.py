@@ -164,7 +164,7 @@ def _examined(
     screened = screen_candidates(composed, (), nominal.values)
     evidence = NominalModelGapEvidence(nominal, *tests, screened, _offsets_stated(nominal.problem))
     _end_stage(search, "screening")
-    if evidence.has_gap(limits) and evidence.are_data_sufficient(limits):
+    if evidence.may_have_gap(limits) and evidence.are_data_sufficient(limits):
         gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
         if tried is not nominal:
             fall = _fall_at_half_time_step(search, nominal, events)

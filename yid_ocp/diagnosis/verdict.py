@@ -70,7 +70,12 @@ class NominalModelGapEvidence:
     are_offsets_stated: bool = False  # whether the size of torque offsets or of constant sensor errors is
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
 
-    def has_gap(self, limits: Thresholds) -> bool:
+    def exceeds_noise(self, limits: Thresholds) -> bool:
+        """Whether the residual as a whole exceeds noise by a relevant amount."""
+        whole = ExcessResidualCriteria(limits.gap_significance_level, limits.min_excess_chi2_per_dof)
+        return residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
+
+    def may_have_gap(self, limits: Thresholds) -> bool:
         """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
 
         Along a signature, some channel must also exceed noise: with many samples, errors far below the noise are
@@ -80,9 +85,7 @@ class NominalModelGapEvidence:
         largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
         is_seen, level = largest > 1 + limits.min_channel_excess_chi2_per_dof, limits.gap_significance_level
         along = [s.p_value for s in ranked if is_seen or (self.are_offsets_stated and s.effect.is_torque_offset)]
-        p_value = min(along, default=math.inf) * len(ranked)
-        whole = ExcessResidualCriteria(level, limits.min_excess_chi2_per_dof)
-        return p_value < level or residuals_exceed_noise(tests, whole)
+        return min(along, default=math.inf) * len(ranked) < level or self.exceeds_noise(limits)
 
     def are_data_sufficient(self, limits: Thresholds) -> bool:
         """Whether the degrees of freedom suffice for the nominal model's unknowns, and a candidate is detectable."""
@@ -159,13 +162,16 @@ class Judgement:
 
 
 def _verdict_and_reason(
-    said: Judgement, has_gap: bool, are_data_sufficient: bool, limits: Thresholds
+    said: Judgement, exceeds_noise: bool, are_data_sufficient: bool, limits: Thresholds
 ) -> tuple[str, UnknownVerdictReason]:
-    """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`."""
+    """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`.
+
+    Without an effect, a gap that is seen only along a candidate's signature is none: no model predicts better.
+    """
     is_empty, explained = not said.selected_effects, said.fitted_or_held_out_explained_fraction
     rules: tuple[tuple[bool, str, UnknownVerdictReason], ...] = (
         (not are_data_sufficient, "insufficient_data", ""),
-        (is_empty and not has_gap, "no_gap", ""),
+        (is_empty and not exceeds_noise, "no_gap", ""),
         (is_empty, "unknown", "none"),
         (explained < said.required_total_explained_fraction(limits), "unknown", "little"),
         (bool(said.failed_transfer_checks), "unknown", "stand_in"),
@@ -184,11 +190,11 @@ def judge(
     `finished` is called with the name of each stage.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
-    has_gap, suffices = evidence.has_gap(limits), evidence.are_data_sufficient(limits)
+    suffices = evidence.are_data_sufficient(limits)
     fits: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     # a gap closed by shifted parameters counts only if an effect explains it
-    if suffices and (has_gap or evidence.has_left_baseline):
+    if suffices and (evidence.may_have_gap(limits) or evidence.has_left_baseline):
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
     finished("refits")
     carried: tuple[EffectAmplitudeTransferCheck, ...] = ()
@@ -200,7 +206,7 @@ def judge(
         added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
     finished("carry_over")
     said = Judgement("", "", fits, added, explained, carried, 0.0)
-    verdict, reason = _verdict_and_reason(said, has_gap, suffices, limits)
+    verdict, reason = _verdict_and_reason(said, evidence.exceeds_noise(limits), suffices, limits)
     return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
 

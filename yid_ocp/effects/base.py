@@ -10,7 +10,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
@@ -143,11 +142,6 @@ class EffectBase(Effect):
     def sticking_speed(self) -> float:
         """Speed of the joint at `location` below which this friction can hold it with any torque up to its size."""
         return 0.0
-
-    def is_active(self, system: System, free: Collection[str], theta: Array) -> bool:
-        """Whether an amplitude is among the `free` parameters or not neutral in the parameter vector `theta`."""
-        index, neutral = system.parameters.index, self.neutral_values
-        return any(name in free or theta[index(name)] != neutral[name] for name in self.amplitude_parameter_names)
 
     @property
     def prior_ranges(self) -> dict[str, tuple[float, float]]:

@@ -22,7 +22,7 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_low_pass_filter
-from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, joint_angle_noise_std
+from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
 from yid_ocp.sensors.mounted import MountedSensor
 
 RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
@@ -177,7 +177,7 @@ def episodes_with_path_noise_redrawn(problem: EstimationProblem, rng: np.random.
 def _with_path_noise_redrawn(episode: Episode, problem: EstimationProblem, rng: np.random.Generator) -> Episode:
     joints, system, options = episode.recording.joints, problem.system, problem.options
     names = () if joints is None else tuple(name for name in system.prescribed if name in joints.names)
-    if joints is None or not names:
+    if joints is None or not names or len(joints.t) <= NOISE_ESTIMATE_DIFFERENCE_ORDER:
         return episode
     encoders = options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
     std = joint_angle_noise_std(joints, names, encoders, episode.name)

@@ -243,8 +243,9 @@ def prepare_episode(
         arm = smoothed_joint_angles_at_nodes(*read, LowPassFilter(math.inf))
         smooth = smoothed_joint_angles_at_nodes(*read, low_pass) if options.arm_tracking_feedback == "lqr" else arm
     uncertain = options.has_uncertain_point_clocks and any("damping" in name for name in free)
-    effects = [own for own in system.effects if isinstance(own, EffectBase) and own.is_active(system, free, theta)]
-    sticking = {effect.location: effect.sticking_speed for effect in effects if effect.sticking_speed}
+    effects = [own for own in system.effects if isinstance(own, EffectBase)]
+    estimated = [own for own in effects if not {*free}.isdisjoint(own.amplitude_parameter_names)]
+    sticking = {own.location: own.sticking_speed for own in estimated if own.sticking_speed}
     samples = _samples(step, recording, options, theta, grid, uncertain, sticking)
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))

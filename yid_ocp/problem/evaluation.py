@@ -252,8 +252,11 @@ def estimated_initial_state_names(
         coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
         found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]
     for effect in system.effects:
-        if isinstance(effect, EffectBase) and effect.is_active(system, free, theta):
-            found += [f"z.{name}" for name in effect.max_abs_initial_internal_coordinates]
+        if isinstance(effect, EffectBase) and effect.max_abs_initial_internal_coordinates:
+            index = system.parameters.index
+            names = effect.amplitude_parameter_names
+            if any(name in free or theta[index(name)] != effect.neutral_values[name] for name in names):
+                found += [f"z.{name}" for name in effect.max_abs_initial_internal_coordinates]
     return tuple(found)
 
 

@@ -334,7 +334,7 @@ class SensorDataInputs:
     path_filter: _SmoothingFilter  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
     has_uncertain_clocks: bool = False  # of point groups, if the settings do not specify it
-    # by joint: speed [rad/s or m/s] below which the model's friction can hold it with any torque up to its size
+    # by joint: speed [rad/s or m/s] below which a friction that is estimated can hold it with any torque up to its size
     sticking_speeds: Mapping[str, float] = field(default_factory=dict)
 
 

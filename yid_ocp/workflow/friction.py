@@ -30,16 +30,23 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         folder.record_run_start(run, "friction")
         fits: list[CrossValidatedFrictionLawFit] = []
         solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
-        for law in EFFECT_KINDS_BY_FRICTION_LAW:
+        by_law = {
+            law: replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
+            for law in EFFECT_KINDS_BY_FRICTION_LAW
+        }
+        problems = [
+            friction_law_comparison.problem_estimating_on_held_out_too(build_problem(settings))
+            for settings in by_law.values()
+        ]
+        kinds = friction_law_comparison.recording_names_by_name_stem(problems[0])
+        if len(kinds) < 2:
+            allowed = "two recordings or more in which the motors are on"
+            hint = "list more under recordings.estimate or recordings.held_out"
+            what = "a law is tested on recordings that are not fitted, but there is only one recording"
+            raise DataError(what, where=run.setting_location("recordings"), allowed=allowed, hint=hint)
+        problems = friction_law_comparison.problems_with_common_samples(problems)
+        for (law, settings), problem in zip(by_law.items(), problems, strict=True):
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
-            settings = replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
-            problem = friction_law_comparison.problem_estimating_on_held_out_too(build_problem(settings))
-            kinds = friction_law_comparison.recording_names_by_name_stem(problem)
-            if len(kinds) < 2:
-                allowed = "two recordings or more in which the motors are on"
-                hint = "list more under recordings.estimate or recordings.held_out"
-                what = "a law is tested on recordings that are not fitted, but there is only one recording"
-                raise DataError(what, where=settings.setting_location("recordings"), allowed=allowed, hint=hint)
             solution = solve(problem, run.solver, restarts=False)
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
