@@ -20,7 +20,6 @@ NEUTRAL = {
     "significance_level": 0.05,
     "gap_significance_level": 0.01,
     "min_excess_chi2_per_dof": 0.0,
-    "min_channel_excess_chi2_per_dof": 0.0,
     "min_samples_per_unknown": 1e-9,
     "signature_overlap": 1.0,
     "n_refit_pairs": 0,

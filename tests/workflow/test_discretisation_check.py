@@ -111,3 +111,12 @@ def test_a_cross_of_few_links_is_not_called_found(tmp_path):
             assert not (entry["verdict"] == "identifiable" and abs(error) > 0.1)
     assert largest[4] > 0.2
     assert largest[8] < 0.5 * largest[4]
+
+
+def test_the_error_of_few_links_is_no_gap(folder):
+    """Six links for twelve leave chi2/n of 2.9, which no effect explains, and twelve none."""
+    file = configuration(folder, 6, ["north"])
+    file.write_text(file.read_text().replace("object: 0.002", "object: 0.001"))
+    found = yid.diagnose(yid.load_problem(file), ("density", "gravity_scale"))
+    assert (found.verdict, found.is_corrected_for_links) == ("no_gap", True)
+    assert "few links looks like a gap; it was removed here" in found.summary

@@ -34,6 +34,7 @@ _NORMAL_QUANTILE_95 = 1.96
 # to their size: m + m/2 + m/4 + ...
 _EXTRAPOLATION_FACTOR = 2.0
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
+_MAX_FINER_FIT_ITERATIONS = 15
 _MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 
@@ -153,16 +154,19 @@ def predicted_refit_residual_at_finer_step(
 
 
 def problem_without_error_of_links(problem: EstimationProblem, x: Array, at_x: Evaluation) -> EstimationProblem | None:
-    """Subtract from all data, held-out ones included, what twice the links change in the predictions at `x` (nx,).
+    """Subtract from all data, held-out ones included, what a fit with twice the links adds to the fit `x` (nx,).
 
-    `at_x` is the evaluation at `x`. Returns None if the object cannot be divided or the finer model does not follow.
+    `at_x` is the evaluation at `x`. Residuals at `x` are then those of the finer fit. Returns None if the object cannot
+    be divided, if torques have noise, which moves the arms of both models apart, or if the finer fit fails.
     """
-    if problem.options.divided_links_model is None or not problem.system.segment_layouts:
+    divided, segments = problem.options.divided_links_model, problem.system.segment_layouts
+    if divided is None or not segments or problem.has_process_noise:
         return None
     try:
         refined = _refined_problem(problem, "links")
         point, guesses = refined._unknowns(problem.unknown_names, x), at_x.equilibrium_guesses
         warm = tuple(None if q is None else refined._guess(problem.system, q) for q in guesses)
+        point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(refined.problem, point, None).x
         fine = refined.problem.evaluate(point, False, warm)
     except YidError:
         return None

@@ -281,7 +281,6 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
         significance_level=sure,
         gap_significance_level=sure,
         min_excess_chi2_per_dof=-1.0,
-        min_channel_excess_chi2_per_dof=-1.0,
         min_log_bayes_factor=1e-9,
         min_gap_closed=-math.inf,
         max_effects=1,
@@ -293,12 +292,6 @@ def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
     if said["chi2_per_dof"] is None:
         return math.inf  # the model could not follow the recording
     return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.gap_significance_level else -math.inf
-
-
-def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
-    """chi2/n - 1 of the worst channel, if any candidate is significant."""
-    is_sure = said["candidate"] < limits.gap_significance_level
-    return (said["largest_channel"] or 1.0) - 1 if is_sure else -math.inf
 
 
 def _of(name: str) -> _Statistic:
@@ -332,7 +325,6 @@ class _CalibrationRule:
 _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "gap": _CalibrationRule("min_excess_chi2_per_dof", _excess, "clean", "most", 0.1),
     "candidate": _CalibrationRule("gap_significance_level", _of("candidate"), "clean", "least", 1e-4),
-    "channel": _CalibrationRule("min_channel_excess_chi2_per_dof", _along, "clean", "most", 0.02),
     "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
     "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),
@@ -343,7 +335,6 @@ _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
 _STATISTIC_TEXTS = {
     "gap": "chi2/n - 1 of a significant residual",
     "candidate": "p of the best candidate",
-    "channel": "the same of the worst channel, along a candidate",
     "evidence": "rise of the log evidence by the best place",
     "rival": "log odds of the likeliest effect against the truth",
     "closure": "lower end of the closure by the best effect",
@@ -449,7 +440,6 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
         "nominal_model": _refit_to_json(result.nominal_model),
         "tests": [plain(test) for test in (result.nominal_test, result.nominal_held_out_test)],
         "screening": _screening_to_json(result.screening),
-        "are_offsets_stated": result.are_offsets_stated,
         "has_left_baseline": result.has_left_baseline,
         "thresholds": plain(result.thresholds),
         "located_gap": {"locations": plain(result.located_gap)},
@@ -494,8 +484,7 @@ class _RecordedCase:
         restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
-        flags = (data["are_offsets_stated"], data["has_left_baseline"])
-        self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *flags)
+        self.evidence = NominalModelGapEvidence(nominal, before, held, screened, data["has_left_baseline"])
         located = data["located_gap"] or {"locations": ()}
         self.located_gap = tuple(restored(GapLocation, place) for place in located["locations"])
         self.record = EffectSearchResults(

@@ -162,7 +162,7 @@ def _examined(
     # the whitening of all hypotheses is fixed here
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
     screened = screen_candidates(composed, (), nominal.values)
-    evidence = NominalModelGapEvidence(nominal, *tests, screened, _offsets_stated(nominal.problem))
+    evidence = NominalModelGapEvidence(nominal, *tests, screened)
     _end_stage(search, "screening")
     if evidence.may_have_gap(limits) and evidence.are_data_sufficient(limits):
         gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
@@ -197,16 +197,13 @@ def _at_half_time_step(search: RefitContext, fit: RefittedModel, fall: float) ->
 def _without_error_of_links(
     search: RefitContext, fit: RefittedModel, gap: float
 ) -> tuple[RefitContext, RefittedModel] | None:
-    """Hypotheses and nominal fit on data that lack what twice the links change, if this closes half of the gap."""
+    """Hypotheses and nominal fit on data without the error of the links, if twice the links close half of the gap."""
     search.progress.begin_stage("trying twice the links", 1.0, 8.5)
     composed, x = search.problem.problem, fit.problem.unknown_vector(fit.values)
     corrected = problem_without_error_of_links(composed, x, fit.evaluation)
     if corrected is None:
         return None
-    judged = fit.problem.with_episodes(corrected.episodes, corrected.held_out, fit.problem.whitening_filters)
-    left, jacobian = judged.evaluate(x, False, fit.evaluation.equilibrium_guesses).residual, fit.evaluation.jacobian
-    assert jacobian is not None
-    left = left - jacobian @ np.linalg.lstsq(jacobian, left, rcond=1e-10)[0]
+    left = corrected.evaluate(x, False, fit.evaluation.equilibrium_guesses).residual
     fall = _excess_of(fit.evaluation.residual) - _excess_of(left)
     if not fall > gap / 2:
         return None
@@ -232,12 +229,6 @@ def _followed(
         name = f"the nominal model, limited to the part that it can follow ({margin:g})"
         nominal = _fitted_nominal_model(search, nominal.values, name)
     return search, nominal, tuple(found.values())
-
-
-def _offsets_stated(problem: EstimationProblem) -> bool:
-    """Whether the size of torque offsets or of constant sensor errors is stated."""
-    torques = (np.any(e.input_errors.torque_bias_std > 0) for e in problem.episodes if e.input_errors is not None)
-    return any(torques) or any(episode.has_biases_treated_as_noise for episode in problem.episodes)
 
 
 def _undivided(composed: AllCandidatesProblem) -> EstimationProblem:

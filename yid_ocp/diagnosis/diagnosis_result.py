@@ -171,7 +171,6 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     found = {
         "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
-        "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
         "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
         "closure_low": result.gap_closure.ci_low,

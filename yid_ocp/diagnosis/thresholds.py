@@ -30,9 +30,6 @@ class Thresholds:
     min_excess_chi2_per_dof: Annotated[float, Ge(0), OptionInfo("smallest chi2/n - 1 of a gap")] = (
         DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof
     )
-    min_channel_excess_chi2_per_dof: Annotated[
-        float, Ge(0), OptionInfo("smallest chi2/n - 1 of the worst channel, if a candidate explains it")
-    ] = 0.02
     gap_significance_level: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance level of a gap, of all residuals or along a candidate")
     ] = 1e-4

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import ScreeningResult
+from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, leaves_noise, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
@@ -67,7 +67,6 @@ class NominalModelGapEvidence:
     nominal_test: NullTestResult  # test on the estimation recordings
     nominal_held_out_test: NullTestResult
     screening: ScreeningResult
-    are_offsets_stated: bool = False  # whether the size of torque offsets or of constant sensor errors is
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
 
     def exceeds_noise(self, limits: Thresholds) -> bool:
@@ -76,16 +75,9 @@ class NominalModelGapEvidence:
         return residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
 
     def may_have_gap(self, limits: Thresholds) -> bool:
-        """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
-
-        Along a signature, some channel must also exceed noise: with many samples, errors far below the noise are
-        significant. A torque offset beyond its stated size counts without: it is one number among thousands.
-        """
-        tests, ranked = (self.nominal_test, self.nominal_held_out_test), self.screening.candidate_scores
-        largest = max((value for test in tests for value in test.channel_chi2.values()), default=1.0)
-        is_seen, level = largest > 1 + limits.min_channel_excess_chi2_per_dof, limits.gap_significance_level
-        along = [s.p_value for s in ranked if is_seen or (self.are_offsets_stated and s.effect.is_torque_offset)]
-        return min(along, default=math.inf) * len(ranked) < level or self.exceeds_noise(limits)
+        """Whether the residual exceeds noise as a whole or, significantly, along a candidate's signature."""
+        p_value = bonferroni_corrected_min_candidate_p_value(self.screening.candidate_scores)
+        return p_value < limits.gap_significance_level or self.exceeds_noise(limits)
 
     def are_data_sufficient(self, limits: Thresholds) -> bool:
         """Whether the degrees of freedom suffice for the nominal model's unknowns, and a candidate is detectable."""

@@ -203,7 +203,6 @@ class _EffortOffset(_DistortedEffort):
     """Constant offset of a joint's recorded effort."""
 
     equation = "measured effort = true + offset"
-    is_torque_offset = True
     declared_parameters = (
         replace(
             ParameterDefinition("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured less true effort"),

@@ -84,9 +84,7 @@ class EffectBase(Effect):
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
     # whether the effect at one location implies nothing about other locations, as for a mass (unlike friction)
     is_local: ClassVar[bool] = False
-    # whether it is a constant error of a recorded torque, whose size recordings state; whether it is carried mass
-    is_torque_offset: ClassVar[bool] = False
-    is_load: ClassVar[bool] = False
+    is_load: ClassVar[bool] = False  # whether it is carried mass
     # whether a location is a sensor `GROUP:FRAME`, which a diagnosis tries if recordings contain it
     is_at_recorded_sensor: ClassVar[bool] = False
     # whether a location may also be the name of a point group, which a diagnosis tries if recordings contain it
