@@ -119,4 +119,4 @@ def test_the_error_of_few_links_is_no_gap(folder):
     file.write_text(file.read_text().replace("object: 0.002", "object: 0.001"))
     found = yid.diagnose(yid.load_problem(file), ("density", "gravity_scale"))
     assert (found.verdict, found.is_corrected_for_links) == ("no_gap", True)
-    assert "few links looks like a gap; it was removed here" in found.summary
+    assert "The error of few links looks like a gap" in found.summary

@@ -254,9 +254,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         used = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
         text.append(f"The discretisation error of {stated} s steps looks like a gap, {used}.")
     if result.is_corrected_for_links:
-        text.append(
-            "The error of the number of links looks like a gap and was removed (other commands need more links)."
-        )
+        text.append("The error of few links looks like a gap. It was removed here; other commands need more links.")
     if result.verdict not in ("insufficient_data", "no_gap"):
         text += [_places(result), *_causes(result), *_remains(result)]
     if result.law is not None:
