@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM, correlated, efforts, measured, pendulum_step, taken
 
+from yid_ocp.analysis.friction_law_comparison import problems_with_common_samples
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
@@ -191,6 +192,20 @@ def test_an_effort_where_an_estimated_dry_friction_may_hold_the_joint_is_no_meas
     assert not np.isnan(samples.value[:, 0]).any()
     np.testing.assert_array_equal(np.isnan(samples.value[:, 1]), free & (slowest < 0.06))
     assert 5 < np.count_nonzero(slowest < 0.06) < 0.5 * len(slowest)
+
+
+def test_friction_laws_are_compared_on_the_samples_that_all_of_them_use(urdf_folder):
+    friction = [("joint_coulomb", "elbow", {"tau_c": 0.4}), ("joint_viscous", "elbow", {"b": 0.1})]
+    step, path = pendulum_step(urdf_folder, friction, prescribed=JOINTS), motion()
+    names = ("joint_viscous@elbow.b",), ("joint_coulomb@elbow.tau_c",)
+    laws = [arm(step, path, np.ones_like(path), angle=0.0, free=own) for own in names]
+    masks = [
+        [own.positive_weight_mask for own in problem.episodes[0].measurements]
+        for problem in (*laws, *problems_with_common_samples(laws))
+    ]
+    assert masks[0][0].sum() > masks[1][0].sum()
+    np.testing.assert_array_equal(masks[2], masks[1])
+    np.testing.assert_array_equal(masks[3], masks[1])
 
 
 JOINTS = ("shoulder", "elbow")
