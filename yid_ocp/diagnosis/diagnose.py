@@ -142,13 +142,7 @@ def _examined(
     is_corrected_for_links: bool = False,
 ) -> _Examined:
     """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
-    limits, residual = search.thresholds, nominal.evaluation.residual
-    excess = _excess_of(residual)
-    # neither events nor candidates are sought while the step makes most of the gap
-    is_poor = excess >= limits.min_excess_chi2_per_dof * len(residual)
-    tried, fall = (nominal, _fall_at_half_time_step(search, nominal)) if is_poor else (None, -math.inf)
-    if fall > excess / 2:
-        return _examined(*_at_half_time_step(search, nominal, fall), known)
+    limits = search.thresholds
     search, nominal, cuts = _followed(search, nominal, known)
     _end_stage(search, "nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
@@ -165,11 +159,11 @@ def _examined(
     evidence = NominalModelGapEvidence(nominal, *tests, screened)
     _end_stage(search, "screening")
     if evidence.may_have_gap(limits) and evidence.are_data_sufficient(limits):
-        gap = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=excess)
-        if tried is not nominal:
-            fall = _fall_at_half_time_step(search, nominal, events)
+        # without the error of its discretisation, the gap may be none
+        gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
+        fall = _fall_at_half_time_step(search, nominal, events)
         if fall > gap / 2:
-            return _examined(*_at_half_time_step(search, nominal, fall), cuts)
+            return _examined(*_at_half_time_step(search, nominal, fall))
         corrected = None if is_corrected_for_links else _without_error_of_links(with_events, nominal, gap)
         if corrected is not None:
             return _examined(*corrected, cuts, True)
@@ -177,7 +171,7 @@ def _examined(
     return _Examined(replace(search, problem=composed), *found)
 
 
-def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet = NO_EVENTS) -> float:
+def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
     """How much half the time step lowers r'r - n of a fit; minus infinity if the motion cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
     finer = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False).problem
