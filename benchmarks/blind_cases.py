@@ -1,6 +1,6 @@
 """Diagnose cases of one kind and one experiment of a blind ensemble, and print every answer.
 
-    python benchmarks/blind_cases.py [CONFIG.VARIATION] [--category null] [--multiple 10] [--cases 10] [--seed 1]
+    python benchmarks/blind_cases.py [CONFIG.VARIATION] [--category null] [--multiple 10] [--brisk] [--cases 10]
 
 Where a whole ensemble raises false alarms or misses effects, this shows at what: CONFIG is `diagnosis` or
 `dual_arm_vision`, VARIATION one of `EXPERIMENT_VARIATIONS`, the category one of `BLIND_CASE_CATEGORY_SHARES`. The cases
@@ -32,6 +32,7 @@ def main() -> None:
     )
     parser.add_argument("--category", default="null", choices=list(BLIND_CASE_CATEGORY_SHARES))
     parser.add_argument("--multiple", type=float, help="of the detectable size of one effect")
+    parser.add_argument("--brisk", action="store_true", help="three times the acceleration")
     parser.add_argument("--cases", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--config", type=Path, help="file; default: the example of this name")
@@ -46,7 +47,7 @@ def main() -> None:
         print("| case | injected | verdict | effects, with those that are equivalent | chi2/n | held out | CPU [s] |")
         print("|---|---|---|---|---|---|---|")
         for number in range(given.cases):
-            planned = PlannedBlindCase(number, given.experiment, given.category, given.multiple)
+            planned = PlannedBlindCase(number, given.experiment, given.category, given.multiple, given.brisk)
             case, label = ensemble.draw_recordings_and_ground_truth(planned)
             begun = time.process_time()
             found = diagnose_blind_case(ensemble, case, "all", run.diagnosis)
