@@ -206,6 +206,9 @@ def test_friction_laws_are_compared_on_the_samples_that_all_of_them_use(urdf_fol
     assert masks[0][0].sum() > masks[1][0].sum()
     np.testing.assert_array_equal(masks[2], masks[1])
     np.testing.assert_array_equal(masks[3], masks[1])
+    for problem in problems_with_common_samples(laws):
+        [samples] = problem.episodes[0].measurements
+        np.testing.assert_array_equal(np.isfinite(samples.value), samples.positive_weight_mask)
 
 
 JOINTS = ("shoulder", "elbow")

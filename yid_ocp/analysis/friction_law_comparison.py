@@ -184,16 +184,13 @@ def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[
     """Return problems of the same recordings without samples that one of them lacks, so that errors are comparable."""
     found = []
     for problem in problems:
-        episodes = [
-            replace(
-                episode,
-                measurements=tuple(
-                    replace(own, weight=own.weight * np.all([s.positive_weight_mask for s in others], axis=0))
-                    for own, *others in zip(episode.measurements, *(o.measurements for o in alike), strict=True)
-                ),
-            )
-            for episode, *alike in zip(problem.episodes, *(other.episodes for other in problems), strict=True)
-        ]
+        episodes = []
+        for episode, *alike in zip(problem.episodes, *(other.episodes for other in problems), strict=True):
+            samples = []
+            for own, *others in zip(episode.measurements, *(other.measurements for other in alike), strict=True):
+                seen = np.all([other.positive_weight_mask for other in others], axis=0)
+                samples.append(replace(own, weight=own.weight * seen, value=np.where(seen, own.value, np.nan)))
+            episodes.append(replace(episode, measurements=tuple(samples)))
         found.append(problem.with_episodes(episodes, ()))
     return found
 
