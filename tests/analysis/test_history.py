@@ -167,6 +167,9 @@ def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():
     # the best has by chance the same error everywhere; the difference from it is less sure
     even, uneven = fit_of("stribeck", 2, 2, 2, 2), fit_of("coulomb", 1.7, 1.7, 2.1, 2.4)
     assert simplest_fit_within_std_error([rough, uneven, even], KINDS) is uneven
+    # a small advantage in every kind counts although the kinds differ by more
+    worse, better = fit_of("viscous", 9.1, 9.1, 5.1, 1.15), fit_of("coulomb", 9, 9, 5, 1)
+    assert simplest_fit_within_std_error([worse, better], KINDS) is better
     failed = fit_of("coulomb", float("nan"), 1, 1, 1)
     assert simplest_fit_within_std_error([rough, failed, far], KINDS) is far
 

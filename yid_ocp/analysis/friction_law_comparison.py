@@ -101,7 +101,7 @@ def simplest_fit_within_std_error(
     Returns the first of `fits` whose mean error over the `kinds` of motion is within one standard error of the smallest
     error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
     doi:10.1007/978-0-387-84858-7). The larger of two standard errors counts: of the smallest error, or of the
-    difference from it.
+    difference from it. A difference beyond two of its own standard errors counts in any case.
     """
     means = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)[0] for fit in fits]
     best = fits[int(np.argmin(np.where(np.isfinite(means), means, np.inf)))]
@@ -109,7 +109,7 @@ def simplest_fit_within_std_error(
 
     def is_near(fit: CrossValidatedFrictionLawFit) -> bool:
         difference, paired = prediction_error_difference_and_std_error(fit, best, kinds)
-        return difference <= max(error, paired)
+        return difference <= min(max(error, paired), 2 * paired)
 
     return next((fit for fit in fits if is_near(fit)), fits[0])
 
