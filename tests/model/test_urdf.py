@@ -65,7 +65,7 @@ def test_kept_joints_in_the_order_given(urdf_folder):
     robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=names)
     # parents come first, the rest as given
     assert robot.joint_names == ("slide", "swing", "nod", "spin")
-    assert robot.parent_joint_indices == (-1, 0, 1, 0)
+    assert [joint.parent_index for joint in robot.joints] == [-1, 0, 1, 0]
     assert robot.name == "mixed_joints"
     assert robot.ancestor_joint_indices(robot.joint_index("nod")) == (0, 1, 2)
     assert robot.ancestor_joint_indices(-1) == ()

@@ -231,7 +231,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
     with respect to the parameters. `A` (state), `B_u` (input) and `B_theta` (parameters) are the Jacobians of the next
     state.
     """
-    whole = _mask(symbols.full_jacobian_sparsity_pattern)
+    whole = ca.DM.ones(symbols.full_jacobian_sparsity_pattern).full() > 0
     system = symbols.equations.system
     free = list(system.unprescribed_coordinate_indices)
     joints = system.mechanism.joint_names
@@ -292,10 +292,3 @@ def _inverse_sparsity(mask: BoolArray) -> BoolArray:
 def _times(a: BoolArray, b: BoolArray) -> BoolArray:
     product: BoolArray = (a.astype(np.float32) @ b.astype(np.float32)) > 0
     return product
-
-
-def _mask(pattern: ca.Sparsity) -> BoolArray:
-    mask = np.zeros(pattern.shape, bool)
-    row, column = pattern.get_triplet()
-    mask[row, column] = True
-    return mask

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import scipy.special
+from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
@@ -21,12 +22,6 @@ _MAX_REPEATED_FRACTION = 0.1  # fraction of samples that may repeat the previous
 _MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # change next to a rest over smallest and median change
 _MIN_NOISE_FRACTION = 1e-2  # fraction of the stated noise below which a channel was computed
 _MAX_SAMPLE_PERIOD = 0.02  # longest period at which arm motion counts as slow [s]
-
-
-def cumulative_trapezoid(values: Array, t: Array) -> Array:
-    """Integral (N, ...) of samples (N, ...) from the first time `t` (N,) on, by the trapezoidal rule."""
-    widths = np.diff(t).reshape(-1, *[1] * (values.ndim - 1))
-    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(widths * (values[1:] + values[:-1]) / 2.0, axis=0)])
 
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
@@ -52,7 +47,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         quantity, _, name = channel.partition(".")
         turned_by = np.zeros(len(t))
         if joints is not None and quantity == "position" and joints.velocity is not None:
-            turned_by = cumulative_trapezoid(joints.velocity[:, joints.names.index(name)], t)
+            turned_by = cumulative_trapezoid(joints.velocity[:, joints.names.index(name)], t, initial=0)
         runs = [
             (begin, end, float(np.ptp(turned_by[begin : end + 1])))
             for begin, end in _repeated_stretches(same)

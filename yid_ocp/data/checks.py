@@ -13,6 +13,7 @@ from itertools import chain, combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data import channel_checks
@@ -203,7 +204,7 @@ def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array
     starts = np.arange(0, max(len(t) - width, 1), max(1, width // 2))
     ends = np.minimum(starts + width, len(t) - 1)
     length = (t[ends] - t[starts])[:, None]
-    area = channel_checks.cumulative_trapezoid(rates, t)
+    area = cumulative_trapezoid(rates, t, axis=0, initial=0)
     good = (length[:, 0] > 0) & (length[:, 0] < 3 * np.median(length))
     by_value, by_rate = ((x[ends] - x[starts])[good] / length[good] for x in (values, area))
     return by_value, by_rate

@@ -135,7 +135,8 @@ class CompiledKernel:
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         alike: dict[Hashable, list[int]] = {}
         for i, member in enumerate(members):
-            alike.setdefault(_batch_key(member), []).append(i)
+            loop = None if member.feedback is None else tuple(np.asarray(member.feedback.state_indices).tolist())
+            alike.setdefault((loop, member.directions is None), []).append(i)
         # a batch costs as many columns and steps as its widest and longest member
         for group in alike.values():
             group.sort(key=lambda i: (_width(members[i]), len(members[i].torque)), reverse=True)
@@ -276,12 +277,6 @@ class CompiledKernel:
 def _check(code: int, outcome: Any) -> None:
     if code == NewtonStatusCode.OUT_OF_MEMORY:
         raise out_of_memory_error("the work on one step", outcome.memory)
-
-
-def _batch_key(member: RolloutInputs) -> Hashable:
-    """Properties shared by the members of one batch."""
-    feedback, wanted = member.feedback, member.directions
-    return None if feedback is None else tuple(np.asarray(feedback.state_indices).tolist()), wanted is None
 
 
 def _width(member: RolloutInputs) -> int:

@@ -151,11 +151,6 @@ class Mechanism(ReprMixin):
         """Names of the joints, in the order of the configuration vector."""
         return tuple(joint.name for joint in self.joints)
 
-    @property
-    def parent_joint_indices(self) -> tuple[int, ...]:
-        """Index of every joint's parent joint, -1 for the world."""
-        return tuple(joint.parent_index for joint in self.joints)
-
     def joint_index(self, name: str) -> int:
         """Return the index of a joint. Raises `ModelError`, with the nearest name, if there is no such joint."""
         names = self.joint_names

@@ -240,11 +240,6 @@ class CloudSkeleton:
     edges: IntArray  # (E, 2), minimum spanning forest of the graph of nearest neighbours
     component_of_node: IntArray  # (K,), connected part of each node, largest part first
 
-    @property
-    def points_assigned_to_node_mask(self) -> BoolArray:
-        """Whether each point (N,) of the cloud belongs to a node."""
-        return self.node_of_point >= 0
-
 
 def _thin_to_nodes(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions

@@ -49,11 +49,6 @@ class _Centerline:
     slice_width: float
 
     @property
-    def end_nodes(self) -> IntArray:
-        """Nodes with only one edge."""
-        return np.flatnonzero(np.bincount(self.edges.ravel(), minlength=len(self.nodes)) <= 1)
-
-    @property
     def to_skeleton(self) -> CloudSkeleton:
         """Skeleton with the same nodes and edges, without points."""
         none = np.empty(0, dtype=np.int64)
@@ -272,7 +267,8 @@ class ShapeGuessFinder:
         Raises `DataError` if the number of ends or the lengths do not match, because a part of the object is hidden or
         something else is connected to it.
         """
-        leaves, n_ends = trace.end_nodes, len(self._end_distances)
+        edges_of_node = np.bincount(trace.edges.ravel(), minlength=len(trace.nodes))
+        leaves, n_ends = np.flatnonzero(edges_of_node <= 1), len(self._end_distances)
         if not n_ends <= len(leaves) <= _MAX_ENDS:
             counts = f"the cloud has {len(leaves)} ends, the object {n_ends}"
             raise DataError(f"the object cannot be followed from end to end: {counts}")

@@ -422,7 +422,7 @@ class FrameTracker:
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
-        work.filtered = rest = cloud.select(found.points_assigned_to_node_mask)
+        work.filtered = rest = cloud.select(found.node_of_point >= 0)
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
     def _anywhere(

@@ -216,7 +216,7 @@ def _torque_bias_std(tree: Mechanism, recorded: JointGroup, joints: Sequence[str
 
 def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
     for j in range(len(tree.joints)):
-        if j not in tree.parent_joint_indices:
+        if all(joint.parent_index != j for joint in tree.joints):
             own = sorted([name for name, frame in tree.frames.items() if frame.joint_index == j], key=_tool_rank)
             ends = [name for name in own if tree.frames[name].proximal_names.issuperset({*own} - {name})]
             own = [*ends, *(name for name in own if name not in ends)] if len(ends) == 1 else own
