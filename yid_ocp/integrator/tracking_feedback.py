@@ -67,7 +67,10 @@ def lqr_tracking_feedback(
     parameters = arm_step.system.parameters
     arm_theta = parameters.vector({name: values[name] for name in parameters.names})
     nu = len(system.driven)
-    momenta = _reference_momentum(arm_step, reference, torques, arm_theta)
+    # p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, (N + 1, nu), which starts from rest
+    angles, pushes = np.vstack([reference[:1], reference]), np.vstack([torques[:1], torques])
+    course = arm_theta, np.hstack([angles, np.zeros_like(angles)]), np.zeros((len(pushes), 0)), pushes
+    momenta = arm_step.kernel.linearize_step_equations(*course, (), False).p1
     steps = len(reference) - 1
 
     weight_q, weight_u = (np.eye(nu) * (1.0 / std**2) for std in (_ANGLE_STD, _TORQUE_STD))
@@ -103,13 +106,6 @@ def compile_driven_arms_only_step(step: Step) -> Step:
     without = replace(system, elastic_joints=(), grasps=(), prescribed=(), segment_layouts=(), point_frames=())
     arms_only = replace(without, mechanism=arms, joint_compliances={}, joint_damping=damping, effects=())
     return compile_step_like(step, arms_only)
-
-
-def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: Array) -> Array:
-    """p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, (N + 1, nu), which starts from rest."""
-    angles, torques = np.vstack([measured[:1], measured]), np.vstack([torque[:1], torque])
-    state = np.hstack([angles, np.zeros_like(angles)])
-    return arm_step.kernel.linearize_step_equations(theta, state, np.zeros((len(torques), 0)), torques, (), False).p1
 
 
 def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, theta: Array) -> tuple[Array, Array]:

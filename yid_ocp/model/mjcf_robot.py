@@ -128,7 +128,7 @@ def _body(
             what, allowed = f"joint '{label}' has the type free or ball", "hinge and slide joints"
             raise ModelError(what, where=where, allowed=allowed, hint="fix the base, or use several hinges")
         place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
-        origin = at @ _shift(place - last) @ _moved(axis, -ref, kind)
+        origin = at @ _shift(place - last) @ joint_motion_pose(axis, -ref, kind)
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
         if carried != name:
             links.append(SimpleNamespace(name=carried, inertial=None))
@@ -237,7 +237,8 @@ def _shift(translation: Array) -> Array:
     return homogeneous_transform(np.eye(3), translation)
 
 
-def _moved(axis: Array, amount: float, kind: str) -> Array:
+def joint_motion_pose(axis: Array, amount: float, kind: str) -> Array:
+    """Pose (4, 4) of a prismatic or revolute joint of unit axis (3,) at the position `amount` [m or rad]."""
     if kind == "prismatic":
         return _shift(amount * axis)
     return homogeneous_transform(rotation_from_axis_sin_cos(axis, math.sin(amount), math.cos(amount)), np.zeros(3))

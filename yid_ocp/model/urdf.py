@@ -28,14 +28,12 @@ from yid_ocp.model.mechanism import (
     Joint,
     Mechanism,
     Placement,
-    homogeneous_transform,
     merge_bodies,
-    rotation_from_axis_sin_cos,
     rpy_from_rotation,
     snap_near_integer_entries,
     transform_from_xyz_rpy,
 )
-from yid_ocp.model.mjcf_robot import mjcf_robot_description
+from yid_ocp.model.mjcf_robot import joint_motion_pose, mjcf_robot_description
 from yid_ocp.model.parameters import Parameter, Parameters
 
 _UNLIMITED_VALUE = 1e9  # represents "no limit" where URDF requires a number
@@ -423,11 +421,7 @@ def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia
 def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Array:
     if joint.type == "fixed":
         return np.eye(4)
-    value = _locked_value(joint, locked)
-    axis = _unit_axis(joint)
-    if joint.type == "prismatic":
-        return homogeneous_transform(np.eye(3), value * axis)
-    return homogeneous_transform(rotation_from_axis_sin_cos(axis, math.sin(value), math.cos(value)), np.zeros(3))
+    return joint_motion_pose(_unit_axis(joint), _locked_value(joint, locked), joint.type)
 
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:

@@ -340,11 +340,8 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in folders}
         folder.log_command_start(["report", *map(str, folders)])
-        about: dict[str, Any] = {
-            "robot": None if first is None else first.model.robot,
-            "section_data": {"overlay": pairs},
-        }
-        about["animations"] = _overlaid_motions(folders, labels, found)
+        robot, motions = None if first is None else first.model.robot, _overlaid_motions(folders, labels, found)
+        about: dict[str, Any] = {"robot": robot, "animations": motions, "section_data": {"overlay": pairs}}
         written = folder.write_result_and_report(settings, progress, told, "overlay.json", **about)
     return CommandOutcome(folder.path, written, None)
 
