@@ -37,6 +37,8 @@ class MadeUp:
         Stated standard deviations by name, for what is said of a parameter's size.
     """
 
+    guess: str | None = "warm"
+
     def __init__(
         self,
         rows: Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray] | None],
@@ -66,6 +68,10 @@ class MadeUp:
             no_data_issue_exceeds_warning=True,
             weighting=weighting,
             prior_stds=dict(priors or {}),
+            known_initial_states={},
+            parameters_by_recording={},
+            initial_state="equilibrium",
+            data_issues=(),
             stated_std_factor=1.0,
             path_cutoff=np.inf,
             multivariate_prior=MultivariateGaussianPrior(),
@@ -112,7 +118,8 @@ class MadeUp:
             return Evaluation(np.inf, np.zeros(0), None, False, "it snaps", ())
         residual, jacobian = found
         data = np.asarray(residual)[self.residual_rows.data, None]
-        done = tuple(SimpleNamespace(predicted_outputs=(part,), equilibrium_guess="warm") for part in (data, data[:0]))
+        parts = (data, data[:0])[: len(self.episodes)]
+        done = tuple(SimpleNamespace(predicted_outputs=(part,), equilibrium_guess=self.guess) for part in parts)
         cost = 0.5 * float(residual @ residual)
         return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
 

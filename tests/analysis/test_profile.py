@@ -39,7 +39,7 @@ def profiled(problem, name="a", std=None):
         std = float(np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))[index]))
     problem.asked.clear()
     found = compute_profile_likelihood_interval(problem, x, index, std, best)
-    assert tuple(x) not in problem.asked
+    assert tuple(x) not in problem.points
     return found
 
 
@@ -128,7 +128,7 @@ def test_an_unknown_at_its_bound_is_open_there_without_a_search(start, side):
     problem = Formula(lambda x: [x["a"] - start], {"a": start}, bounds={"a": (2.5, 6.0)})
     found = profiled(problem, std=1.0)
     assert (getattr(found, side), found.notes) == (None, ())
-    assert all((x[0] < start) == (side == "upper") for x in problem.asked)
+    assert all((x[0] < start) == (side == "upper") for x in problem.points)
 
 
 @pytest.mark.parametrize(("limit", "side"), [(7.0, "above"), (-7.0, "below")])
@@ -188,8 +188,8 @@ def test_a_refit_is_worth_a_thousandth_of_chi2(left, refitted):
 
     problem = Formula(rows, {"a": 3.0, "b": 0.0}, bounds=OPEN, scales={"a": 1.0, "b": 1.0})
     profiled(problem, std=1.0)
-    first = next(x[0] for x in problem.asked if x[0] > 3.0)
-    assert (len([a for a, _ in problem.asked if a == first]) > 1) is refitted
+    first = next(x[0] for x in problem.points if x[0] > 3.0)
+    assert (len([a for a, _ in problem.points if a == first]) > 1) is refitted
 
 
 @pytest.mark.parametrize(
