@@ -121,19 +121,6 @@ def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback,
     assert gradient == pytest.approx(result.jacobian.T @ result.residual, rel=1e-6, abs=1e-6)
 
 
-def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed) -> None:
-    for bench in (driven, prescribed):
-        task = problem(bench, ("effort_delay", "camera_latency"), neutral=True)
-        x = task.initial_unknowns
-        jacobian = task.evaluate(x).jacobian
-        for column in (i for i, name in enumerate(task.unknown_names) if name.endswith(".delay")):
-            shift = 1e-5 * np.eye(len(x))[column]
-            above, below = (task.evaluate(x + sign * shift, derivatives=False).residual for sign in (1, -1))
-            # a sample that would be looked for before the recording stays at its start
-            error = jacobian[:, column] - (above - below) / 2e-5
-            assert np.max(np.abs(error)) <= 1e-3 * np.max(np.abs(jacobian[:, column]))
-
-
 @pytest.mark.parametrize("time_constant", [0.02, -0.02])
 def test_what_acts_follows_the_recorded_effort_of_a_prescribed_joint(time_constant, prescribed) -> None:
     """T dz/dt = c - z; with a negative T the recorded effort follows what acts."""
@@ -175,14 +162,6 @@ def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     for k in range(6):
         expected = np.interp(position, np.arange(len(nodes)), nodes[:, k])
         assert late.predicted_outputs[at][:, k] == pytest.approx(expected, abs=1e-9)
-
-
-def test_an_offset_is_taken_out_of_the_prescribed_path(prescribed) -> None:
-    task = problem(prescribed, ("encoder_offset",))
-    inputs = task.predictor.corrected_inputs(task.episodes[0], task.theta, ("encoder_offset@left_b.offset",))
-    change = inputs.prescribed_path - task.episodes[0].prescribed_path
-    assert change == pytest.approx(np.tile([0.0, -0.01, 0.0], (STEPS + 1, 1)))
-    assert np.all(inputs.prescribed_path_sensitivity[:, 1] == -1)
 
 
 def test_a_gear_needs_recorded_effort(prescribed) -> None:

@@ -104,47 +104,18 @@ def test_without_derivatives_the_cost_is_the_same(problem):
 def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
     whole = problem_of(urdf_folder, "driven, filtered")
     x, few = moved(whole), whole.unknown_names[1:4]
-    part = whole.with_free_parameters_without_recompiling(few).with_parameter_values(
-        dict(zip(whole.unknown_names, x, strict=True))
-    )
+    known = dict(zip(whole.unknown_names, x, strict=True))
+    part = whole.with_free_parameters_without_recompiling(few).with_parameter_values(known)
     own = np.array([x[whole.unknown_names.index(name)] for name in few])
     one, two = part.evaluate(own), whole.evaluate(x)
     data = whole.residual_rows.data
     np.testing.assert_allclose(one.residual[part.residual_rows.data], two.residual[data], atol=1e-9)
     columns = [whole.unknown_names.index(name) for name in few]
     np.testing.assert_allclose(one.jacobian[part.residual_rows.data], two.jacobian[data][:, columns], atol=1e-7)
-    none = whole.with_free_parameters_without_recompiling(()).with_parameter_values(
-        dict(zip(whole.unknown_names, x, strict=True))
-    )
+    none = whole.with_free_parameters_without_recompiling(()).with_parameter_values(known)
     alone = none.evaluate(np.zeros(0))
     np.testing.assert_allclose(alone.residual, two.residual[data], atol=1e-9)
     assert alone.jacobian.shape == (len(alone.residual), 0)
-
-
-def predicted(problem, values, group=0):
-    return (
-        problem.evaluate(problem.unknown_vector(values), derivatives=False)
-        .episode_predictions[0]
-        .predicted_outputs[group]
-    )
-
-
-def test_a_late_camera_sees_what_was_before(urdf_folder):
-    problem = problem_of(urdf_folder, "robust", seeds=(1,))
-    camera = problem.episodes[0].measurements[1]
-    delay = "camera_latency@camera.delay"
-    neutral = {"clock_scale@clock.scale": 1.0}
-    whole = (
-        problem.evaluate(problem.unknown_vector({**neutral, delay: 0.0}), False)
-        .episode_predictions[0]
-        .predicted_outputs[0]
-    )
-    t = H * (camera.node + camera.fraction)
-    late = predicted(problem, {**neutral, delay: 0.02}, group=1)
-    for i in range(3):
-        expected = np.interp(t - 0.02, H * np.arange(STEPS + 1), whole[:, i])
-        np.testing.assert_allclose(late[:, 3 + i], expected, atol=1e-9)
-    np.testing.assert_allclose(predicted(problem, {**neutral, delay: 0.02}), whole, atol=1e-12)
 
 
 def test_a_delay_is_in_true_time(urdf_folder):
