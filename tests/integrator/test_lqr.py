@@ -130,25 +130,23 @@ def step_with(system, names):
     return compile_step(system.with_effects(effects), TIME_STEP, use_compiler=False)
 
 
-def moved(step, theta, remembered=0.6):
-    """A motion, the torques that made it, and what its joints remembered at first."""
+def moved(step, values=None, remembered=0.6):
+    """The step, its parameters, a motion with the torques and first memories that made it, and the momentum's shift."""
+    theta = step.system.parameters.vector(values)
     time = np.arange(STEPS) * TIME_STEP
     torque = np.stack([3.0 * np.sin(2 * time), np.cos(3 * time)], axis=1)
     internal = np.full(step.sizes["nz"], remembered)
     start = np.concatenate([[0.3, -0.2, 0.0, 0.0], internal])
     swung = simulate(step, theta, start, STEPS, torque)
     assert swung.status.is_converged
-    return swung.state, torque, internal
+    return step, theta, (swung.state, torque, internal), EffectMomentumShift(step)
 
 
 @pytest.mark.parametrize("names", EFFECTS.values(), ids=EFFECTS)
 @pytest.mark.parametrize("misread", [0.0, 0.5], ids=["torque as read", "torque misread"])
 def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, misread):
     """A filter that follows them pulls at nothing; the first node is stood at before the reference begins."""
-    step = step_with(plain, names)
-    theta = step.system.parameters.vector()
-    state, torque, internal = moved(step, theta)
-    shift = EffectMomentumShift(step)
+    step, theta, (state, torque, internal), shift = moved(step_with(plain, names))
     read = torque + misread
     loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
     recorded, true = (JointMotionWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
@@ -161,9 +159,7 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
 def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(plain):
     step = compile_step(system_with_link_mass_factors(plain, "mass_scale"), TIME_STEP, use_compiler=False)
     names = {"shoulder.mass_scale": 1.1, "elbow.mass_scale": 0.8, "elbow.damping": 0.4}
-    theta = step.system.parameters.vector(names)
-    state, torque, internal = moved(step, theta)
-    shift = EffectMomentumShift(step)
+    step, theta, (state, torque, internal), shift = moved(step, names)
     loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.theta_without_effects(theta))
     recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, internal)
     value, slopes = shift.effect_momentum_shifts_and_derivatives(recorded, recorded, theta, tuple(names))
@@ -173,10 +169,7 @@ def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(pla
 
 def test_the_shift_of_a_torque_that_was_misread(plain):
     """Half the impulse of the error; the derivative says the same of a gain."""
-    step = step_with(plain, ())
-    theta = step.system.parameters.vector()
-    state, torque, none = moved(step, theta)
-    shift = EffectMomentumShift(step)
+    _, theta, (state, torque, none), shift = moved(step_with(plain, ()))
     assert set(shift.parameter_names) == OWN
     by_torque = np.stack([torque, 0 * torque], axis=2)
     recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, none)
@@ -192,10 +185,7 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
 @pytest.mark.parametrize("names", [EFFECTS["two that hold"], EFFECTS["friction"]], ids=["holds", "slides"])
 def test_derivatives_are_those_of_differences(plain, names):
     """By the effects' parameters, and by what angles, torques and internal coordinates do beside them."""
-    step = step_with(plain, names)
-    theta = step.system.parameters.vector()
-    state, torque, internal = moved(step, theta)
-    shift = EffectMomentumShift(step)
+    step, theta, (state, torque, internal), shift = moved(step_with(plain, names))
     wanted = shift.parameter_names
     d, rng = len(wanted) + 2, np.random.default_rng(1)
     by_angles, by_torque = (0.01 * rng.normal(size=(*x.shape, d)) for x in (state[:, ANGLES], torque))

@@ -32,6 +32,7 @@ CASES = {
     "estimated start": ((), {}, {"initial_state": "estimated"}),
     "local": (SOFT, {}, {"local_parameters": ("elbow.stiffness",)}),
     "robust": (LATE, {}, {"huber_threshold": 1.5}),
+    "paper": ((), {}, {"weighting": "paper"}),
     "prescribed": (MISREAD + LATE, {"prescribed": ("shoulder",)}, {}),
     "prescribed gears": (GEARS + HEAVY, {"prescribed": ("shoulder",)}, {}),
     "all prescribed": (MISREAD, {"prescribed": PENDULUM}, {}),

@@ -72,23 +72,6 @@ def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(pr
     assert np.abs(rolled.state[:, driven] - episode.measured_driven_angles).max() > 1e-4
 
 
-@pytest.mark.parametrize("weighting", ["whitened", "paper"])
-def test_gradients_of_the_cost_agree(make_problem, weighting):
-    threshold = 2.0 if weighting == "whitened" else np.inf
-    problem = make_problem(duration=1.0, weighting=weighting, huber_threshold=threshold)
-    x = problem.initial_unknowns * np.array([5.0, 4.0, 3.0, 2.0, 3.0, 2.0])
-    now = problem.evaluate(x)
-    forward = now.jacobian.T @ now.residual
-    cost, adjoint, _ = problem.cost_and_gradient(x)
-    assert cost == pytest.approx(now.cost, rel=1e-8)
-    np.testing.assert_allclose(adjoint, forward, rtol=1e-5, atol=1e-7 * np.abs(forward).max())
-    for i in (0, 2):
-        step = np.zeros_like(x)
-        step[i] = 1e-4 * x[i]
-        ends = [problem.evaluate(x + sign * step, derivatives=False).cost for sign in (1, -1)]
-        assert (ends[0] - ends[1]) / (2 * step[i]) == pytest.approx(adjoint[i], rel=1e-4)
-
-
 @pytest.mark.parametrize(("interval", "initial_state"), [(1, "equilibrium"), (5, "equilibrium"), (4, "estimated")])
 def test_condensed_derivatives_match_differences(make_problem, interval, initial_state):
     """Of the residual by the unknowns, node states moved along, and by closing the defects."""

@@ -127,11 +127,15 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypatch):
+def show_all_on_a_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("COLUMNS", "200")
     update = Bars.update
     monkeypatch.setattr(Bars, "update", lambda self, task, **what: update(self, task, refresh=True, **what))
+
+
+def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypatch):
+    show_all_on_a_terminal(monkeypatch)
     with command_runner.stderr_progress_display(asked(program=True)) as progress:
         progress.report_parts_done(1, 2, "before any stage")
         progress.begin_stage("solving")
@@ -146,10 +150,7 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypat
 
 @pytest.mark.parametrize("verbose", [False, True])
 def test_a_terminal_renews_one_line_of_iterations_and_a_table_of_results(monkeypatch, verbose):
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    monkeypatch.setenv("COLUMNS", "200")
-    update = Bars.update
-    monkeypatch.setattr(Bars, "update", lambda self, task, **what: update(self, task, refresh=True, **what))
+    show_all_on_a_terminal(monkeypatch)
     with command_runner.stderr_progress_display(asked(verbose=verbose)) as progress:
         progress.begin_stage("solving", ahead=60.0)
         for _ in range(2):
@@ -189,11 +190,8 @@ def test_a_live_solve_is_shown_on_a_terminal_and_nowhere_else(pendulum, monkeypa
     settings = ["--set", "output={write_report: false}", "--set", "output.discretisation_check=none"]
     assert main(["solve", str(pendulum), "--live", *settings, "--out", str(tmp_path / "lines")]) == 0
     assert "last step" not in capsys.readouterr().err
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    monkeypatch.setenv("COLUMNS", "200")
+    show_all_on_a_terminal(monkeypatch)
     monkeypatch.setattr(command_runner, "_MAX_TABLE_ROWS", 2)
-    update = Bars.update
-    monkeypatch.setattr(Bars, "update", lambda self, task, **what: update(self, task, refresh=True, **what))
     assert main(["solve", str(pendulum), "--live", *settings, "--out", str(tmp_path / "bars")]) == 0
     said = sys.stderr.getvalue()
     assert "last step" in said
