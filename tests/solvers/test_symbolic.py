@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM, STEPS, pendulum_step, taken
 
-import yid_ocp
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import (
     problem_with_sensor_noise_only,
@@ -42,6 +41,7 @@ CASES = {
     "driven, proportional": ((), {"driven": ("shoulder",)}, TRACKED),
     "driven, filtered": ((), {"driven": ("shoulder",)}, {"arm_tracking_feedback": "lqr"}),
     "driven and prescribed": ((), {"driven": ("elbow",), "prescribed": ("shoulder",)}, TRACKED),
+    "remembering": ((("joint_presliding", "elbow", {"tau_c": 0.3, "yield_angle": 0.02}),), {}, {}),
 }
 
 
@@ -118,7 +118,8 @@ def test_its_reduced_gradient_is_the_problems(problem):
         if problem.local_parameters:
             own.append(program.variables[f"local[{episode.name}]"].index.ravel())
         if rows:
-            first = np.concatenate([program.variables[f"{part}[{episode.name}]"].index[:, 0] for part in "qp"])
+            parts = [f"{part}[{episode.name}]" for part in ("qpz" if problem.step.sizes["nz"] else "qp")]
+            first = np.concatenate([program.variables[part].index[:, 0] for part in parts])
             own.append(first[rows])
     own = np.concatenate(own)
     others = np.setdiff1d(np.flatnonzero(program.lower < program.upper), own)
@@ -152,23 +153,6 @@ def test_the_program_and_condensing_have_one_solution(urdf_folder):
         assert one.history[-1].cost == pytest.approx(found[0].history[-1].cost, rel=1e-9)
         assert one.history[0].note == "start"
     assert len(found[2].history) <= len(found[1].history)
-
-
-@pytest.mark.slow
-def test_internal_coordinates_are_among_the_states(paper_systems, recording, one_arm):
-    system = paper_systems["single"]
-    effect = yid_ocp.effects.make_effect("standard_linear_solid", "T3", system, {"ratio": 0.5})
-    step = yid_ocp.compile_step(system.with_effects([effect]), 0.01, use_compiler=False)
-    problem = EstimationProblem(
-        step, [recording], ("T1.bend", effect.parameters.names[0]), ProblemOptions(duration=0.05)
-    )
-    program = transcribe(problem)
-    assert program.named_block("z").index.shape == (step.sizes["nz"], 6)
-    x = problem.initial_unknowns * 4
-    w, evaluation = rolled_out(problem, program, x)
-    cost, defects = values_at(program, w, program.f, program.g)
-    assert cost.item() == pytest.approx(evaluation.cost, rel=1e-8)
-    assert np.abs(defects).max() < 1e-6
 
 
 @pytest.mark.parametrize("case", ["local", "estimated", "known start", "driven, filtered", "all prescribed"])
