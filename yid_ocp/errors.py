@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 import sys
 from collections.abc import Iterable, Sequence
+from importlib import import_module
+from types import ModuleType
 from typing import TypeVar
 
 
@@ -76,6 +78,14 @@ def missing_package_error(kind: type[_Error], what: str, extra: str) -> _Error:
     """Make the error for a missing package of the optional dependencies `extra`."""
     where, hint = f"the Python environment {sys.prefix}", f"pip install 'yid-ocp[{extra}]'"
     return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
+
+
+def import_optional(module: str, extra: str, what: str, kind: type[YidError] = DataError) -> ModuleType:
+    """Import a module of the optional dependencies `extra`. Raises an error of `kind` (`what`) if it is missing."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise missing_package_error(kind, what, extra) from error
 
 
 class OutputError(YidError):

@@ -129,12 +129,6 @@ def test_a_torque_that_does_not_fit_the_posture_is_said(arm):
     assert "elbow would have to move by" in rest.message
 
 
-def test_a_single_joint_rests_where_it_is_held(urdf_folder):
-    system = System.build(read_urdf(urdf_folder / "servo_pendulum.urdf"), prescribed=["joint"])
-    statics = EquilibriumSolver(compile_step(system, 0.01, use_compiler=False))
-    assert statics.solve([0.4], system.parameters.vector()).is_converged
-
-
 def test_a_grasp_out_of_reach_is_said():
     statics, posture = hung_cable(1.5)
     rest = statics.solve(posture, statics.step.system.parameters.vector())

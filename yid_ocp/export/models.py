@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, get_args
 from xml.etree.ElementTree import Element, SubElement
 
@@ -76,9 +76,8 @@ def _xml_text(root: Element) -> str:
 
 def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, JointDynamicsTerms]]:
     """The tree with numbers and without separate weights of bodies, and the dynamics of its joints."""
-    tree = system.numeric_mechanism(values)
-    joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
-    return replace(tree, joints=joints), system_joint_dynamics_terms(system, ExpressionEvaluator(system, values))
+    tree = system.numeric_mechanism(values).with_gravity_fraction(None)
+    return tree, system_joint_dynamics_terms(system, ExpressionEvaluator(system, values))
 
 
 def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:

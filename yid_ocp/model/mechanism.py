@@ -229,6 +229,12 @@ class Mechanism(ReprMixin):
         added = replace(carrier, placement=carrier.placement @ Placement.from_matrix(placement))
         return replace(self, frames={**self.frames, name: added})
 
+    def with_gravity_fraction(self, fraction: ca.SX | None) -> Mechanism:
+        """Return a copy with this factor on the weight of every body; None means 1."""
+        bodies = [tuple(replace(b, gravity_fraction=fraction) for b in joint.bodies) for joint in self.joints]
+        joints = tuple(replace(joint, bodies=own) for joint, own in zip(self.joints, bodies, strict=True))
+        return replace(self, joints=joints)
+
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """Return a copy with numbers, from `values` or nominal, in place of all parameters."""
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ModelError, missing_package_error
+from yid_ocp.errors import ModelError, import_optional
 from yid_ocp.files import check_input_file
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_axis_sin_cos
 
@@ -91,10 +91,7 @@ def _compiled_file(file: Path) -> Any:
 @functools.lru_cache(maxsize=4)
 def _compiled(file: Path, changed: int) -> Any:
     """Compiled model of a file version; omitted elements are logged once."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise missing_package_error(ModelError, f"reading {file} needs the package mujoco", "blind") from error
+    mujoco = import_optional("mujoco", "blind", f"reading {file} needs the package mujoco", ModelError)
     try:
         model = mujoco.MjModel.from_xml_path(str(check_input_file(file)))
     except Exception as error:  # MuJoCo raises ValueError, and others for files that are missing

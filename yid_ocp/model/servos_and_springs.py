@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import casadi as ca
@@ -279,12 +279,3 @@ def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_
         unit, upper, text = known[term]
         made[term] = Parameter(f"{joint.name}.servo_{term}", 0.0, unit, 0.0, upper, text)
     return made
-
-
-def mechanism_without_gravity(tree: Mechanism) -> Mechanism:
-    """Return the robot without weight, as if its controller compensated gravity."""
-    joints = tuple(
-        replace(joint, bodies=tuple(replace(body, gravity_fraction=ca.SX(0)) for body in joint.bodies))
-        for joint in tree.joints
-    )
-    return replace(tree, joints=joints)

@@ -23,7 +23,6 @@ from yid_ocp.model.servos_and_springs import (
     RobotJointSpring,
     ServoModelOptions,
     build_joint_servos_and_parameters,
-    mechanism_without_gravity,
     stiffness_and_rest_parameters,
 )
 
@@ -312,7 +311,8 @@ class System(ReprMixin):
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         moved, own = ({}, []) if servos is None else build_joint_servos_and_parameters(tree, driven, servos)
-        tree = mechanism_without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
+        if servos is not None and servos.has_gravity_compensation:
+            tree = tree.with_gravity_fraction(ca.SX(0))
         segments: list[SegmentLayout] = []
         for item, frame, placement in options.get("objects", ()):
             tree = tree.with_attached_mechanism(item.mechanism, frame, placement)

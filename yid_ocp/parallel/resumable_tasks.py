@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.errors import ConfigError, DataError, OutputError, ParallelWorkError, YidError, missing_package_error
+from yid_ocp.errors import ConfigError, DataError, OutputError, ParallelWorkError, YidError, import_optional
 from yid_ocp.files import file_sha256, json_sha256, make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel.threads_and_processes import InlineExecutor, available_processor_count, process_pool
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences
@@ -332,11 +332,8 @@ def _dask_executor(
     scheduler: str, function: _TaskFunction | None = None, folder: Path | None = None
 ) -> Iterator[tuple[Executor, Callable[[], None]]]:
     """Executor on a Dask scheduler's workers, and a function that warns if there are no workers."""
-    try:
-        distributed = importlib.import_module("distributed")
-    except ImportError as error:
-        what = "the option --scheduler needs the package dask"
-        raise missing_package_error(ParallelWorkError, what, "cluster") from error
+    what = "the option --scheduler needs the package dask"
+    distributed = import_optional("distributed", "cluster", what, ParallelWorkError)
     path = Path(scheduler).expanduser()
     where = {"scheduler_file": str(path)} if path.is_file() else {"address": scheduler}
     refusal: ParallelWorkError | None = None
@@ -406,7 +403,6 @@ def _question(module: str, probe: str) -> Callable[[], Any]:
     """A function that returns a worker's fingerprint, or a text if the worker is unsuitable."""
 
     def asked() -> Any:
-        import importlib
         import os
 
         try:

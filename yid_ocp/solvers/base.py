@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import math
 import time
@@ -17,7 +16,7 @@ import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ConfigError, YidError, missing_package_error
+from yid_ocp.errors import ConfigError, YidError, import_optional
 from yid_ocp.inference.linearized_residual import (
     is_stationary_point,
     projected_gradient_norm,
@@ -171,10 +170,7 @@ class Solution(ReprMixin):
         `lower` and `upper` are the 95 % interval, infinite at an open end. Raises `ConfigError` if pandas is not
         installed.
         """
-        try:
-            pandas = importlib.import_module("pandas")
-        except ImportError as error:
-            raise missing_package_error(ConfigError, "a data frame needs the package pandas", "pandas") from error
+        pandas = import_optional("pandas", "pandas", "a data frame needs the package pandas", ConfigError)
         columns, rows = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"], {}
         for name, e in sorted(self.parameters.items(), key=lambda entry: not entry[1].free):
             rows[name] = (e.value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)

@@ -10,7 +10,7 @@ import functools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,7 +22,7 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, ModelError, missing_package_error
+from yid_ocp.errors import ConfigError, ModelError, import_optional
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
@@ -351,8 +351,7 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
             hint = "leave out one of the effects that change weights"
             raise ModelError(what, where=where, allowed="one ratio for all bodies of a joint", hint=hint)
         weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
-    joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
-    return replace(tree, joints=joints), weights
+    return tree.with_gravity_fraction(None), weights
 
 
 def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]:
@@ -423,11 +422,7 @@ def _add_actuators(system: System, value: ExpressionEvaluator, actuator: Element
 
 def import_mujoco() -> ModuleType:
     """Import the mujoco package. Raises `DataError` if it is not installed."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise missing_package_error(DataError, "virtual experiments need MuJoCo", "blind") from error
-    return mujoco
+    return import_optional("mujoco", "blind", "virtual experiments need MuJoCo")
 
 
 def mujoco_model_from_mjcf_text(text: str) -> Any:

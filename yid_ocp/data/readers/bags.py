@@ -24,7 +24,7 @@ from yid_ocp.data.foreign_formats import (
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
+from yid_ocp.errors import DataError, import_optional, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
@@ -66,7 +66,7 @@ class OpenBag:
 
     def __init__(self, path: Path) -> None:
         highlevel, typesys = (
-            base.import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags")
+            import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags")
             for name in ("highlevel", "typesys")
         )
         self.path = path

@@ -6,7 +6,6 @@ import fnmatch
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from itertools import chain
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
-from yid_ocp.errors import DataError, missing_package_error, unknown_name_error_arguments
+from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.registry import Registry
 
 _RecordingReader = Callable[..., Recording]
@@ -223,14 +222,6 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
         ratio = [value for pattern, value in gear_ratios.items() if fnmatch.fnmatchcase(name, pattern)]
         factors[j] = own[-1] * (ratio[-1] if ratio else 1.0)
     return factors
-
-
-def import_optional(module: str, extra: str, what: str) -> Any:
-    """Import a module of the package's optional dependencies `extra`. Raises `DataError` (`what`) if it is missing."""
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise missing_package_error(DataError, what, extra) from error
 
 
 def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:

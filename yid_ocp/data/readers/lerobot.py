@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field, ValidationError
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.errors import DataError
+from yid_ocp.errors import DataError, import_optional
 from yid_ocp.files import check_input_file, check_max_input_numbers, file_sha256, read_input_json
 
 _STATE, _ACTION = "observation.state", "action"
@@ -163,7 +163,7 @@ def _dataset(folder: Path) -> _Dataset:
 def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path]:
     """Columns of one episode, shape (frames, numbers of a frame), and its file."""
     names = "pyarrow", "pyarrow.parquet"
-    arrow, parquet = (base.import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow") for name in names)
+    arrow, parquet = (import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow") for name in names)
     where = f"{dataset.folder}, episode {episode}"
     last = dataset.info.total_episodes - 1
     allowed = f"0 to {last}" if last >= 0 else "an episode that was recorded"
