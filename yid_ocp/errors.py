@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
 from types import ModuleType
 from typing import TypeVar
@@ -128,6 +128,15 @@ def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str
     names = [str(entry) for entry in known]
     otherwise = otherwise or ("use one of the allowed names" if names else "leave it out")
     return {"allowed": _listed(name, names) or "none", "hint": nearest_name_question(name, names) or otherwise}
+
+
+def require_known_names(
+    names: Iterable[str], known: Collection[str], noun: str, where: str, kind: type[YidError]
+) -> None:
+    """Raise an error of `kind`, "there is no NOUN 'NAME'" with the nearest known name, if a name is not known."""
+    for name in names:
+        if name not in known:
+            raise kind(f"there is no {noun} '{name}'", where=where, **unknown_name_error_arguments(name, known))
 
 
 def _close(name: str, names: Sequence[str], count: int) -> list[str]:

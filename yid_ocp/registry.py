@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Generic, TypeVar
 
-from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, require_known_names
 
 _Entry = TypeVar("_Entry")
 
@@ -36,9 +36,7 @@ class Registry(Generic[_Entry]):
             self._entries.pop(name, None)
 
     def __getitem__(self, name: str) -> _Entry:
-        if name not in self._entries:
-            where, said = f"the name of the {self.entry_noun}", unknown_name_error_arguments(name, self)
-            raise ConfigError(f"there is no {self.entry_noun} '{name}'", where=where, **said)
+        require_known_names([name], self, self.entry_noun, f"the name of the {self.entry_noun}", ConfigError)
         return self._entries[name]
 
     def __contains__(self, name: object) -> bool:

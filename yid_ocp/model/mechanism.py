@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ModelError, require_known_names, unknown_name_error_arguments
 from yid_ocp.model.parameters import Parameters
 
 
@@ -154,9 +154,7 @@ class Mechanism(ReprMixin):
     def joint_index(self, name: str) -> int:
         """Return the index of a joint. Raises `ModelError`, with the nearest name, if there is no such joint."""
         names = self.joint_names
-        if name not in names:
-            said = unknown_name_error_arguments(name, names)
-            raise ModelError(f"there is no joint '{name}'", where=f"model '{self.name}'", **said)
+        require_known_names([name], names, "joint", f"model '{self.name}'", ModelError)
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:

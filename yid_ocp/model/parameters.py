@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, require_known_names
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,7 @@ class Parameters(ReprMixin):
 
     def index(self, name: str) -> int:
         """Index of a parameter in `theta`. Raises `ConfigError`, which suggests the nearest name, if there is none."""
-        if name not in self._index:
-            said = unknown_name_error_arguments(name, self._index)
-            raise ConfigError(f"there is no parameter '{name}'", where="parameters of the model", **said)
+        require_known_names([name], self._index, "parameter", "parameters of the model", ConfigError)
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:

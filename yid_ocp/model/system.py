@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
-from yid_ocp.errors import ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ModelError, require_known_names
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
@@ -385,9 +385,7 @@ class System(ReprMixin):
     def segment_layout(self, name: str) -> SegmentLayout:
         """Return the layout of a segment. Raises `ModelError`, with the nearest name, if there is no such segment."""
         found = {layout.name: layout for layout in self.segment_layouts}
-        if name not in found:
-            where, said = "segments of the model", unknown_name_error_arguments(name, found)
-            raise ModelError(f"there is no segment '{name}'", where=where, **said)
+        require_known_names([name], found, "segment", "segments of the model", ModelError)
         return found[name]
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> System:

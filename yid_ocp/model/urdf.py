@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ModelError, require_known_names, unknown_name_error_arguments
 from yid_ocp.files import MAX_TEXT_BYTES, check_input_file, is_file
 from yid_ocp.model.mechanism import (
     Frame,
@@ -347,10 +347,7 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
             allowed, hint = "an axis other than 0 0 0", "write the axis, or set the type of the joint to fixed"
             raise ModelError(f"joint '{joint.name}' has a zero axis", where=where, allowed=allowed, hint=hint)
     known = [joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES]
-    for name in wanted:
-        if name not in known:
-            said = unknown_name_error_arguments(name, known)
-            raise ModelError(f"there is no movable joint '{name}'", where=where, **said)
+    require_known_names(wanted, known, "movable joint", where, ModelError)
     names, below = [link.name for link in robot.links], [joint.child for joint in robot.joints]
     for joint in robot.joints:
         for link in (joint.parent, joint.child):

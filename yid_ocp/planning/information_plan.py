@@ -14,7 +14,7 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EffectBase, make_effect
-from yid_ocp.errors import ConfigError, SolverError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, SolverError, require_known_names
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_RELATIVE_STD_TAKEN_AS_INFINITE
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.options import check_option_bounds
@@ -132,9 +132,7 @@ def _chosen(
         what, hint = f"{where} is empty", "list the parameters, or set parameters.NAME.free: true"
         raise ConfigError(what, where=where, allowed=", ".join(problem.free) or "free parameters", hint=hint)
     for name in wanted:
-        if name not in problem.system.parameters:
-            said = unknown_name_error_arguments(name, problem.system.parameters.names)
-            raise ConfigError(f"there is no parameter '{name}'", where=where, **said)
+        require_known_names([name], problem.system.parameters.names, "parameter", where, ConfigError)
         if name not in problem.free:
             hint, allowed = f"set parameters.{name}.free: true", ", ".join(problem.free)
             raise ConfigError(f"'{name}' is not a free parameter", where=where, allowed=allowed, hint=hint)

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.errors import ConfigError, DataError, ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, ModelError, require_known_names
 from yid_ocp.files import check_input_file, file_sha256, is_file, json_sha256, read_input_text
 from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.model.kinematics import forward_kinematics
@@ -355,9 +355,7 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
         assert mesh is not None
         joint, placement = -1, np.eye(4)
         if entry.parent_frame is not None:
-            if entry.parent_frame not in mechanism.frames:
-                said = unknown_name_error_arguments(entry.parent_frame, mechanism.frames)
-                raise ConfigError(f"there is no link '{entry.parent_frame}'", where=where, **said)
+            require_known_names([entry.parent_frame], mechanism.frames, "link", where, ConfigError)
             joint, placement = _carrier(mechanism, entry.parent_frame)
         pose = placement @ homogeneous_transform(rotation_from_rpy(*entry.rpy), entry.xyz)
         made.setdefault(joint, []).append(mesh.transformed(pose))

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import ConfigError, DataError, ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, ModelError, require_known_names
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import recorded_joint_column_indices
 from yid_ocp.vision import frame_selection, point_cloud, sequence_calibration, surface_meshes
@@ -448,10 +448,7 @@ class FrameTracker:
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
     held = {grasp.held_frame for grasp in system.grasps}
-    for name in wanted or ():
-        if name not in system.point_frames:
-            said = unknown_name_error_arguments(name, system.point_frames)
-            raise ConfigError(f"there is no point '{name}'", where="track.options.points", **said)
+    require_known_names(wanted or (), system.point_frames, "point", "track.options.points", ConfigError)
     free = tuple(name for name in system.point_frames if name not in held) or system.point_frames
     return free if wanted is None else wanted
 

@@ -17,7 +17,7 @@ from yid_ocp.config.schema import config_json_schema, option_info_from_annotatio
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.display import Progress
-from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, OutputError, require_known_names
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import ObjectWithInitialValues, init_object_templates, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
@@ -83,9 +83,7 @@ def _object_from_arguments(arguments: argparse.Namespace) -> ObjectWithInitialVa
                 what, hint = f"--{name} needs --object", f"add --object KIND, or leave --{name} out"
                 raise ConfigError(what, where=f"--{name}", allowed=f"with --object {', '.join(templates)}", hint=hint)
         return None
-    if word not in templates:
-        said = unknown_name_error_arguments(word, templates)
-        raise ConfigError(f"there is no object '{word}'", where="--object", **said)
+    require_known_names([word], templates, "object", "--object", ConfigError)
     template = templates[word]
     links = template.default_links if arguments.links is None else arguments.links
     if not 1 <= links <= 64:

@@ -14,7 +14,7 @@ import numpy as np
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
 from yid_ocp.registry import Registry
 
 _RecordingReader = Callable[..., Recording]
@@ -148,7 +148,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
         names = {name: name for name in group.names}
         if options.joints is not None:
             names = parse_renamings(options.joints, "joint", where)
-            _check_known(names, group.names, "joint", where)
+            require_known_names(names, group.names, "joint", where, DataError)
         at = [group.names.index(name) for name in names]
         recorded = group.values_by_channel.items()
         channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in recorded}
@@ -166,7 +166,8 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
 
 
 def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:
-    _check_known(chosen, [name for group in groups for name in group.names], "point", where)
+    known = [name for group in groups for name in group.names]
+    require_known_names(chosen, known, "point", where, DataError)
     check_unique_point_names(chosen, where)
     kept = []
     for group in groups:
@@ -177,12 +178,6 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
             names = tuple(chosen[name] for name in own)
             kept.append(replace(group, names=names, position=group.position[:, at], std=std))
     return tuple(kept)
-
-
-def _check_known(chosen: Iterable[str], known: Sequence[str], noun: str, where: str) -> None:
-    for name in chosen:
-        if name not in known:
-            raise DataError(f"there is no {noun} '{name}'", where=where, **unknown_name_error_arguments(name, known))
 
 
 def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Len
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, ModelError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, ModelError, require_known_names
 from yid_ocp.files import read_input_text
 from yid_ocp.model.flexible import (
     AXIS_UNIT_VECTORS,
@@ -307,10 +307,8 @@ model:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
         found = CableTopology(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
         for name in self.branch_density_and_damping:
-            if name not in found.vertex_names_by_branch:
-                said = unknown_name_error_arguments(name, found.vertex_names_by_branch)
-                where = f"model.object.branch_density_and_damping.{name}"
-                raise ModelError(f"there is no branch '{name}'", where=where, **said)
+            where = f"model.object.branch_density_and_damping.{name}"
+            require_known_names([name], found.vertex_names_by_branch, "branch", where, ModelError)
         return found
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
