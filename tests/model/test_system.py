@@ -148,13 +148,12 @@ def test_errors_of_build(robot, name):
 
 
 def test_a_clamp_has_six_massless_coordinates():
-    clamp = six_joint_floating_mechanism("hand", frame="palm")
+    clamp = six_joint_floating_mechanism("hand")
     assert clamp.joint_names == tuple(f"hand_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))
     assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
     assert [j.parent_index for j in clamp.joints] == [-1, 0, 1, 2, 3, 4]
     assert all(merge_bodies(j.bodies) is None for j in clamp.joints)
-    assert clamp.frame("palm").joint_index == 5
-    assert six_joint_floating_mechanism("hand").frame("hand").joint_index == 5
+    assert clamp.frame("hand").joint_index == 5
 
 
 @pytest.fixture

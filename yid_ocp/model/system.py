@@ -485,12 +485,12 @@ def _check_names(
         tree.frame(frame)
 
 
-def six_joint_floating_mechanism(name: str, frame: str | None = None) -> Mechanism:
-    """Build a massless mechanism of six joints `NAME_x` to `NAME_rz` that move a frame `frame` (default `NAME`)."""
+def six_joint_floating_mechanism(name: str) -> Mechanism:
+    """Build a massless mechanism of six joints `NAME_x` to `NAME_rz` that move a frame `NAME`."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)
         for block, (prefix, kind) in enumerate(kinds)
         for a, (letter, axis) in enumerate(AXIS_UNIT_VECTORS.items())
     )
-    return Mechanism(name, joints, {frame or name: Frame(5, Placement.identity())})
+    return Mechanism(name, joints, {name: Frame(5, Placement.identity())})
