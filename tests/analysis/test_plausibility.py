@@ -288,18 +288,12 @@ def test_limits_of_joints(arms, runs):
         assert (doubt.limit_violation_ratio, doubt.recording) == (pytest.approx(ratio, rel=1e-3), run.name)
         assert f"left_e1 goes {past} rad beyond its limits of -0.05 to 2.62" in doubt.what
     (doubt,) = joint_limit_issues(arm, with_joints(run, position=lambda j: np.degrees(j.position)))
-    assert (doubt.cause, doubt.weight, doubt.limit_violation_ratio) == (
-        "degrees",
-        "refused",
-        pytest.approx(754.1, rel=1e-3),
-    )
+    assert (doubt.cause, doubt.weight) == ("degrees", "refused")
+    assert doubt.limit_violation_ratio == pytest.approx(754.1, rel=1e-3)
     assert "angles reach 78 rad" in doubt.what
     (doubt,) = joint_limit_issues(arm, with_joints(run, t=lambda j: j.t / 30))
-    assert (doubt.cause, doubt.channel, doubt.limit_violation_ratio) == (
-        "speed_limits",
-        "t",
-        pytest.approx(6.959, rel=1e-3),
-    )
+    assert (doubt.cause, doubt.channel) == ("speed_limits", "t")
+    assert doubt.limit_violation_ratio == pytest.approx(6.959, rel=1e-3)
     assert "left_e1 turns 10.4 times as fast as it can (1.5 rad/s)" in doubt.what
 
 
