@@ -1,10 +1,11 @@
 """Clean recordings of an arm that holds a rod, set up by `init` alone: is there a false alarm, is a tip mass named?
 
-    python benchmarks/clean_rod.py [ROBOT ...] [--tip-mass KG] [--encoder-noise RAD] [--brisk]
+    python benchmarks/clean_rod.py [ROBOT ...] [--tip-mass KG] [--encoder-noise RAD] [--brisk] [--finer N]
 
 Each ROBOT is a seed: it draws four links, a lightly damped rod of six links and two motions of 4 s. MuJoCo simulates
 them by RK4 at 0.2 ms. Encoders are recorded at 200 Hz, three markers on the rod at 100 Hz with noise of 0.3 mm. The
-CSV files go through `import`, `init` and `diagnose` without an edit.
+CSV files go through `import`, `init` and `diagnose` without an edit. With `--finer N`, the rod that MuJoCo simulates
+has N times as many links as the model.
 """
 
 from __future__ import annotations
@@ -71,8 +72,9 @@ def urdf(arm: Arm) -> str:
     return text + f'<link name="flange"/><joint name="end" type="fixed">{fixed}</joint></robot>'
 
 
-def mjcf(arm: Arm, tip_mass: float) -> str:
-    long, mass = arm.rod_length / LINKS, arm.rod_mass / LINKS
+def mjcf(arm: Arm, tip_mass: float, finer: int) -> str:
+    count = finer * LINKS
+    long, mass = arm.rod_length / count, arm.rod_mass / count
     stiffness, damping = arm.rigidity / long, arm.damping / long
     across, along = mass * (3 * RADIUS**2 + long**2) / 12, mass * RADIUS**2 / 2
     body = "".join(
@@ -80,7 +82,7 @@ def mjcf(arm: Arm, tip_mass: float) -> str:
         f'<inertial pos="0 0 {middle}" mass="{m}" diaginertia="{inertia} {inertia} {0.001 * m}"/>'
         for joint, axis, place, middle, m, inertia in links(arm)
     )
-    for i in range(LINKS):
+    for i in range(count):
         share, place = (2, FLANGE) if i == 0 else (1, long)  # half a link to the clamp
         spring = f'stiffness="{share * stiffness}" damping="{share * damping}"'
         body += f'<body pos="0 0 {place}"><joint axis="1 0 0" {spring}/><joint axis="0 1 0" {spring}/>'
@@ -90,14 +92,16 @@ def mjcf(arm: Arm, tip_mass: float) -> str:
         load = f'<inertial pos="0 0 0" mass="{tip_mass}" diaginertia="1e-7 1e-7 1e-7"/>'
         body += f'<body pos="0 0 {long}">{load}</body>'
     motors = "".join(f'<motor joint="{joint}"/>' for joint in JOINTS)
-    option = f'<option timestep="{STEP}"/>'
-    closed = "</body>" * (len(JOINTS) + LINKS)
+    option = f'<option timestep="{STEP / finer**2}"/>'
+    closed = "</body>" * (len(JOINTS) + count)
     return f"<mujoco>{option}<worldbody>{body}{closed}</worldbody><actuator>{motors}</actuator></mujoco>"
 
 
-def recorded(arm: Arm, seed: int, tip_mass: float, encoder_std: float, brisk: bool) -> tuple[np.ndarray, np.ndarray]:
+def recorded(
+    arm: Arm, seed: int, tip_mass: float, encoder_std: float, brisk: bool, finer: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows (time, joint angles) and (time, marker coordinates in mm) of a motion that begins and ends at rest."""
-    model = mujoco.MjModel.from_xml_string(mjcf(arm, tip_mass))
+    step, model = STEP / finer**2, mujoco.MjModel.from_xml_string(mjcf(arm, tip_mass, finer))
     data, rng, noise = mujoco.MjData(model), np.random.default_rng(seed), np.random.default_rng(9000 + seed)
     rates = rng.uniform(0.35, 1.2, (4, 3)) * (1.6 if brisk else 1.0)
     phases, size = rng.uniform(0, 2 * np.pi, (4, 3)), np.array([0.5, 0.35, 0.45, 0.5])
@@ -118,27 +122,27 @@ def recorded(arm: Arm, seed: int, tip_mass: float, encoder_std: float, brisk: bo
     for factor, rest, kind in ((30.0, 3.0, kinds.mjINT_IMPLICITFAST), (1 / 30.0, 1.5, kinds.mjINT_RK4)):
         model.dof_damping[4:] *= factor
         model.opt.integrator = kind
-        for _ in range(round(rest / STEP)):
+        for _ in range(round(rest / step)):
             advance(0.0)
     angles, points = [], []
-    for k in range(round(DURATION / STEP) + 1):
-        if k % round(0.01 / STEP) == 0:
+    for k in range(round(DURATION / step) + 1):
+        if k % round(0.01 / step) == 0:
             mujoco.mj_kinematics(model, data)
-            seen = np.concatenate([data.site(name).xpos for name in ("m1", "m3", f"m{LINKS - 1}")])
-            points.append([k * STEP, *(1e3 * (seen + POINT_STD * noise.standard_normal(9)))])
-        if k % round(0.005 / STEP) == 0:
-            angles.append([k * STEP, *(data.qpos[:4] + encoder_std * noise.standard_normal(4))])
-        advance(k * STEP)
+            seen = np.concatenate([data.site(name).xpos for name in (f"m{k * finer - 1}" for k in (2, 4, LINKS))])
+            points.append([k * step, *(1e3 * (seen + POINT_STD * noise.standard_normal(9)))])
+        if k % round(0.005 / step) == 0:
+            angles.append([k * step, *(data.qpos[:4] + encoder_std * noise.standard_normal(4))])
+        advance(k * step)
     return np.array(angles), np.array(points)
 
 
-def diagnosed(robot: int, tip_mass: float, encoder_std: float, brisk: bool, folder: Path) -> str:
+def diagnosed(robot: int, tip_mass: float, encoder_std: float, brisk: bool, finer: int, folder: Path) -> str:
     """Verdict on a robot's recordings, a row of the table."""
     arm, files = drawn(robot), []
     (folder / "arm.urdf").write_text(urdf(arm))
     columns = ",".join(f"{name}.{axis}" for name in ("rod_1", "rod_2", "rod_tip") for axis in "XYZ")
     for i in (0, 1):
-        angles, points = recorded(arm, 2 * robot + i, tip_mass, encoder_std, brisk)
+        angles, points = recorded(arm, 2 * robot + i, tip_mass, encoder_std, brisk, finer)
         tables = {
             "joints": (angles, "timestamp," + ",".join(f"pos_{n}" for n in JOINTS)),
             "mocap": (points, "time," + columns),
@@ -166,11 +170,12 @@ def main() -> None:
     parser.add_argument("--tip-mass", type=float, default=0.0, help="unknown to the model [kg]")
     parser.add_argument("--encoder-noise", type=float, default=1e-4, help="standard deviation [rad]")
     parser.add_argument("--brisk", action="store_true", help="1.6 times the frequencies")
+    parser.add_argument("--finer", type=int, default=1, help="links of the simulated rod per link of the model")
     chosen = parser.parse_args()
     print("| robot | verdict | named | chi2/n held out | CPU |\n|---|---|---|---|---|", flush=True)
     for robot in chosen.robots:
         with tempfile.TemporaryDirectory() as folder:
-            how = (chosen.tip_mass, chosen.encoder_noise, chosen.brisk)
+            how = (chosen.tip_mass, chosen.encoder_noise, chosen.brisk, chosen.finer)
             print(diagnosed(robot, *how, Path(folder)), flush=True)
 
 

@@ -147,6 +147,8 @@ def judged(changed):
 )
 def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
     assert judged(changed)[1] == reason
+    # seen along one candidate alone, it is no gap
+    assert judged(changed | {"gap": False}) == (("no_gap" if reason else judged(changed)[0]), "")
 
 
 def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_more():

@@ -158,19 +158,25 @@ def _verdict_and_reason(
 ) -> tuple[str, UnknownVerdictReason]:
     """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`.
 
-    Without an effect, a gap that is seen only along a candidate's signature is none: no model predicts better.
+    Without an accepted effect, a gap that is seen only along a candidate's signature is none: no model predicts better.
     """
-    is_empty, explained = not said.selected_effects, said.fitted_or_held_out_explained_fraction
-    rules: tuple[tuple[bool, str, UnknownVerdictReason], ...] = (
-        (not are_data_sufficient, "insufficient_data", ""),
-        (is_empty and not exceeds_noise, "no_gap", ""),
-        (is_empty, "unknown", "none"),
-        (explained < said.required_total_explained_fraction(limits), "unknown", "little"),
-        (bool(said.failed_transfer_checks), "unknown", "stand_in"),
-        (any(len(entry.equivalent_effects) > 1 for entry in said.selected_effects[:1]), "confusable", ""),
-        (True, "effect", ""),
+    explained, rivals = said.fitted_or_held_out_explained_fraction, said.selected_effects[:1]
+    reasons: tuple[tuple[bool, UnknownVerdictReason], ...] = (
+        (not said.selected_effects, "none"),
+        (explained < said.required_total_explained_fraction(limits), "little"),
+        (bool(said.failed_transfer_checks), "stand_in"),
+        (True, ""),
     )
-    return next((verdict, reason) for holds, verdict, reason in rules if holds)
+    reason = next(reason for holds, reason in reasons if holds)
+    rules = (
+        (not are_data_sufficient, "insufficient_data"),
+        (reason and not exceeds_noise, "no_gap"),
+        (reason, "unknown"),
+        (any(len(entry.equivalent_effects) > 1 for entry in rivals), "confusable"),
+        (True, "effect"),
+    )
+    verdict = next(verdict for holds, verdict in rules if holds)
+    return verdict, reason if verdict == "unknown" else ""
 
 
 def judge(
