@@ -45,7 +45,7 @@ def test_all_candidates_together_are_the_nominal_model_until_they_are_freed(benc
 
 def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
     composed, nominal, _ = screened
-    chosen = [effect for effect in composed.candidate_effects if effect.kind in ("joint_stribeck", "link_mass")]
+    chosen = [effect for effect in composed.candidate_effects if effect.kind in ("rotor_inertia", "link_mass")]
     some = composed.with_nominal_and_effects_free(chosen)
     alone = EstimationProblem(composed.problem.step, [e.recording for e in some.episodes], some.free, some.options)
     x = some.unknown_vector(nominal.values) + 0.01

@@ -298,7 +298,10 @@ def _refined_problem(problem: EstimationProblem, what: RefinementKind) -> _Finer
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)
     held_out = [episode.recording for episode in problem.held_out]
-    made = EstimationProblem(step, recordings, problem.free, options, None, held_out)
+    # also the centre of priors
+    known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
+    values = {name: known[name] * factors.get(name, 1.0) for name in step.system.parameters.names if name in known}
+    made = EstimationProblem(step, recordings, problem.free, options, values, held_out)
     return _FinerDiscretisationProblem(made, factors, _fine_joints_by_coarse_joint(problem.system, step.system))
 
 
