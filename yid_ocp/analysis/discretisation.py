@@ -11,6 +11,7 @@ import numpy as np
 import scipy.optimize
 
 from yid_ocp.arrays import Array
+from yid_ocp.data.recording import Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
@@ -23,7 +24,7 @@ from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import TorqueAndAngleErrorModel, truncate_episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.options import RefinementKind
 from yid_ocp.solvers import GaussNewton
@@ -34,7 +35,7 @@ _NORMAL_QUANTILE_95 = 1.96
 # to their size: m + m/2 + m/4 + ...
 _EXTRAPOLATION_FACTOR = 2.0
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
-_MAX_FINER_FIT_ITERATIONS = 15
+_MAX_FINER_FIT_ITERATIONS, _MAX_LINEAR_CHANGE = 3, 10.0  # of r'r, below which a linear step decides
 _MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 
@@ -153,39 +154,57 @@ def predicted_refit_residual_at_finer_step(
     return fitted.residual if fitted.ok and fitted.cost < before.cost else made[1]
 
 
-def problem_without_error_of_links(problem: EstimationProblem, x: Array, at_x: Evaluation) -> EstimationProblem | None:
-    """Subtract from all data, held-out ones included, what a fit with twice the links adds to the fit `x` (nx,).
+def problem_without_error_of_links(
+    problem: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
+) -> EstimationProblem | None:
+    """Subtract from all data, held-out ones included, what twice the links change in the predictions of a fit.
 
-    `at_x` is the evaluation at `x`. Residuals at `x` are then those of the finer fit. Returns None if the object cannot
-    be divided, if torques have noise, which moves the arms of both models apart, or if the finer fit fails.
+    `at_x` is the evaluation at the fit `x` (nx,), with Jacobian. If the change is much larger than the residual, a
+    linear step does not tell what a refit would leave, and the finer model is refitted first. Returns None if a refit
+    on the new data is not predicted to lower r'r by `min_chi2_decrease`, if the object cannot be divided, if torques
+    have noise, which moves the arms of both models apart, or if the finer model does not follow.
     """
     divided, segments = problem.options.divided_links_model, problem.system.segment_layouts
     if divided is None or not segments or problem.has_process_noise:
         return None
+    guesses, before = at_x.equilibrium_guesses, at_x.residual
     try:
         refined = _refined_problem(problem, "links")
-        point, guesses = refined._unknowns(problem.unknown_names, x), at_x.equilibrium_guesses
+        point, finer = refined._unknowns(problem.unknown_names, x), refined.problem
         warm = tuple(None if q is None else refined._guess(problem.system, q) for q in guesses)
-        point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(refined.problem, point, None).x
-        fine = refined.problem.evaluate(point, False, warm)
+        for is_refitted in (False, True):
+            if is_refitted:
+                point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(finer, point, None).x
+            fine = finer.evaluate(point, False, warm)
+            if not fine.ok:
+                return None
+            episodes = list(
+                map(_with_data_shifted, problem.episodes, at_x.episode_predictions, fine.episode_predictions)
+            )
+            after = problem.with_episodes(episodes, ()).evaluate(x, False, guesses).residual
+            if len(after) != len(before):
+                return None  # events have removed samples
+            if np.sum((after - before) ** 2) <= _MAX_LINEAR_CHANGE * (before @ before):
+                break
+        assert at_x.jacobian is not None
+        left = after - at_x.jacobian @ np.linalg.lstsq(at_x.jacobian, after, rcond=1e-10)[0]
+        if not before @ before - left @ left > min_chi2_decrease:
+            return None
+        finer = _refined_problem(problem, "links", [episode.recording for episode in problem.held_out]).problem
+        held_out = (own.predict_held_out(at) for own, at in ((problem, x), (finer, point)))
+        others = [_with_data_shifted(e, one, other) for (e, one), (_, other) in zip(*held_out, strict=True)]
     except YidError:
         return None
-    if not fine.ok:
-        return None
-    held_out = (own.predict_held_out(at) for own, at in ((problem, x), (refined.problem, point)))
-    coarse, finer = (
-        [*own.episode_predictions, *(found for _, found in others)]
-        for own, others in zip((at_x, fine), held_out, strict=True)
-    )
-    episodes, count = [], len(problem.episodes)
-    for episode, before, after in zip((*problem.episodes, *problem.held_out), coarse, finer, strict=True):
-        measurements = list(episode.measurements)
-        if not isinstance(before, str) and not isinstance(after, str):
-            for k, pair in enumerate(zip(before.predicted_outputs, after.predicted_outputs, strict=True)):
-                if pair[0].shape == pair[1].shape:
-                    measurements[k] = replace(measurements[k], value=measurements[k].value - (pair[1] - pair[0]))
-        episodes.append(replace(episode, measurements=tuple(measurements)))
-    return problem.with_episodes(episodes[:count], episodes[count:])
+    return problem.with_episodes(episodes, others)
+
+
+def _with_data_shifted(episode: Episode, before: EpisodePrediction | str, after: EpisodePrediction | str) -> Episode:
+    """The episode minus the change of its predictions, where both exist and have the same samples."""
+    if isinstance(before, str) or isinstance(after, str):
+        return episode
+    triples = zip(episode.measurements, before.predicted_outputs, after.predicted_outputs, strict=True)
+    alike = ((own, new - old if new.shape == old.shape else 0.0) for own, old, new in triples)
+    return replace(episode, measurements=tuple(replace(own, value=own.value - change) for own, change in alike))
 
 
 def longest_accurate_time_step(problem: EstimationProblem) -> float:
@@ -286,7 +305,9 @@ def estimate_shifts_by_discretisation(
     return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _refined_problem(problem: EstimationProblem, what: RefinementKind) -> _FinerDiscretisationProblem:
+def _refined_problem(
+    problem: EstimationProblem, what: RefinementKind, held_out: Sequence[Recording] = ()
+) -> _FinerDiscretisationProblem:
     options, fine = problem.options, problem.options.divided_links_model
     if what == "time_step" or fine is None:
         return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
@@ -297,7 +318,6 @@ def _refined_problem(problem: EstimationProblem, what: RefinementKind) -> _Finer
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)
-    held_out = [episode.recording for episode in problem.held_out]
     # also the centre of priors
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
     values = {name: known[name] * factors.get(name, 1.0) for name in step.system.parameters.names if name in known}
