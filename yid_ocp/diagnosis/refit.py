@@ -314,7 +314,8 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
         x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
         nonlocal moving
-        return problem_relinearized_at_torque_bias(moving, x, x).evaluate(x, derivatives, equilibrium_guesses)
+        moving = problem_relinearized_at_torque_bias(moving, x, x)
+        return moving.evaluate(x, derivatives, equilibrium_guesses)
 
     # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
     again = _seen(problem, effects, REFIT_SOLVER.minimize_cost(moving, outcome.x, None, evaluate))

@@ -158,7 +158,7 @@ def _verdict_and_reason(
 ) -> tuple[str, UnknownVerdictReason]:
     """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`.
 
-    Without an accepted effect, a gap that is seen only along a candidate's signature is none: no model predicts better.
+    A gap that is seen only along a candidate's signature counts only with an accepted effect.
     """
     explained, rivals = said.fitted_or_held_out_explained_fraction, said.selected_effects[:1]
     reasons: tuple[tuple[bool, UnknownVerdictReason], ...] = (

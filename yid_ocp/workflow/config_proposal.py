@@ -546,6 +546,9 @@ def _clock(group: JointGroup | PointGroup) -> str:
     if not len(steps):
         return "one sample"
     uneven = float(np.std(steps) / np.mean(steps))
-    said = f"{mean_sample_rate(group.t):.4g} Hz, a {group.clock} clock" + f", uneven by {uneven:.0%}" * (uneven >= 0.01)
-    std = getattr(group, "clock_offset_std", None)
-    return said if std is None else f"{said}, known to ± {std:g} s (clock_offset_std), which a fit corrects"
+    said = f"{mean_sample_rate(group.t):.4g} Hz, a {group.clock} clock"
+    if uneven >= 0.01:
+        said += f", uneven by {uneven:.0%}"
+    if isinstance(group, PointGroup) and group.clock_offset_std is not None:
+        said += f", known to ± {group.clock_offset_std:g} s (clock_offset_std), which a fit corrects"
+    return said
