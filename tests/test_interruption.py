@@ -66,10 +66,11 @@ def test_a_call_that_does_not_come_back_is_ended_by_force(tmp_path):
     assert (code, set(out.split()), there) == (143, {"READY"}, False)
 
 
-def test_a_deferred_block_ends_first(tmp_path):
-    whole = "    time.sleep(1)\n    print('WHOLE', flush=True)\ntime.sleep(20)"
-    deferring = f"with interruption.defer_interruption():\n    {READY}\n{whole}"
-    code, out, _ = ended(tmp_path, deferring, signal.SIGINT)
+@pytest.mark.parametrize("late", [0.0, 0.5])
+def test_a_deferred_block_ends_first_also_where_the_signal_is_repeated_late(tmp_path, late):
+    slow = f"kill = signal.pthread_kill\nsignal.pthread_kill = lambda *to: (time.sleep({late}), kill(*to))\n"
+    deferring = f"with interruption.defer_interruption():\n    {READY}\n    time.sleep(1)\n    print('WHOLE', flush=1)"
+    code, out, _ = ended(tmp_path, f"{slow}{deferring}\ntime.sleep(20)", signal.SIGINT)
     assert (code, out.split("\n")) == (130, ["WHOLE", "ENDED SIGINT"])
 
 

@@ -98,14 +98,16 @@ def raise_on_termination_signals() -> Iterator[None]:
     try:
         yield
     finally:
+        _STATE.deferring += 1  # a signal that the watcher has just sent still finds this handler
         ended.set()
-        _STATE.asked = None
-        for number, handler in taken.items():
-            signal.signal(number, handler)
         signal.set_wakeup_fd(wakeup)
         tell.close()
         watcher.join()
         told.close()
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+        _STATE.asked = None
+        _STATE.deferring -= 1
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
