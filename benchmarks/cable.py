@@ -52,7 +52,7 @@ NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 t
 MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
 GRAVITY = 9.81  # [m/s^2]
 BRANCH = CableBranchRigidityAndDensity(
-    bend_rigidity=1.5e-3, twist_rigidity=1e-3, bend_damping=1e-3, separate_twist_damping=True
+    bend_rigidity=1.5e-3, twist_rigidity=1e-3, bend_damping=1e-3, has_separate_twist_damping=True
 )  # a guess
 OPTIONS = CableOptions(default_branch=BRANCH, shape_memory_fraction=0.5, has_rest_angle_parameters=True)
 
@@ -71,7 +71,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
     names: list[str] = []
     for name in cable.vertex_names_by_branch:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
-        if options.branch_density_and_damping.get(name, options.default_branch).separate_twist_damping:
+        if options.branch_density_and_damping.get(name, options.default_branch).has_separate_twist_damping:
             names.append(f"{name}.twist_damping")
         if options.shape_memory_fraction is not None:
             names.append(f"{name}.memory")

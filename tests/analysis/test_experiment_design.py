@@ -16,7 +16,7 @@ from yid_ocp.analysis import torque_error_propagation as propagation
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    MechanicalVariantSensitivityBuilder,
+    ExperimentVariantSensitivityBuilder,
     SinglePointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
@@ -189,7 +189,7 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     base = UnchangedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
-    assert MechanicalVariantSensitivityBuilder(base).applicable_mechanical_changes() == possible.split()
+    assert ExperimentVariantSensitivityBuilder(base).applicable_setup_changes() == possible.split()
 
 
 @pytest.fixture(scope="module")
@@ -214,18 +214,18 @@ def swung(urdf_folder):
     return build
 
 
-def built(problem, *mechanics, heard=None, **settings):
+def built(problem, *setup_changes, heard=None, **settings):
     """The builder of a problem's variants, and the variant with these changes."""
-    made = MechanicalVariantSensitivityBuilder(
+    made = ExperimentVariantSensitivityBuilder(
         UnchangedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
     )
-    found = made.build_sensitivities(frozenset(mechanics))
+    found = made.sensitivities_of_variant(frozenset(setup_changes))
     assert not isinstance(found, str), found
     return made, found
 
 
-def informed(problem, *mechanics):
-    made, found = built(problem, *mechanics)
+def informed(problem, *setup_changes):
+    made, found = built(problem, *setup_changes)
     views = [made.setting.existing_point_observation_schedules(episode) for episode in problem.episodes]
     return found, found.fisher_information_with_prior(views)
 
@@ -251,7 +251,7 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     problem = swung()
     x = np.array([np.nan, 0.1])
-    found = MechanicalVariantSensitivityBuilder(UnchangedExperiment(problem, x)).build_sensitivities(frozenset())
+    found = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, x)).sensitivities_of_variant(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
@@ -263,7 +263,7 @@ def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung
     stated = built(swung(effort_std=0.05), "torque")[1].fisher_information_with_prior([[]])
     np.testing.assert_allclose(stated, 4 * blind, rtol=1e-9)
     assert made.problem.system.prescribed == ("shoulder",)
-    assert builder.build_sensitivities(frozenset({"torque"})) is made
+    assert builder.sensitivities_of_variant(frozenset({"torque"})) is made
     assert heard.stages == ["working out joint torques as a measurement, the arms' motion as known"]
 
 
@@ -283,7 +283,7 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
 
 def test_welds_keep_the_orientation_at_the_start(held_tube):
     builder, made = built(held_tube, "weld")
-    (grasp,), free = made.problem.system.grasps, builder.build_sensitivities(frozenset())
+    (grasp,), free = made.problem.system.grasps, builder.sensitivities_of_variant(frozenset())
     assert grasp.kind == "weld"
     start = free.problem.initial_state_of_episode(
         free.problem.episodes[0], *free.problem.theta_and_initial_state_deviation(free.x, 0)
@@ -499,8 +499,8 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
 
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
-    builder = MechanicalVariantSensitivityBuilder(UnchangedExperiment(noisy, noisy.initial_unknowns))
-    made = builder.build_sensitivities(frozenset({"motion"}))
+    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(noisy, noisy.initial_unknowns))
+    made = builder.sensitivities_of_variant(frozenset({"motion"}))
     assert not isinstance(made, str), made
     own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors
     for name in ("torque_std", "torque_bias_std", "angle_std"):

@@ -11,12 +11,6 @@ import pytest
 import scipy.stats
 from small_problems import PENDULUM, joints, pendulum_step, recording
 
-from yid_ocp.analysis.estimate_history import (
-    RunEstimates,
-    assess_drift_and_outlier_runs,
-    nearby_positive_definite_covariance,
-    pool_estimates_and_chi2,
-)
 from yid_ocp.analysis.friction_law_comparison import (
     CrossValidatedFrictionLawFit,
     cross_validate_over_motion_kinds,
@@ -24,6 +18,12 @@ from yid_ocp.analysis.friction_law_comparison import (
     measured_and_predicted_friction_torques,
     recording_names_by_name_stem,
     simplest_fit_within_std_error,
+)
+from yid_ocp.analysis.run_estimates import (
+    RunEstimates,
+    assess_drift_and_outlier_runs,
+    nearby_positive_definite_covariance,
+    pool_estimates_and_chi2,
 )
 from yid_ocp.model.servos_and_springs import ServoModelOptions
 from yid_ocp.problem import EstimationProblem
@@ -41,7 +41,7 @@ def drawn(rng, mean, count):
 
 
 def drifted(found):
-    return [entry.name for entry in found.parameter_drifts if entry.has_drifted]
+    return [entry.name for entry in found.parameter_drift_tests if entry.has_drifted]
 
 
 def outliers(found):
@@ -108,7 +108,7 @@ def test_each_run_is_tested_against_all_others_at_its_share_of_the_level():
         expected = apart @ np.linalg.solve(COVARIANCE * (1 + birge / 2), apart)
         assert (entry.chi2, entry.degrees_of_freedom) == (pytest.approx(expected, rel=1e-6), 2)
         assert entry.p_value == pytest.approx(scipy.stats.chi2.sf(expected, 2), rel=1e-5)
-    for i, entry in enumerate(found.parameter_drifts):
+    for i, entry in enumerate(found.parameter_drift_tests):
         chi2 = np.sum((values[:, i] - values[:, i].mean()) ** 2) / COVARIANCE[i, i]
         assert (entry.chi2, entry.p_value) == pytest.approx((chi2, scipy.stats.chi2.sf(chi2, 2)), rel=1e-6)
         std = np.sqrt(COVARIANCE[i, i] / 3 * max(1, chi2 / 2))
@@ -116,7 +116,8 @@ def test_each_run_is_tested_against_all_others_at_its_share_of_the_level():
         shares = [assess_drift_and_outlier_runs(runs, level=share * entry.p_value) for share in (1.9, 2.1)]
         assert [drifted(share).count(entry.name) for share in shares] == [0, 1]
     strange = assess_drift_and_outlier_runs([*runs, run("z", [1.0], [[1.0]], ("c",))]).run_outlier_tests[-1]
-    assert (strange.chi2, strange.degrees_of_freedom, strange.p_value, strange.worst_parameter) == (0.0, 0, 1.0, "")
+    assert (strange.chi2, strange.degrees_of_freedom, strange.p_value) == (0.0, 0, 1.0)
+    assert strange.most_deviating_parameter == ""
 
 
 def test_the_run_that_stands_apart_is_the_one_to_distrust():
@@ -124,9 +125,8 @@ def test_the_run_that_stands_apart_is_the_one_to_distrust():
     runs = drawn(rng, [1.0, 2.0], 4)
     runs[2] = run("day2", runs[2].values + np.array([0.2, 0.0]))
     found = assess_drift_and_outlier_runs(runs)
-    assert outliers(found) == ["day2"]
-    assert drifted(found) == ["a"]
-    assert next(entry.worst_parameter for entry in found.run_outlier_tests if entry.run_name == "day2") == "a"
+    assert (outliers(found), drifted(found)) == (["day2"], ["a"])
+    assert next(entry.most_deviating_parameter for entry in found.run_outlier_tests if entry.run_name == "day2") == "a"
 
 
 def test_a_steady_drift_and_two_runs_that_differ_make_no_outlier():

@@ -11,8 +11,8 @@ from heard import Heard
 
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis.experiment_design import (
-    MECHANICAL_CHANGE_DESCRIPTIONS,
-    MechanicalVariantSensitivityBuilder,
+    SETUP_CHANGE_DESCRIPTIONS,
+    ExperimentVariantSensitivityBuilder,
     UnchangedExperiment,
 )
 from yid_ocp.analysis.identifiability import identifiability
@@ -105,7 +105,7 @@ def test_changes_that_apply(short_run, held_tube):
     for found in names.values():
         for name, change in found.items():
             kind, _, what = name.partition(":")
-            assert change.mechanical_change == (name if name in MECHANICAL_CHANGE_DESCRIPTIONS else "")
+            assert change.setup_change == (name if name in SETUP_CHANGE_DESCRIPTIONS else "")
             assert change.camera_frame == (what if kind == "camera" else "")
             assert change.arm_frame == (what if kind == "arm" else "")
             assert change.camera_rate == (float(what) if kind == "rate" else None)
@@ -205,8 +205,8 @@ def missing(*arguments, **settings):
 
 def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
-    builder = MechanicalVariantSensitivityBuilder(UnchangedExperiment(short_run, short_run.initial_unknowns))
-    other = builder.build_sensitivities(frozenset({"motion"}))
+    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(short_run, short_run.initial_unknowns))
+    other = builder.sensitivities_of_variant(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_driven_angles[:20]
     np.testing.assert_allclose(other.problem.episodes[0].measured_driven_angles[:20], held_out, atol=1e-12)
@@ -254,7 +254,7 @@ def test_one_arm_needs_another_arm_and_welds(exact):
 def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     """Two arms with welds and no camera, MuJoCo's motion and noise, from a start of 3 N m/rad each."""
     made = exact("dual_arm_no_vision")
-    layout = MechanicalVariantSensitivityBuilder(UnchangedExperiment(made, at_truth(made))).build_sensitivities(
+    layout = ExperimentVariantSensitivityBuilder(UnchangedExperiment(made, at_truth(made))).sensitivities_of_variant(
         frozenset({"weld"})
     )
     assert not isinstance(layout, str), layout

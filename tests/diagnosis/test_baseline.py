@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.estimate_history import RunEstimates
+from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording

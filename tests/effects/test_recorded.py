@@ -16,7 +16,7 @@ from yid_ocp.errors import DataError, ModelError, SolverError
 from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
+from yid_ocp.problem.recorded_inputs import available_signal_kinds
 from yid_ocp.sensors import measuring_camera_pose, sensor_reading_function
 from yid_ocp.solvers import MultipleShooting
 
@@ -173,14 +173,14 @@ def test_a_gear_needs_recorded_effort(prescribed) -> None:
 
 def test_what_a_recording_holds(driven) -> None:
     full = recording(driven)
-    assert recorded_signal_kinds([full]) == {"joints.position", "joints.effort", "camera"}
-    assert recorded_signal_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
+    assert available_signal_kinds([full]) == {"joints.position", "joints.effort", "camera"}
+    assert available_signal_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
     arm, camera = full.points
     assert measuring_camera_pose(arm) is None
     assert measuring_camera_pose(camera) is not None
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
     assert measuring_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
-    assert "nominal_clock" in recorded_signal_kinds([Recording(points=(unposed,))])
+    assert "nominal_clock" in available_signal_kinds([Recording(points=(unposed,))])
 
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
@@ -329,8 +329,8 @@ def test_the_clock_of_any_group_of_points_may_be_late_or_early(driven):
     [camera] = [group for group in recording(driven).points if group.name.endswith("camera")]
     mocap = replace(camera, name="points_mocap", sensor_name="mocap", camera_pose=None)
     made = replace(recording(driven, camera=False), points=(*recording(driven, camera=False).points, mocap))
-    assert "points:points_mocap" in recorded_signal_kinds([made])
-    found = candidate_kinds_and_locations(driven.system, recorded_signal_kinds([made]))
+    assert "points:points_mocap" in available_signal_kinds([made])
+    found = candidate_kinds_and_locations(driven.system, available_signal_kinds([made]))
     assert [place for kind, place in found if kind == "camera_latency"] == ["points_mocap"]
     late = make_effect("camera_latency", "points_mocap", driven.system)
     assert late.parameters["camera_latency@points_mocap.delay"].lower < 0

@@ -150,7 +150,7 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     read = torque + misread
     loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
     recorded, true = (JointMotionWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
-    value, _ = shift.effect_momentum_shifts_and_derivatives(recorded, true, theta, ())
+    value, _ = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     if names or misread:
         assert np.max(np.abs(value)) > 1e-3
@@ -162,7 +162,7 @@ def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(pla
     step, theta, (state, torque, internal), shift = moved(step, names)
     loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.theta_without_effects(theta))
     recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, internal)
-    value, slopes = shift.effect_momentum_shifts_and_derivatives(recorded, recorded, theta, tuple(names))
+    value, slopes = shift.effect_momentum_shifts_and_sensitivities(recorded, recorded, theta, tuple(names))
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     assert np.all(np.max(np.abs(slopes), axis=(0, 1)) > 1e-4)
 
@@ -174,7 +174,7 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     by_torque = np.stack([torque, 0 * torque], axis=2)
     recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, none)
     true = JointMotionWithSensitivities(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
-    value, slope = shift.effect_momentum_shifts_and_derivatives(recorded, true, theta, ("gain", "other"))
+    value, slope = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, ("gain", "other"))
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
     np.testing.assert_array_equal(slope[:, :, 1], 0.0)
@@ -198,7 +198,7 @@ def test_derivatives_are_those_of_differences(plain, names):
         own[[step.system.parameters.index(name) for name in wanted]] += move[: len(wanted)]
         parts = (state[:, ANGLES] + by_angles @ move, torque + by_torque @ move, internal + by_internal @ move)
         true = JointMotionWithSensitivities(*parts, by_angles, by_torque, by_internal)
-        return shift.effect_momentum_shifts_and_derivatives(recorded, true, own, wanted)
+        return shift.effect_momentum_shifts_and_sensitivities(recorded, true, own, wanted)
 
     value, slopes = at(np.zeros(d))
     assert slopes.shape == (*value.shape, d)

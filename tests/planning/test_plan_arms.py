@@ -129,9 +129,9 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
         "child_branch_vertex_names={}",
         "branch_density_and_damping={}",
         "main_branch_vertex_names=[p0, p1, p4, p6, p8, p11, p12]",
+        "branch_density_and_damping={parent: {has_separate_twist_damping: true, linear_density: 0.05}}",
     )
     coarse = [f"model.object.{entry}" for entry in fewer]
-    coarse += ["model.object.branch_density_and_damping={parent: {separate_twist_damping: true, linear_density: 0.05}}"]
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", "problem.use_compiler=false", *coarse, way)
     assert outcome.is_successful, outcome.result["message"]
     first = outcome.output.rollout.state[0]

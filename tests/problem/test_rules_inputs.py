@@ -14,10 +14,10 @@ from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,
+    available_signal_kinds,
     mean_step_input_delay_derivative,
     mean_step_inputs,
     prescribed_coordinates_at_nodes,
-    recorded_signal_kinds,
     smoothed_joint_efforts,
 )
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_low_pass_filter
@@ -158,9 +158,9 @@ RECORDED = {
 
 @pytest.mark.parametrize(("made", "expected"), RECORDED.values(), ids=RECORDED)
 def test_sensors_are_known_by_what_was_recorded(made, expected):
-    assert recorded_signal_kinds([made]) == expected
+    assert available_signal_kinds([made]) == expected
     with_efforts, both = RECORDED["efforts"]
-    assert recorded_signal_kinds([with_efforts, made]) == expected | both
+    assert available_signal_kinds([with_efforts, made]) == expected | both
 
 
 def moving(*names):

@@ -17,7 +17,7 @@ from yid_ocp.problem.episodes import mass_matrix_diagonal_at_zero, truncate_epis
 from yid_ocp.problem.evaluation import (
     ResidualVectorLayout,
     UnknownVectorLayout,
-    check_parameter_bounds,
+    check_initial_values_and_bounds,
     soft_logarithm_and_slope,
 )
 
@@ -392,10 +392,10 @@ def test_a_free_parameter_has_room_about_its_start(bounds, words):
     lower, upper = bounds
     system = SimpleNamespace(parameters=Parameters([Parameter("k", lower, "N m/rad", lower, upper)]))
     with pytest.raises(ConfigError, match=words):
-        check_parameter_bounds(system, ("k",), np.array([3.0]))
-    check_parameter_bounds(system, (), np.array([3.0]))
+        check_initial_values_and_bounds(system, ("k",), np.array([3.0]))
+    check_initial_values_and_bounds(system, (), np.array([3.0]))
     for value in (lower, upper) if lower < upper else ():
-        check_parameter_bounds(system, ("k",), np.array([value]))
+        check_initial_values_and_bounds(system, ("k",), np.array([value]))
 
 
 def test_there_must_be_something_to_estimate_on(free_step):

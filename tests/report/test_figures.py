@@ -317,10 +317,10 @@ def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
 def test_a_ranking_says_what_lies_beyond_its_axis():
     untried = {"untried": (None, 0.5)}
     entries = {"good": ((90.0, 80.0, 95.0), 88.0), "bad": ((-900.0, -2000.0, -100.0), 1.0)} | untried
-    figure = go.Figure(figures.candidate_gap_closure_figure(entries, "closed [%]", "promised [%]"))
+    figure = go.Figure(figures.gap_closure_and_screening_figure(entries, "closed [%]", "promised [%]"))
     assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
     assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
-    alone = go.Figure(figures.candidate_gap_closure_figure(untried, "closed", "promised"))
+    alone = go.Figure(figures.gap_closure_and_screening_figure(untried, "closed", "promised"))
     assert [trace.type for trace in alone.data] == ["bar"]
 
 

@@ -157,7 +157,7 @@ SEGMENTED = (
     "model:\n  object:\n    kind: segments\n    named_segments:\n"
     "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 2}\n"
     "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, "
-    "values_given_as_rigidities: true, separate_twist_damping: true}\n"
+    "values_given_as_rigidities: true, has_separate_twist_damping: true}\n"
     "parameters:\n  '*.bend': {initial: 5, bounds: [1, 8]}\n  a.twist: {initial: 2}\n  b.damping: {initial: 0.3}\n"
 )
 

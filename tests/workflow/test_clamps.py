@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.estimate_history import RunEstimates
+from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
@@ -29,7 +29,7 @@ model:
         {length: 0.1, mass: 0.1, cross_section_size: [0.03, 0.03], links: 2, values_given_as_rigidities: true,
          clamped_at_base: true, joint_axes: y}
   frames:
-    mark: {parent_frame: w_beam, position_from_straight_pose: true}
+    mark: {parent_frame: w_beam, use_recorded_straight_position: true}
 recordings: {estimate: [beam.h5]}
 sensors: {points: {std: 1.0e-4}}
 parameters:

@@ -219,7 +219,7 @@ class VariantPositionSensitivities:
         return self._known[key]
 
 
-MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
+SETUP_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
     "weld": "weld grasps in place of points",
     "second_arm": "a second arm",
     "motion": "another motion",
@@ -228,28 +228,28 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 }
 
 
-class MechanicalVariantSensitivityBuilder:
-    """Computes and caches sensitivities of an experiment with mechanical changes, such as a second arm."""
+class ExperimentVariantSensitivityBuilder:
+    """Computes and caches sensitivities of variants of an experiment, such as with a second arm or another motion."""
 
     def __init__(self, setting: UnchangedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
         self._progress = progress
         self._layouts: dict[frozenset[str], VariantPositionSensitivities | str] = {}
 
-    def build_sensitivities(self, mechanics: frozenset[str]) -> VariantPositionSensitivities | str:
-        """Compute the sensitivities for the mechanical changes `mechanics`, or return a message if that fails."""
-        if mechanics not in self._layouts:
-            if mechanics:
-                words = " and ".join(MECHANICAL_CHANGE_DESCRIPTIONS[name] for name in sorted(mechanics))
+    def sensitivities_of_variant(self, setup_changes: frozenset[str]) -> VariantPositionSensitivities | str:
+        """Compute the sensitivities of the variant with the changes `setup_changes`, or return why that fails."""
+        if setup_changes not in self._layouts:
+            if setup_changes:
+                words = " and ".join(SETUP_CHANGE_DESCRIPTIONS[name] for name in sorted(setup_changes))
                 self._progress.begin_stage(f"working out {words}")
             try:
-                self._layouts[mechanics] = self._build(mechanics)
+                self._layouts[setup_changes] = self._build(setup_changes)
             except YidError as error:
-                self._layouts[mechanics] = error.what
-        return self._layouts[mechanics]
+                self._layouts[setup_changes] = error.what
+        return self._layouts[setup_changes]
 
-    def applicable_mechanical_changes(self) -> list[str]:
-        """Names of the mechanical changes that the experiment's system allows."""
+    def applicable_setup_changes(self) -> list[str]:
+        """Names of the setup changes that the experiment's system allows."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos
         measured = any(s.sensor.effort_joints for e in episodes for s in e.measurements)
@@ -258,18 +258,18 @@ class MechanicalVariantSensitivityBuilder:
         applies = {"weld": loose, "second_arm": second, "motion": moves, "travel": moves}
         return [name for name, does in (applies | {"torque": bool(robot) and not measured}).items() if does]
 
-    def _build(self, mechanics: frozenset[str]) -> VariantPositionSensitivities:
+    def _build(self, setup_changes: frozenset[str]) -> VariantPositionSensitivities:
         setting, base = self.setting, self.setting.problem
-        system, recordings, notes = self._experiment(mechanics)
-        if "torque" in mechanics:
+        system, recordings, notes = self._experiment(setup_changes)
+        if "torque" in setup_changes:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
-        other = mechanics - {"motion", "travel"} or system is not base.system
+        other = setup_changes - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
         step, seen = step_with_frames_at_measurable_points(step)
         wide = free_starts_and_grasps(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
-        options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
-        dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]
+        options = replace(plain, sensors=self._joint_sensors(setup_changes), duration=None)
+        dense = [self._dense(entry, i, seen, "torque" in setup_changes) for i, entry in enumerate(recordings)]
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}
         nuisances = [name for name in wide.free if name not in base.free]
         problem = EstimationProblem(step, dense, (*base.free, *nuisances), options, values)
@@ -292,13 +292,13 @@ class MechanicalVariantSensitivityBuilder:
         stated[:, [problem.unknown_names.index(name) for name in names]] = 0.0
         return VariantPositionSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
 
-    def _joint_sensors(self, mechanics: frozenset[str]) -> dict[str, SensorOptions]:
+    def _joint_sensors(self, setup_changes: frozenset[str]) -> dict[str, SensorOptions]:
         given = self.setting.problem.options.sensors
         sensors = {name: replace(choice, use=None) for name, choice in given.items() if name.startswith("joints.")}
-        if "second_arm" in mechanics:
+        if "second_arm" in setup_changes:
             # simulated motions state their noise, also for joints that the settings do not contain
             sensors = {name: replace(choice, std=None, bias_std=None) for name, choice in sensors.items()}
-        if "torque" in mechanics:
+        if "torque" in setup_changes:
             joints = self.setting.problem.episodes[0].recording.joints
             said = None if joints is None else joints.effort_std
             stated = said is not None and bool(np.all(np.asarray(said) > 0))
@@ -332,24 +332,24 @@ class MechanicalVariantSensitivityBuilder:
         options = replace(problem.options, sensors=sensors)
         return EstimationProblem(problem.step, recordings, problem.free, options, values)
 
-    def _experiment(self, mechanics: frozenset[str]) -> tuple[System, list[Recording], list[str]]:
+    def _experiment(self, setup_changes: frozenset[str]) -> tuple[System, list[Recording], list[str]]:
         """System, recordings and notes of the experiment, driven as in the recordings."""
         base = self.setting.problem
         system = base.system
-        if "second_arm" in mechanics:
+        if "second_arm" in setup_changes:
             assert self.setting.two_arm_system is not None
             system = self.setting.two_arm_system
-        if "weld" in mechanics:
-            system = self._welded(system, mechanics - {"weld", "torque", "motion", "travel"})
-        if not mechanics & {"motion", "travel", "second_arm"}:
+        if "weld" in setup_changes:
+            system = self._welded(system, setup_changes - {"weld", "torque", "motion", "travel"})
+        if not setup_changes & {"motion", "travel", "second_arm"}:
             return system, [self._cut(episode) for episode in self._corrected.episodes], []
         made: list[Recording] = []
         notes: list[str] = []
         for i, episode in enumerate(base.episodes):
             try:
-                recording, beyond = self._moved(system, episode, _MOTION_SEED + i, "travel" in mechanics)
+                recording, beyond = self._moved(system, episode, _MOTION_SEED + i, "travel" in setup_changes)
             except DataError:
-                if system.driven != base.system.driven or not base.held_out or "travel" in mechanics:
+                if system.driven != base.system.driven or not base.held_out or "travel" in setup_changes:
                     raise
                 recording, beyond = self._cut(base.held_out[i % len(base.held_out)]), []
             made.append(replace(recording, name=episode.name))
@@ -374,7 +374,7 @@ class MechanicalVariantSensitivityBuilder:
         return recording.time_slice(-math.inf, float(episode.grid.node_times[-1]) + 1e-6)
 
     def _welded(self, system: System, others: frozenset[str]) -> System:
-        layout = self.build_sensitivities(others)
+        layout = self.sensitivities_of_variant(others)
         if isinstance(layout, str):
             raise failed_rollout_error(layout)
         problem, n = layout.problem, system.n_coordinates

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.profile import (
     ParameterProfileLikelihood,
-    apply_to_each_parameter_at_optimum,
     compute_profile_likelihood_interval,
+    map_over_parameters_at_optimum,
     mark_unidentifiable_near_zero_estimate,
 )
 from yid_ocp.arrays import Array, IntArray
@@ -209,7 +209,7 @@ def _profiles(
         return found, apply_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    pairs = apply_to_each_parameter_at_optimum(one, problem, view.x, wanted, progress)
+    pairs = map_over_parameters_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
 

@@ -124,18 +124,18 @@ def solution_with_profile_intervals(
 
     # each parameter takes about one and a half times as long as the solution
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood", 7.5 * len(asked), 5.2)
-    found = apply_to_each_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
+    found = map_over_parameters_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def apply_to_each_parameter_at_optimum(
+def map_over_parameters_at_optimum(
     judged: Callable[[str, Array, Evaluation], _Found],
     problem: EstimationProblem,
     x: Array,
     names: Sequence[str],
     progress: Progress,
 ) -> dict[str, _Found]:
-    """Call `judged` in parallel for each name, with the minimum of the cost near `x` and its evaluation."""
+    """Minimise the cost once from `x`; call `judged` in parallel with each name, the minimum and its evaluation."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 

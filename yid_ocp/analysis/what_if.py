@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    MECHANICAL_CHANGE_DESCRIPTIONS,
-    MechanicalVariantSensitivityBuilder,
+    SETUP_CHANGE_DESCRIPTIONS,
+    ExperimentVariantSensitivityBuilder,
     SinglePointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
@@ -38,14 +38,14 @@ _MAX_CHANGE_SET_SIZE = 3
 
 @dataclass(frozen=True)
 class ExperimentChange:
-    """One change of an experiment, such as a mechanical change, another measured frame or a camera rate.
+    """One change of an experiment, such as another setup, another measured frame or a camera rate.
 
     Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
     """
 
     name: str
     description: str
-    mechanical_change: str = ""  # key of `MECHANICAL_CHANGE_DESCRIPTIONS`, empty where only sensors change
+    setup_change: str = ""  # key of `SETUP_CHANGE_DESCRIPTIONS`, empty if the simulated experiment stays the same
     camera_frame: str = ""  # additional frame that the camera sees; empty for none
     arm_frame: str = ""  # additional frame that an arm measures; empty for none
     camera_rate: float | None = None  # [Hz]
@@ -166,7 +166,7 @@ def _smallest(
 def _are_compatible(changes: Sequence[ExperimentChange]) -> bool:
     """Whether changes can be combined: at most one camera rate and one motion."""
     rates = sum(change.camera_rate is not None for change in changes)
-    return rates <= 1 and sum(change.mechanical_change in ("motion", "travel") for change in changes) <= 1
+    return rates <= 1 and sum(change.setup_change in ("motion", "travel") for change in changes) <= 1
 
 
 def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedExperimentResult]:
@@ -187,7 +187,7 @@ class _Outcomes:
         judge: ChangeSetEvaluationFunction | None = None,
     ) -> None:
         self.setting, self.inflation, self.progress = setting, inflation, progress
-        self.builder = MechanicalVariantSensitivityBuilder(setting, progress)
+        self.builder = ExperimentVariantSensitivityBuilder(setting, progress)
         self.judge = judge or self._judged
         self.known: dict[frozenset[str], ChangedExperimentResult] = {}
 
@@ -200,8 +200,8 @@ class _Outcomes:
         views = setting.existing_point_observation_schedules(episode)
         groups = ("" if group is None else group.name for group in (camera, arm))
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
-        names = self.builder.applicable_mechanical_changes()
-        changes = [ExperimentChange(name, MECHANICAL_CHANGE_DESCRIPTIONS[name], name) for name in names]
+        names = self.builder.applicable_setup_changes()
+        changes = [ExperimentChange(name, SETUP_CHANGE_DESCRIPTIONS[name], name) for name in names]
         for sight in measurable_points(setting.problem.system):
             name, words = sight.name, sight.description
             if name not in looked | felt:
@@ -233,8 +233,8 @@ class _Outcomes:
 
     def _outcome(self, changes: Sequence[ExperimentChange]) -> ChangedExperimentResult:
         names, words = tuple(change.name for change in changes), _words(changes)
-        mechanics = frozenset(change.mechanical_change for change in changes if change.mechanical_change)
-        layout = self.builder.build_sensitivities(mechanics)
+        setup_changes = frozenset(change.setup_change for change in changes if change.setup_change)
+        layout = self.builder.sensitivities_of_variant(setup_changes)
         if isinstance(layout, str):
             return ChangedExperimentResult(names, words, {}, {}, 0, -math.inf, layout)
         views = [self._views(episode, changes, layout) for episode in self.setting.problem.episodes]

@@ -50,10 +50,10 @@ _GraspKind = Literal["point", "axis", "weld"]
 class _FrameSettings(MountSettings):
     """An additional named frame on the robot, the object or in the world, such as a tool tip or a marker."""
 
-    position_from_straight_pose: Annotated[
+    use_recorded_straight_position: Annotated[
         bool,
         OptionInfo(
-            "whether the dataset `straight` of each recording gives the position of the point of this name, "
+            "whether its position is that of the point of this name in the dataset `straight` of each recording, "
             "instead of xyz; for markers on an object whose root is fixed in the world"
         ),
     ] = False

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from yid_ocp.analysis.estimate_history import RunEstimates, nearby_positive_definite_covariance, pool_estimates_and_chi2
+from yid_ocp.analysis.run_estimates import RunEstimates, nearby_positive_definite_covariance, pool_estimates_and_chi2
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_rmse_and_unit_by_channel

@@ -15,7 +15,7 @@ import numpy as np
 import threadpoolctl
 
 from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step, problem_without_error_of_links
-from yid_ocp.analysis.estimate_history import RunEstimates
+from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import DiagnosisBaseline, add_baseline_prior
@@ -27,7 +27,7 @@ from yid_ocp.diagnosis.diagnosis_result import (
 )
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
-    SIMULATED_DURATION_FRACTIONS_TO_KEEP,
+    FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP,
     AllCandidatesProblem,
     CandidateNamesOrAll,
     TruncatedHeldOutRecording,
@@ -207,16 +207,16 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = {cut.recording: cut for cut in known}
-    for margin in SIMULATED_DURATION_FRACTIONS_TO_KEEP:
+    for fraction in FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
-        composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, margin)
+        composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, fraction)
         for cut in cuts:
             search.progress.begin_stage(held_out_truncation_message(cut))
             found[cut.recording] = cut
         search = replace(search, problem=composed)
-        name = f"the nominal model, limited to the part that it can follow ({margin:g})"
+        name = f"the nominal model, limited to the part that it can follow ({fraction:g})"
         nominal = _fitted_nominal_model(search, nominal.values, name)
     return search, nominal, tuple(found.values())
 

@@ -28,15 +28,15 @@ from yid_ocp.problem.episodes import Episode, truncate_episode
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions
-from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
+from yid_ocp.problem.recorded_inputs import available_signal_kinds
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
 _BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
 _MIN_PREDICTED_DURATION = 1.0  # shortest beginning of a held-out recording that is worth predicting [s]
-SIMULATED_DURATION_FRACTIONS_TO_KEEP = (0.9, 0.5, 0.0)
-"""Fractions of the successful part of a rollout to keep, tried in order while the rollout still fails: before it
-fails, a model has already deviated, and a fit on a shorter recording may fail earlier."""
+FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP = (0.9, 0.5, 0.0)
+"""Held-out recordings keep one of these fractions of the duration that a model follows before its rollout fails: before
+a failure it has already deviated. The next fraction is tried if the refitted model fails earlier."""
 
 
 def make_candidate_effects(
@@ -48,7 +48,7 @@ def make_candidate_effects(
     `ConfigError` if the list is empty, or if a kind does not exist, has no location here or is part of the nominal
     model. Raises `ModelError` if a location does not exist.
     """
-    where, sensors = "diagnosis.candidates", recorded_signal_kinds(recordings)
+    where, sensors = "diagnosis.candidates", available_signal_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
     if choice == "all":
@@ -181,11 +181,11 @@ class AllCandidatesProblem:
         return replace(self, problem=made.with_episodes(made.episodes, held.episodes))
 
     def truncate_failing_held_out_recordings(
-        self, values: Mapping[str, float], margin: float
+        self, values: Mapping[str, float], kept_fraction: float
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
         """Truncate held-out recordings where the nominal model's rollout fails. Also returns these recordings.
 
-        `margin` is the fraction kept of the duration that the model follows. If too little of every recording remains,
+        They keep `kept_fraction` of the duration that the model follows. If too little of every recording remains,
         estimation recordings are split in blocks instead. Residuals are whitened by sensor noise alone.
         """
         problem, x = self.problem, self.problem.unknown_vector(values)
@@ -196,7 +196,7 @@ class AllCandidatesProblem:
             if steps == whole:
                 kept.append(episode)
                 continue
-            steps = round(margin * steps)
+            steps = round(kept_fraction * steps)
             usable = steps * h >= _MIN_PREDICTED_DURATION
             cuts.append(TruncatedHeldOutRecording(episode.name, steps * h if usable else 0.0, whole * h))
             kept += [truncate_episode(episode, steps)] if usable else []
@@ -255,13 +255,10 @@ def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFuncti
 
     def placed(episode: Episode) -> Episode:
         loop, start, rest = episode.tracking_feedback, episode.fixed_initial_state, episode.equilibrium_guess
-        return replace(
-            episode,
-            tracking_feedback=loop
-            and replace(loop, state_indices=np.searchsorted(kept, loop.state_indices).astype(np.int32)),
-            fixed_initial_state=start and replace(start, state=start.state[kept]),
-            equilibrium_guess=None if rest is None else rest[joints],
-        )
+        loop = loop and replace(loop, state_indices=np.searchsorted(kept, loop.state_indices).astype(np.int32))
+        start = start and replace(start, state=start.state[kept])
+        rest = None if rest is None else rest[joints]
+        return replace(episode, tracking_feedback=loop, fixed_initial_state=start, equilibrium_guess=rest)
 
     def masked(own: ProcessNoiseWhitener | None) -> ProcessNoiseWhitener | None:
         return replace(own, state_mask=own.state_mask[kept]) if isinstance(own, WhiteningFilter) else own

@@ -16,7 +16,7 @@ import scipy.linalg
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
-from yid_ocp.diagnosis.hypotheses import SIMULATED_DURATION_FRACTIONS_TO_KEEP, AllCandidatesProblem
+from yid_ocp.diagnosis.hypotheses import FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
 from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement
 from yid_ocp.effects import EffectBase
@@ -253,7 +253,7 @@ def _composed_with_laws(
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
-    composed, _ = composed.truncate_failing_held_out_recordings(start, SIMULATED_DURATION_FRACTIONS_TO_KEEP[0])
+    composed, _ = composed.truncate_failing_held_out_recordings(start, FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP[0])
     return composed.with_whitening_linearized_at(last.values)
 
 

@@ -201,8 +201,8 @@ def effect_at_checked_location(kind: str, location: str, system: System, values:
     return cls(kind, location, Parameters(entries), internal, definitions, joint_names_by_arm(system).get(location, ()))
 
 
-def segment_names(system: System) -> tuple[str, ...]:
-    """Names of the flexible object's segments."""
+def flexible_segment_names(system: System) -> tuple[str, ...]:
+    """Names of the flexible segments of the object, such as branches of a cable."""
     return tuple(segment.name for segment in system.segment_layouts)
 
 
@@ -241,13 +241,11 @@ def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
         chain = {tree.joints[i].name for i in tree.ancestor_joint_indices(tree.frame(grasp.holder_frame).joint_index)}
-        held = tuple(name for name in joints if name in chain)
-        if held:
+        if held := tuple(name for name in joints if name in chain):
             found[grasp.name] = held
     left = tuple(name for name in joints if not any(name in arm for arm in found.values()))
     for side in ("left", "right"):
-        own = tuple(name for name in left if name.startswith(f"{side}_"))
-        if own and side not in found:
+        if side not in found and (own := tuple(name for name in left if name.startswith(f"{side}_"))):
             found[side] = own
     loose = tuple(name for name in left if not name.startswith(("left_", "right_")))
     if loose and not found:

@@ -64,7 +64,7 @@ class _Density(_ScaledBodies):
     """Scale factor on all masses and inertias of a segment."""
 
     equation = "masses and inertias times scale"
-    possible_locations = base.segment_names
+    possible_locations = base.flexible_segment_names
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on mass and inertia"),)
 
     def _joints(self, system: System) -> tuple[str, ...]:
@@ -247,7 +247,7 @@ def _length_names(system: System, segment: str) -> list[str]:
 
 
 def _segments_with_length(system: System) -> tuple[str, ...]:
-    return tuple(name for name in base.segment_names(system) if _length_names(system, name))
+    return tuple(name for name in base.flexible_segment_names(system) if _length_names(system, name))
 
 
 @EFFECTS.register("length_scale")
@@ -290,7 +290,7 @@ class _AerodynamicDrag(EffectBase):
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
     required_excitation = "how fast it moves"
-    possible_locations = base.segment_names
+    possible_locations = base.flexible_segment_names
     declared_parameters = (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:

@@ -18,7 +18,7 @@ from yid_ocp.effects.base import (
     ParameterDefinition,
     arm_joint_names,
     elastic_joints_within_segment,
-    segment_names,
+    flexible_segment_names,
 )
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.files import read_input_text
@@ -131,7 +131,7 @@ def _spline_weights(count: int) -> Array:
 def _coordinate_indices(system: System, location: str) -> list[int]:
     """Indices of the coordinates on which a law at a location acts."""
     index = system.mechanism.joint_index
-    if location in segment_names(system):
+    if location in flexible_segment_names(system):
         springs = elastic_joints_within_segment(system, location)
         bends = [spring for spring in springs if spring.deformation == "bend"]
         return [index(spring.joint_name) for spring in bends or springs]
@@ -162,7 +162,7 @@ def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[st
 
     `load` needs a driven joint, `command` a servo.
     """
-    if location in segment_names(system):
+    if location in flexible_segment_names(system):
         return ("angle", "speed", "time")
     if location not in arm_joint_names(system):
         return ()
@@ -225,7 +225,7 @@ def torque_law_from_tables(
     """
     label, possible = f"law@{location}", allowed_torque_law_quantity_names(system, location)
     if not possible:
-        places = (*segment_names(system), *arm_joint_names(system))
+        places = (*flexible_segment_names(system), *arm_joint_names(system))
         what, choice = f"there is no location '{location}' for a law", unknown_name_error_arguments(location, places)
         raise ConfigError(what, where=label, **choice)
     definitions, entries = [], []

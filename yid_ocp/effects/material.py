@@ -8,7 +8,8 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elastic_joints_within_segment, segment_names
+from yid_ocp.effects import base
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elastic_joints_within_segment
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.system import EffectStepTerms, MidpointStateSymbols, System
 
@@ -30,7 +31,7 @@ def _bending_stiffness(system: System, segment: str) -> float:
 class _SegmentEffect(EffectBase):
     """An effect on every elastic joint of a segment."""
 
-    possible_locations = segment_names
+    possible_locations = base.flexible_segment_names
 
     def _springs(self, state: MidpointStateSymbols) -> list[tuple[ElasticJoint, int]]:
         index = state.system.mechanism.joint_index
@@ -193,7 +194,7 @@ class _RestCurvature(_SpringChange):
 
 def _doubly_bending_segments(system: System) -> tuple[str, ...]:
     bent = {(spring.segment_name, spring.axis) for spring in system.elastic_joints}
-    return tuple(name for name in segment_names(system) if {(name, "x"), (name, "y")} <= bent)
+    return tuple(name for name in base.flexible_segment_names(system) if {(name, "x"), (name, "y")} <= bent)
 
 
 @EFFECTS.register("bend_anisotropy")

@@ -214,14 +214,14 @@ class EffectMomentumShift:
         """Derivative of the momentum with respect to the previous step's torques, (nu, nu) [s]."""
         return np.array(self._impulse(*[np.zeros(self._impulse.numel_in(i)) for i in range(5)], theta, self._time_step))
 
-    def effect_momentum_shifts_and_derivatives(
+    def effect_momentum_shifts_and_sensitivities(
         self,
         recorded: JointMotionWithSensitivities,
         true: JointMotionWithSensitivities,
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Momentum (N, nu) that effects add to the recorded motion at nodes 0..N-1, and its derivatives (N, nu, d).
+        """Momentum (N, nu) that effects add to the recorded motion at nodes 0..N-1, and its sensitivities (N, nu, d).
 
         `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
         The first of the d directions are the parameters `names`.

@@ -271,7 +271,7 @@ class EpisodePredictor:
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
-            by_torque = inputs.nominal_torque_derivatives(feedback, driven, width)
+            by_torque = inputs.torque_sensitivity_with_feedback_reference(feedback, driven, width)
             by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
         feedback = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
@@ -445,7 +445,8 @@ class EpisodePredictor:
         known = start.state, start.state_sensitivity, inputs
         inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, *known)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
-        by_torque = inputs.nominal_torque_derivatives(feedback, self.system.actuated_coordinate_indices, len(own))
+        driven = self.system.actuated_coordinate_indices
+        by_torque = inputs.torque_sensitivity_with_feedback_reference(feedback, driven, len(own))
         if by_torque is not None:
             own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.prescribed_path_sensitivity is not None:

@@ -33,8 +33,9 @@ from yid_ocp.problem.evaluation import (
     ResidualVectorLayout,
     UnknownVectorLayout,
     check_free_parameters,
-    check_names_and_known_parameters,
-    check_parameter_bounds,
+    check_initial_values_and_bounds,
+    check_no_known_value_of_free_parameters,
+    check_unique_recording_names,
     estimated_initial_state_names,
     initial_internal_state_offset_bounds,
     soft_logarithm_and_slope,
@@ -108,7 +109,7 @@ class EstimationProblem(ReprMixin):
         theta = step.system.parameters.vector(values)
         names = (*free, *(name for name in may_free if name not in free))
         functions = ModelFunctions(step, names, options.initial_state_fit_parameters)
-        check_parameter_bounds(step.system, free, theta)
+        check_initial_values_and_bounds(step.system, free, theta)
         prepare = partial(prepare_episode, functions, options=options, theta=theta, free=free)
         episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
         self._set(functions, options, tuple(free), theta, episodes, others)
@@ -117,7 +118,8 @@ class EstimationProblem(ReprMixin):
             tuple(episode_at_equilibrium_with_denoised_gear_loads(self.predictor, e, theta) for e in group)
             for group in (fitted, others)
         )
-        check_names_and_known_parameters(ready, other, free)
+        check_unique_recording_names([episode.name for episode in ready])
+        check_no_known_value_of_free_parameters((*ready, *other), free)
         self._set(functions, options, tuple(free), theta, ready, other)
 
     def _set(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -253,9 +253,8 @@ def estimated_initial_state_names(
         found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]
     for effect in system.effects:
         if isinstance(effect, EffectBase) and effect.max_abs_initial_internal_coordinates:
-            index = system.parameters.index
-            names = effect.amplitude_parameter_names
-            if any(name in free or theta[index(name)] != effect.neutral_values[name] for name in names):
+            at, neutral = system.parameters.index, effect.neutral_values
+            if any(n in free or theta[at(n)] != neutral[n] for n in effect.amplitude_parameter_names):
                 found += [f"z.{name}" for name in effect.max_abs_initial_internal_coordinates]
     return tuple(found)
 
@@ -276,9 +275,8 @@ def check_free_parameters(system: System, free: Sequence[str], options: ProblemO
     """Raise `ConfigError` if a free parameter is unknown or repeated, or if a local or prior parameter is not free."""
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)
-    if len(set(free)) != len(free):
-        twice = next(name for name in free if list(free).count(name) > 1)
-        what, hint = f"the free parameter '{twice}' is listed twice", "delete one of the two"
+    if twice := [name for name in free if list(free).count(name) > 1]:
+        what, hint = f"the free parameter '{twice[0]}' is listed twice", "delete one of the two"
         raise ConfigError(what, where="free parameters", allowed="every name once", hint=hint)
     for name in (*options.local_parameters, *options.prior_stds):
         if name not in free:
@@ -287,13 +285,16 @@ def check_free_parameters(system: System, free: Sequence[str], options: ProblemO
             raise ConfigError(what, where=where, **unknown_name_error_arguments(name, free, "set its `free: true`"))
 
 
-def check_names_and_known_parameters(used: Sequence[Episode], held_out: Sequence[Episode], free: Sequence[str]) -> None:
-    """Raise `ConfigError` if two used episodes have one name, or an episode has a known value of a free parameter."""
-    names = [episode.name for episode in used]
+def check_unique_recording_names(names: Sequence[str]) -> None:
+    """Raise `ConfigError` if two estimation recordings have the same name."""
     if twice := [name for name in names if names.count(name) > 1]:
         what, hint = f"two recordings are called '{twice[0]}'", "rename one of them"
         raise ConfigError(what, where="recordings.estimate", allowed="every name once", hint=hint)
-    for episode in (*used, *held_out):
+
+
+def check_no_known_value_of_free_parameters(episodes: Iterable[Episode], free: Sequence[str]) -> None:
+    """Raise `ConfigError` if a recording has a known value of a free parameter."""
+    for episode in episodes:
         known = {*episode.known_parameters, *getattr(episode.fixed_initial_state, "fitted_parameters", ())}
         if found := [name for name in free if name in known]:
             what = f"{found[0]} is free, but this recording has a known value of it"
@@ -301,7 +302,7 @@ def check_names_and_known_parameters(used: Sequence[Episode], held_out: Sequence
             raise ConfigError(what, where=f"recording '{episode.name}'", allowed=allowed, hint=hint)
 
 
-def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:
+def check_initial_values_and_bounds(system: System, free: Sequence[str], theta: Array) -> None:
     """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or if its bounds coincide."""
     for name in free:
         entry, value = system.parameters[name], theta[system.parameters.index(name)]

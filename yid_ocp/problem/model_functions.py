@@ -86,13 +86,13 @@ class CorrectedInputs:
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
         true = JointMotionWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
-        momentum, slope = shift.effect_momentum_shifts_and_derivatives(recorded, true, theta, names)
+        momentum, slope = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, names)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
-    def nominal_torque_derivatives(
+    def torque_sensitivity_with_feedback_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
-        """Derivatives (N, nu, width) of the nominal torque, including those through the tracking filter's reference."""
+        """Sensitivity (N, nu, width) of the corrected torque plus the tracking feedback's gain times its reference."""
         reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
         for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
             if feedback is not None and slope is not None:

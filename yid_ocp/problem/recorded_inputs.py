@@ -203,8 +203,8 @@ def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: A
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
 
-def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Kinds of signals in recordings that effects can require, such as `joints.effort`.
+def available_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
+    """Signal kinds that the recordings contain, of those that effects can require, such as `joints.effort`.
 
     Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, each point group that
     neither a camera nor an arm measured is a kind too: `points:GROUP`.
@@ -232,7 +232,7 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
 
 def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
     """Kinds of effects that cannot be candidates, by the signals that they require but the recordings lack."""
-    present, found = recorded_signal_kinds(recordings), dict[str, list[str]]()
+    present, found = available_signal_kinds(recordings), dict[str, list[str]]()
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):
             found.setdefault(" and ".join(missing), []).append(kind)

@@ -72,15 +72,15 @@ class _AnimatedMotion:
 
 
 @dataclass(frozen=True)
-class Animation:
-    """Several motions for one animation, on a common time axis t (F,) [s]."""
+class AnimationData:
+    """Data of one animation: several motions on a common time axis t (F,) [s]."""
 
     title: str
     t: Array
     motions: tuple[_AnimatedMotion, ...]
 
 
-def animations_to_dict(scenes: Sequence[Animation], robot: str | None = None) -> dict[str, Any]:
+def animations_to_dict(scenes: Sequence[AnimationData], robot: str | None = None) -> dict[str, Any]:
     """Convert scenes to JSON-ready data, with meshes by joint. Positions are integers in 0.1 mm, null if unknown.
 
     The meshes of the robot's URDF are drawn on the arm of a scene's last model or, in a scene without a model, on the
@@ -272,7 +272,7 @@ def _shown_frames(system: System) -> list[str]:
 
 def animation_of_trajectories(
     title: str, trajectories: Sequence[ConfigurationTrajectory], recording: Recording | None = None
-) -> Animation:
+) -> AnimationData:
     """Animate model trajectories and the recorded motion. The first trajectory sets the times and joints.
 
     The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames.
@@ -281,12 +281,12 @@ def animation_of_trajectories(
     motions = [_model_motion(entry, t, entry._q_at(t)) for entry in trajectories]
     if recording is not None:
         motions.append(_measured_motion(trajectories[0], recording, t))
-    return Animation(title, t, tuple(motions))
+    return AnimationData(title, t, tuple(motions))
 
 
 def recording_animation(
     title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
-) -> Animation | None:
+) -> AnimationData | None:
     """Animate a recording alone, without predictions. None if the recording holds no positions.
 
     With `has_straight_object`, the model at the recorded angles is drawn too, with an undeformed object.
@@ -297,9 +297,9 @@ def recording_animation(
     if not (motion.sticks or motion.point_indices):
         return None
     if not has_straight_object:
-        return Animation(title, t, (motion,))
+        return AnimationData(title, t, (motion,))
     unbent = replace(told, name="model on the recorded angles, nothing bent")
-    return Animation(title, t, (_model_motion(unbent, t, _with_recorded_angles(told, recording, t)), motion))
+    return AnimationData(title, t, (_model_motion(unbent, t, _with_recorded_angles(told, recording, t)), motion))
 
 
 def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t: Array) -> Array:

@@ -397,7 +397,7 @@ def _even(value: Any) -> Any:
     return np.arcsinh(np.asarray(value, float) / 2)
 
 
-def candidate_gap_closure_figure(
+def gap_closure_and_screening_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, predicted: str
 ) -> _Figure:
     """Plot each candidate's gap closure after a refit [%], with interval, and the decrease that screening predicts.

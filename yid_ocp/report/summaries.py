@@ -23,11 +23,11 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
+    bound_range_text,
     discretisation_shift_sentences,
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
-    parameter_bounds_text,
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
@@ -61,7 +61,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
         value = "–" if not failed and entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}"
         own = (name, value, std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
-        rows.append((*own, parameter_bounds_text(entry, 4)))
+        rows.append((*own, bound_range_text(entry, 4)))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     rows = [("channel", "error (rms)", "unit", "samples")]
     for name, entry in result["residuals"].items():
@@ -397,7 +397,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(said, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
-        bounds, use = parameter_bounds_text(entry, 6), "free" if entry["free"] else ""
+        bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else ""
         rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
     yield SummaryTable(rows, "Parameters")
     sizes = [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]

@@ -185,8 +185,8 @@ def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
     return rows
 
 
-def parameter_bounds_text(entry: Mapping[str, Any], digits: int) -> str:
-    """Format the bounds of a parameter. Missing bounds are `-inf` and `inf`."""
+def bound_range_text(entry: Mapping[str, Any], digits: int) -> str:
+    """Format the range between the bounds of a parameter, such as "0 to inf". Missing bounds are `-inf` and `inf`."""
     ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
     return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
 

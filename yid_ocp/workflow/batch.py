@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.estimate_history import assess_drift_and_outlier_runs
+from yid_ocp.analysis.run_estimates import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_question
@@ -28,7 +28,7 @@ from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_folder import current_local_time_text
-from yid_ocp.workflow.run_history import estimate_history_to_dict, read_estimates, require_comparable_runs
+from yid_ocp.workflow.run_history import drift_and_outlier_tests_to_dict, read_estimates, require_comparable_runs
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve
 
@@ -192,7 +192,7 @@ def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
         return None
     try:
         require_comparable_runs(folders)
-        return estimate_history_to_dict(assess_drift_and_outlier_runs([read_estimates(folder) for folder in folders]))
+        return drift_and_outlier_tests_to_dict(assess_drift_and_outlier_runs(list(map(read_estimates, folders))))
     except YidError:
         return None
 

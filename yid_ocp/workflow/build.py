@@ -93,7 +93,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.joint_springs.items()},
             servos=arms.servo if mode == "servo" else None,
         )
-    if any(said.position_from_straight_pose for said in model.frames.values()) and run.recordings.estimate:
+    if any(said.use_recorded_straight_position for said in model.frames.values()) and run.recordings.estimate:
         # marker positions if no recording is specified
         [places] = marker_positions_from_reference_pose(run, system, read_recordings_of_role(run, count=1)).values()
         system = replace(system, parameters=system.parameters.with_nominal_values(places))
@@ -379,8 +379,8 @@ def _with_extra_frames(
         owner = next((i for i, item in enumerate(made) if parent and item.mechanism.has_frame(parent)), None)
         if owner is not None:
             tree = made[owner].mechanism
-        elif said.position_from_straight_pose:
-            what = f"'{name}' has `position_from_straight_pose`, but its parent is not a frame of the object"
+        elif said.use_recorded_straight_position:
+            what = f"'{name}' has `use_recorded_straight_position`, but its parent is not a frame of the object"
             allowed = "a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%"
             raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame")
         else:
@@ -388,9 +388,9 @@ def _with_extra_frames(
             if parent is not None and not tree.has_frame(parent):
                 known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
                 raise unknown_name_error(run, "frame", parent, known, *where, "parent_frame")
-        pose = np.eye(4) if said.position_from_straight_pose else transform_from_xyz_rpy(said.xyz, said.rpy)
+        pose = np.eye(4) if said.use_recorded_straight_position else transform_from_xyz_rpy(said.xyz, said.rpy)
         tree = tree.with_added_frame(name, parent, pose)
-        if said.position_from_straight_pose or said.position_std > 0:
+        if said.use_recorded_straight_position or said.position_std > 0:
             tree = _with_estimable_position(tree, name, str(parent))
         if owner is None:
             carrier = tree
@@ -413,15 +413,15 @@ def marker_positions_from_reference_pose(
 ) -> dict[str, dict[str, float]]:
     """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
 
-    Empty if no frame has `position_from_straight_pose`. Raises `ConfigError` if the object is not fixed in the world or
-    a marker is not a point of a recording, and `DataError` if a recording has no `straight` positions.
+    Empty if no frame has `use_recorded_straight_position`. Raises `ConfigError` if the object is not fixed in the world
+    or a marker is not a point of a recording, and `DataError` if a recording has no `straight` positions.
     """
-    names = [name for name, said in run.model.frames.items() if said.position_from_straight_pose]
+    names = [name for name, said in run.model.frames.items() if said.use_recorded_straight_position]
     if not names:
         return {}
     if run.model.object is not None and not run.model.object.is_root_fixed_in_world:
-        what = "the mount of the object moves, so `position_from_straight_pose` does not determine its position"
-        where = ("model", "frames", names[0], "position_from_straight_pose")
+        what = "the mount of the object moves, so `use_recorded_straight_position` does not determine its position"
+        where = ("model", "frames", names[0], "use_recorded_straight_position")
         hint, allowed = f"set model.frames.{names[0]}.xyz instead", "an object whose mount is fixed in the world"
         raise run.config_error(what, *where, allowed=allowed, hint=hint)
     q = ca.SX.sym("q", system.n_coordinates)
@@ -434,7 +434,7 @@ def marker_positions_from_reference_pose(
     for recording in recordings:
         group = recording.points[0].names if recording.points else ()
         if recording.marker_reference_pose is None:
-            hint = f"record them, or give model.frames.{names[0]}.xyz in place of position_from_straight_pose: true"
+            hint = f"record them, or give model.frames.{names[0]}.xyz in place of use_recorded_straight_position: true"
             what = "the recording has no marker positions of the straight object"
             allowed = "positions of the points of its first group, shape (np, 3) [m]"
             raise DataError(what, where=f"recording '{recording.name}': straight", allowed=allowed, hint=hint)

@@ -21,7 +21,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.report.animation import Animation, animation_of_trajectories, recording_animation
+from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_joint_parameter_scale, urdf_reader_options
@@ -160,7 +160,7 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
     return noise
 
 
-def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
+def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData]:
     """Animations of every estimation recording with the initial parameters, or of the recording alone."""
     scenes = []
     for i, episode in enumerate(problem.episodes):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.estimate_history import pool_estimates_and_chi2
+from yid_ocp.analysis.run_estimates import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
@@ -39,7 +39,7 @@ from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
-from yid_ocp.report.animation import Animation, ConfigurationTrajectory, animation_of_trajectories
+from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
@@ -234,7 +234,7 @@ def _held_out_predictions(finding: DiagnosisResult) -> list[EpisodeWithNominalAn
     return [(e, first, last) for e, first, last in pairs if not isinstance(first, str) and not isinstance(last, str)]
 
 
-def _scenes(finding: DiagnosisResult, predicted: Sequence[EpisodeWithNominalAndEffectPredictions]) -> list[Animation]:
+def _scenes(finding: DiagnosisResult, predicted: list[EpisodeWithNominalAndEffectPredictions]) -> list[AnimationData]:
     fits = {"nominal model": finding.nominal_model}
     fits |= {"with the effects": finding.final_model} if finding.accepted_effects else {}
     scenes = []
@@ -253,7 +253,7 @@ def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePre
     return prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
 
 
-def _unknown_force_scene(finding: DiagnosisResult) -> list[Animation]:
+def _unknown_force_scene(finding: DiagnosisResult) -> list[AnimationData]:
     """The nominal model in its worst-explained recording, with the largest unknown forces and offsets."""
     fit, smoothed = finding.nominal_model, finding.smoother_result
     if smoothed is None or not smoothed.smoothed_unknowns:

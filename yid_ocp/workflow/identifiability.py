@@ -217,11 +217,11 @@ class _IdentifiabilityTasks:
     def evaluate_experiment_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
-        """Information gained by sets of changes, one task per changed mechanics (an `ChangeSetEvaluationFunction`)."""
+        """Information gained by sets of changes, one task per changed setup (a `ChangeSetEvaluationFunction`)."""
         groups: dict[str, list[int]] = {}
         for i, changes in enumerate(sets):
-            mechanics = sorted({change.mechanical_change for change in changes if change.mechanical_change})
-            groups.setdefault(" and ".join(mechanics) or "sensors", []).append(i)
+            setup = sorted({change.setup_change for change in changes if change.setup_change})
+            groups.setdefault(" and ".join(setup) or "sensors", []).append(i)
         named = [[change.name for change in changes] for changes in sets]
         own = {name: [named[i] for i in members] for name, members in groups.items()}
         tasks = {name: {"sets": members, "inflation": inflation} for name, members in own.items()}

@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from yid_ocp.analysis.estimate_history import (
+from yid_ocp.analysis.run_estimates import (
     DriftAndOutlierTests,
     RunEstimates,
     assess_drift_and_outlier_runs,
@@ -28,7 +28,7 @@ from yid_ocp.files import attributes_to_dict, file_sha256, is_file, read_input_j
 from yid_ocp.model.objects import ObjectBuilder
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import ChannelPrediction
-from yid_ocp.report.animation import Animation, ConfigurationTrajectory, animation_of_trajectories
+from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
@@ -267,24 +267,24 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     estimates = [read_estimates(path) for path in paths]
     require_comparable_runs(paths)
     progress.begin_stage(f"comparing {len(paths)} runs")
-    found = assess_drift_and_outlier_runs(estimates)
+    told = drift_and_outlier_tests_to_dict(assess_drift_and_outlier_runs(estimates))
     settings = RunSettings(name="history", description="Runs of one model side by side.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
         folder.log_command_start(["report", *map(str, paths)])
-        written = folder.write_result_and_report(settings, progress, estimate_history_to_dict(found), "history.json")
+        written = folder.write_result_and_report(settings, progress, told, "history.json")
     return CommandOutcome(folder.path, written, None)
 
 
-def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
-    """Convert parameter estimates over several runs to a `yid-history/1` result, without inputs and versions."""
+def drift_and_outlier_tests_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
+    """Convert drift and outlier tests of several runs to a `yid-history/1` result, without inputs and versions."""
     parameters = {}
-    for entry in found.parameter_drifts:
+    for entry in found.parameter_drift_tests:
         known = zip(entry.run_names, entry.values, entry.std, strict=True)
         values = {name: {"value": value, "std": std} for name, value, std in known}
         own = attributes_to_dict(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
         parameters[entry.name] = own | {"values": values}
-    names = "name=run_name chi2 degrees=degrees_of_freedom p_value worst=worst_parameter"
+    names = "name=run_name chi2 degrees=degrees_of_freedom p_value worst=most_deviating_parameter"
     names += " explains=is_fit_adequate distrusted=is_outlier"
     return {
         "format": "yid-history/1",
@@ -383,7 +383,7 @@ def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple
 
 def _overlaid_motions(
     folders: Sequence[Path], labels: Sequence[str], found: Sequence[Mapping[str, Any]]
-) -> list[Animation]:
+) -> list[AnimationData]:
     """Measured motion and motions of both runs' models; empty if a model or recording is no longer readable."""
     told: dict[str, list[ConfigurationTrajectory]] = {}
     try:

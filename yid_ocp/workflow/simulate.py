@@ -15,7 +15,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import recording_from_prediction
-from yid_ocp.report.animation import Animation, animation_of_trajectories, recording_animation
+from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
 from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
@@ -23,7 +23,7 @@ from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajecto
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
-_Made = tuple[Recording | str, list[Animation]]
+_Made = tuple[Recording | str, list[AnimationData]]
 _DEFAULT_DURATION = 5.0  # default duration of a virtual experiment [s]
 
 

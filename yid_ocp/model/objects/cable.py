@@ -60,7 +60,7 @@ class CableBranchRigidityAndDensity:
     bend_rigidity: float = 1.5e-3  # a configuration sets this and the next two under `parameters`
     twist_rigidity: float = 1.0e-3
     bend_damping: float = 5e-5
-    separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
+    has_separate_twist_damping: Annotated[bool, OptionInfo("whether twists have their own damping parameter")] = False
     linear_density: Annotated[float, Gt(0), OptionInfo("mass per length; results scale with it", "kg/m")] = 0.05
 
 
@@ -253,7 +253,7 @@ def _segments(
             bend=branch.bend_rigidity,
             twist=branch.twist_rigidity,
             damping=branch.bend_damping,
-            twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
+            twist_damping=branch.bend_damping if branch.has_separate_twist_damping else None,
             values_given_as_rigidities=True,
             has_length_parameter_per_link=options.has_edge_lengths_per_recording,
         )
@@ -285,7 +285,7 @@ model:
     undeformed_shape_file: undeformed.csv
     child_branch_vertex_names: {side: [p2, s1, s2]}
     branch_density_and_damping:
-      side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
+      side: {linear_density: 0.03, has_separate_twist_damping: true}    # [kg/m]
 """,
     }
 

@@ -44,7 +44,7 @@ class SegmentGeometrySettings:
         int | None, Ge(0), OptionInfo("link of the parent to whose tip it is attached; default: the last")
     ] = None
     rpy: Annotated[_Vector3, OptionInfo("rest rotation relative to the parent's link or mount", "rad")] = _NO_TURN
-    separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
+    has_separate_twist_damping: Annotated[bool, OptionInfo("whether twists have their own damping parameter")] = False
     values_given_as_rigidities: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
@@ -73,7 +73,7 @@ class SegmentGeometrySettings:
             bend=FlexibleSegment.bend * factor,
             twist=FlexibleSegment.twist * factor,
             damping=damping * factor,
-            twist_damping=damping * factor if self.separate_twist_damping else None,
+            twist_damping=damping * factor if self.has_separate_twist_damping else None,
         )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPrediction
 from yid_ocp.registry import Registry
-from yid_ocp.report.animation import Animation
+from yid_ocp.report.animation import AnimationData
 from yid_ocp.solvers import Solution
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class ReportData:
     problem: EstimationProblem | None = None
     solution: Solution | None = None
     held_out: Sequence[EpisodeAndPrediction] = ()
-    animations: Sequence[Animation] = ()
+    animations: Sequence[AnimationData] = ()
     robot: str | None = None
     section_data: Mapping[str, Any] = field(default_factory=dict)
 

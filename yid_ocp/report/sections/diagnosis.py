@@ -249,7 +249,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     # room for one word on a narrow screen
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
-    return title, sentences, [("", figures.candidate_gap_closure_figure(entries, *axes))]
+    return title, sentences, [("", figures.gap_closure_and_screening_figure(entries, *axes))]
 
 
 def _law(finding: DiagnosisResult) -> _Chapter | None:

@@ -54,7 +54,7 @@ class RunEstimates(ReprMixin):
 
 
 @dataclass(frozen=True)
-class _ParameterDrift:
+class _ParameterDriftTest:
     """Test whether one parameter has the same value in all its runs: pooled mean, chi2 of the differences."""
 
     name: str
@@ -77,7 +77,7 @@ class _RunOutlierTest:
     chi2: float
     degrees_of_freedom: int
     p_value: float
-    worst_parameter: str  # parameter that differs most
+    most_deviating_parameter: str  # parameter that differs most
     is_fit_adequate: bool
     is_outlier: bool  # the other runs agree with each other, but not with this run
 
@@ -87,7 +87,7 @@ class DriftAndOutlierTests:
     """Tests of several runs of one model for parameter drift and outlier runs. `chi2` covers all differences."""
 
     run_names: tuple[str, ...]
-    parameter_drifts: tuple[_ParameterDrift, ...]
+    parameter_drift_tests: tuple[_ParameterDriftTest, ...]
     run_outlier_tests: tuple[_RunOutlierTest, ...]
     chi2: float
     degrees_of_freedom: int
@@ -150,13 +150,13 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
     return DriftAndOutlierTests(names, drifts, against, chi2, degrees, p, level)
 
 
-def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDrift:
+def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDriftTest:
     own = [run._only((name,)) for run in runs if name in run.parameter_names]
     mean, chi2, degrees = pool_estimates_and_chi2(own)
     p, places = chi2_p_value(chi2, degrees), tuple(run.run_name for run in own)
     values, std = tuple(float(run.values[0]) for run in own), tuple(float(run.std[0]) for run in own)
     pooled = float(mean.values[0]), float(mean.std[0])
-    return _ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
+    return _ParameterDriftTest(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
 
 
 def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierTest:
