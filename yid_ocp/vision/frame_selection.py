@@ -107,8 +107,8 @@ _MAX_NOTES = 4  # notes in a hint
 _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a normal variable, in stds
 
 
-def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
-    """Reason to reject a frame because of its own fit, without comparison with other frames. Empty if good."""
+def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str | None:
+    """Reason to reject a frame because of its own fit, without comparison with other frames. None if it is good."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
@@ -124,7 +124,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
     if fit.visible_length_coverage < options.min_covered_visible_length_fraction:
         return f"{_NO_FIT}: only {100 * fit.visible_length_coverage:.0f} % of its visible length has points of its own"
-    return ""
+    return None
 
 
 def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:

@@ -297,7 +297,7 @@ class FrameTracker:
         is_rival = len(fits) > 1 and fits[1].mean_distance < _RIVAL_SHAPE_RATIO * fits[0].mean_distance
         other = fits[1] if is_rival else None
         spent = work.report.cpu_seconds + time.process_time() - begun
-        work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
+        work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason or "")
         return work.report
 
     def frame_processing_stages(self, frame: FrameReport, common: SharedFrameEstimates) -> FrameProcessingStages | None:
