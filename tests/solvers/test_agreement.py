@@ -218,7 +218,7 @@ def test_a_program_that_ipopt_cannot_begin_is_a_status_and_silent(pendulum, monk
         program = transcribe(*arguments)
         return program.with_user_terms(ca.log(program["theta"][0] - 100.0))
 
-    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.transcribe", lost)
+    monkeypatch.setattr("yid_ocp.solvers.symbolic_transcription.transcribe", lost)
     found = MultipleShooting(max_iterations=3).minimize_cost(pendulum, pendulum.initial_unknowns, None)
     assert found.status in (Status.STALLED, Status.FAILED)
     assert "IPOPT: Invalid_Number_Detected" in found.message

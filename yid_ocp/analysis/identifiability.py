@@ -21,26 +21,9 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, failed_rollout_error, unknown_name_error_arguments
+from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
-from yid_ocp.inference.uncertainty import (
-    MAX_IDENTIFIABLE_RELATIVE_STD,
-    MAX_WEAK_RELATIVE_STD,
-    MIN_RELATIVE_STD_TAKEN_AS_INFINITE,
-    VERDICT_TABLE_TEXTS,
-    ParameterEstimate,
-    apply_profile_interval,
-    assess_goodness_of_fit,
-    finite_or_none,
-    misfit_robust_covariance,
-    parameter_estimates,
-    parameter_unknown_names,
-    parameter_verdict,
-    percent_number_text,
-    typical_parameter_magnitudes,
-    unknowns_covariance_and_reduced_chi2,
-    value_and_uncertainty_text,
-)
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -114,8 +97,8 @@ class IdentifiabilityResult(ReprMixin):
     def _summary(self) -> ReprLineAndTableRows:
         rows = [("parameter", "value", "unit", "")]
         for name, entry in self.parameters.items():
-            value = value_and_uncertainty_text(entry.value, finite_or_none(entry.std), None)
-            rows.append((name, value, entry.unit, VERDICT_TABLE_TEXTS[entry.verdict]))
+            value = uncertainty.value_and_uncertainty_text(entry.value, uncertainty.finite_or_none(entry.std), None)
+            rows.append((name, value, entry.unit, uncertainty.VERDICT_TABLE_TEXTS[entry.verdict]))
         found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
         return ReprLineAndTableRows(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
 
@@ -158,7 +141,7 @@ def identifiability(
     limits : ExcessResidualCriteria, optional
         Criteria by which a residual at a solution exceeds noise.
     """
-    names = parameter_unknown_names(problem)
+    names = uncertainty.parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in (own for own in wanted if own not in names):
         said = unknown_name_error_arguments(name, names)
@@ -172,17 +155,17 @@ def identifiability(
         evaluation = wide.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message)
-        covariance, chi2 = unknowns_covariance_and_reduced_chi2(wide, evaluation)
+        covariance, chi2 = uncertainty.unknowns_covariance_and_reduced_chi2(wide, evaluation)
         inflation, fit = math.sqrt(max(1.0, chi2)), None
         if solution is None:
             # far from a fit, chi2 is no measure of the noise
             covariance, inflation = covariance / inflation**2, 1.0
         else:
             own = wide if as_solved else problem_with_whitening_at(problem, given, rounds=2)
-            fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
-            covariance = misfit_robust_covariance(wide, evaluation, fit)
+            fit = uncertainty.assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
+            covariance = uncertainty.misfit_robust_covariance(wide, evaluation, fit)
         view = _Sensitivities.of(wide, x, evaluation, names, inflation)
-        judged = parameter_estimates(wide, x, evaluation, covariance, fit)
+        judged = uncertainty.parameter_estimates(wide, x, evaluation, covariance, fit)
         std = np.array([judged[name].std for name in names])
         profiles = _profiles(view, wanted, judged, progress) if wanted else {}
         nuisances = tuple(name for name in wide.unknown_names if name not in names)
@@ -197,16 +180,20 @@ def identifiability(
 
 
 def _profiles(
-    view: _Sensitivities, wanted: Sequence[str], judged: dict[str, ParameterEstimate], progress: Progress
+    view: _Sensitivities, wanted: Sequence[str], judged: dict[str, uncertainty.ParameterEstimate], progress: Progress
 ) -> dict[str, ParameterProfileLikelihood]:
     """Profile likelihoods of the wanted parameters about the best fit of all unknowns; updates `judged`."""
-    problem, sizes = view.problem, typical_parameter_magnitudes(view.problem, view.x)
+    problem, sizes = view.problem, uncertainty.typical_parameter_magnitudes(view.problem, view.x)
 
-    def one(name: str, best: Array, there: Evaluation) -> tuple[ParameterProfileLikelihood, ParameterEstimate]:
+    def one(
+        name: str, best: Array, there: Evaluation
+    ) -> tuple[ParameterProfileLikelihood, uncertainty.ParameterEstimate]:
         index, size, entry = problem.unknown_names.index(name), sizes[name.split("[")[0]], judged[name]
         found = compute_profile_likelihood_interval(problem, best, index, float(entry.std), there)
         said = mark_unidentifiable_near_zero_estimate(problem, best, index, entry, size, there)
-        return found, apply_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
+        if said.verdict == entry.verdict:
+            said = uncertainty.apply_profile_interval(entry, found.interval, size)
+        return found, said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
     pairs = map_over_parameters_at_optimum(one, problem, view.x, wanted, progress)
@@ -317,7 +304,8 @@ class _Sensitivities:
         """Correlations of the parameters, NaN for parameters without information."""
         own = covariance[np.ix_(self.chosen, self.chosen)]
         std = np.sqrt(np.diag(own))
-        most = MIN_RELATIVE_STD_TAKEN_AS_INFINITE * np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
+        largest = np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
+        most = uncertainty.MIN_RELATIVE_STD_TAKEN_AS_INFINITE * largest
         std = np.where(std < most, std, np.nan)
         return np.asarray(own / np.outer(std, std))
 
@@ -334,7 +322,7 @@ def _orthogonal_part(columns: Array, explained: Array) -> Array:
 def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, ...]:
     """Parameters and combinations without information, then informed directions; least observable first."""
     relative, count = view.relative, len(view.names)
-    hidden = view.alone * MAX_WEAK_RELATIVE_STD < 1.0
+    hidden = view.alone * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0
     found = [
         _direction(view, np.eye(count)[i], f"{view.names[i]} is observed by no sensor") for i in np.flatnonzero(hidden)
     ]
@@ -343,7 +331,7 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
         _, singular, vectors = np.linalg.svd(relative[:, rest], full_matrices=False)
         sizes, wide = np.zeros(len(rest)), np.zeros((len(rest), count))
         sizes[: len(singular)], wide[: len(vectors), rest] = singular, vectors
-        blind = sizes * MAX_WEAK_RELATIVE_STD < 1.0
+        blind = sizes * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0
         if np.any(blind):
             # an orthonormal basis of the complement of the observable directions
             seen, left = wide[~blind][:, rest], np.zeros((int(blind.sum()), count))
@@ -359,7 +347,7 @@ def _direction(view: _Sensitivities, vector: Array, words: str) -> _ParameterDir
     size = float(np.linalg.norm(view.relative @ vector))
     std = 1.0 / size if size > 0 else math.inf
     components = dict(zip(view.names, map(float, vector), strict=True))
-    return _ParameterDirection(size, std, components, parameter_verdict(1.0, std), words)
+    return _ParameterDirection(size, std, components, uncertainty.parameter_verdict(1.0, std), words)
 
 
 def _sparse_basis(vectors: Array) -> list[Array]:
@@ -404,7 +392,7 @@ def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
 
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     parts = _components(view, vector)
-    if float(np.linalg.norm(view.by_alone @ vector)) * MAX_WEAK_RELATIVE_STD >= 1.0:
+    if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
         what = parts[0].name if len(parts) == 1 else "this: " + _combination_words(parts)
         return f"{what} cannot be separated from {_hiding_nuisances(view, vector)}"
     form = _combination(view, *parts) if len(parts) == 2 else None
@@ -419,8 +407,10 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     column = (view.by_alone @ vector)[:, None]
     for words, prefix in (("the unknown start", "start."), ("where the grasp sits", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
-        if at and np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at])) * MAX_WEAK_RELATIVE_STD < 1.0:
-            return words
+        if at:
+            remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
+            if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
+                return words
     return "the unknown start and where the grasp sits"
 
 
@@ -442,12 +432,12 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
     parts = sorted(_components(view, vector), key=lambda part: -abs(part.coefficient))
     own = float(std[view.names.index(parts[0].name)])
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
-    how = "is determined" if spread <= MAX_IDENTIFIABLE_RELATIVE_STD else "is determined only weakly"
+    how = "is determined" if spread <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD else "is determined only weakly"
     what, changes = parts[0].name, [f"{part.coefficient / parts[0].coefficient:.2g}" for part in parts]
     if len(parts) > 1:
         ratio = " : ".join([*changes[:_MAX_LISTED_NAMES], "..."][: len(parts)])
         what = f"a relative change of {_joined([part.name for part in parts])} in the ratio {ratio}"
-    return f"{what} {how} (± {percent_number_text(spread)} %)"
+    return f"{what} {how} (± {uncertainty.percent_number_text(spread)} %)"
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:

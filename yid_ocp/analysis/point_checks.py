@@ -12,12 +12,7 @@ import casadi as ca
 import numpy as np
 import scipy.interpolate
 
-from yid_ocp.analysis.clock_checks import (
-    PositionsAtTimesFunction,
-    point_clock_offset_and_drift,
-    robot_held_point_clock_issues,
-    timestamp_correction_advice,
-)
+from yid_ocp.analysis import clock_checks
 from yid_ocp.analysis.joint_checks import RecordedJointsModel, known_effect_config_line
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import Issue, median_sample_period
@@ -86,7 +81,7 @@ def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, op
         path = scipy.interpolate.CubicSpline(dense, arm.frame_positions_and_jacobians(places, course(dense))[0], axis=0)
         allowed = max(_HELD_POINT_TOLERANCE, 5 * noise)
         if not error > allowed:
-            found = robot_held_point_clock_issues(joints, group, t, seen, by_angle, noise, path)
+            found = clock_checks.robot_held_point_clock_issues(joints, group, t, seen, by_angle, noise, path)
             yield from (replace(issue, recording=recording.name) for issue in found)
             continue
         changes = [
@@ -151,20 +146,20 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
 
 
 def _changed_times(
-    path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array
+    path: clock_checks.PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array
 ) -> Iterator[_Change]:
     """Corrections for points recorded earlier or later than the angles, or by a faster or slower clock."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
-    late, _, error = point_clock_offset_and_drift(path, knots, t, seen)
+    late, _, error = clock_checks.point_clock_offset_and_drift(path, knots, t, seen)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
         return
-    late, drift, error = point_clock_offset_and_drift(path, knots, t, seen, drifts=True)
+    late, drift, error = clock_checks.point_clock_offset_and_drift(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words = f"taken {late:+.3g} s from the joints, by a clock that runs {1e3 * drift:+.3g} parts per thousand fast,"
-        yield _Change("clock_drift", words, timestamp_correction_advice(late, drift, middle), error)
+        yield _Change("clock_drift", words, clock_checks.timestamp_correction_advice(late, drift, middle), error)
 
 
 def _changed_zeros(

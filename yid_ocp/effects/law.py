@@ -13,13 +13,7 @@ import numpy as np
 import scipy.interpolate
 
 from yid_ocp.arrays import Array
-from yid_ocp.effects.base import (
-    EffectBase,
-    ParameterDefinition,
-    arm_joint_names,
-    elastic_joints_within_segment,
-    flexible_segment_names,
-)
+from yid_ocp.effects import base
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.files import read_input_text
 from yid_ocp.model.kinematics import forward_kinematics
@@ -60,7 +54,7 @@ class TorqueLawTable:
 
 
 @dataclass(frozen=True)
-class TorqueLaw(EffectBase):
+class TorqueLaw(base.EffectBase):
     """Torque as a smooth function F = f(x) on an arm joint, or on every joint that bends a segment.
 
     x is the joint's own angle, speed, load or command, or the time since the start of the recording (an internal
@@ -131,8 +125,8 @@ def _spline_weights(count: int) -> Array:
 def _coordinate_indices(system: System, location: str) -> list[int]:
     """Indices of the coordinates on which a law at a location acts."""
     index = system.mechanism.joint_index
-    if location in flexible_segment_names(system):
-        springs = elastic_joints_within_segment(system, location)
+    if location in base.flexible_segment_names(system):
+        springs = base.elastic_joints_within_segment(system, location)
         bends = [spring for spring in springs if spring.deformation == "bend"]
         return [index(spring.joint_name) for spring in bends or springs]
     return [index(location)]
@@ -162,9 +156,9 @@ def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[st
 
     `load` needs a driven joint, `command` a servo.
     """
-    if location in flexible_segment_names(system):
+    if location in base.flexible_segment_names(system):
         return ("angle", "speed", "time")
-    if location not in arm_joint_names(system):
+    if location not in base.arm_joint_names(system):
         return ()
     driven = ("load",) if location in system.driven else ()
     return ("angle", "speed", *driven, *(("command",) if location in system.servos else ()), "time")
@@ -189,25 +183,15 @@ def torque_law_quantity_values_along_rollout(
     internal = system.effect_internal_coordinate_symbols
     sizes = {"q": n, "v": n, "z": len(internal), "u": len(system.driven), "lam": system.n_constraints}
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    kinematics = forward_kinematics(system.mechanism, symbols["q"])
+    midpoint, v, z, u, lam = symbols.values()
+    kinematics = forward_kinematics(system.mechanism, midpoint)
     rows = {name: i for i, name in enumerate(internal)}
-    state = MidpointStateSymbols(
-        system,
-        kinematics,
-        symbols["q"],
-        symbols["v"],
-        symbols["z"],
-        symbols["z"],
-        symbols["u"],
-        symbols["lam"],
-        rows,
-        ca.SX(h),
-    )
+    state = MidpointStateSymbols(system, kinematics, midpoint, v, z, z, u, lam, rows, ca.SX(h))
     wanted = ca.vertcat(*(_quantity(quantity, state, "", index) for index in at))
-    wanted = ca.substitute(wanted, ca.vertcat(*internal.values()), symbols["z"]) if internal else wanted
+    wanted = ca.substitute(wanted, ca.vertcat(*internal.values()), z) if internal else wanted
     function = ca.Function("quantity", [*symbols.values(), system.parameters.symbols], [wanted])
-    z = nodes["state"][:-1, 2 * n :]
-    inputs = ((q[1:] + q[:-1]) / 2, np.diff(q, axis=0) / h, z, nodes["torque"], nodes["multipliers"] / h)
+    before = nodes["state"][:-1, 2 * n :]
+    inputs = ((q[1:] + q[:-1]) / 2, np.diff(q, axis=0) / h, before, nodes["torque"], nodes["multipliers"] / h)
     columns = [own.T if own.shape[1] else ca.DM(0, len(own)) for own in inputs]
     values = np.asarray(function.map(len(q) - 1)(*columns, np.tile(theta[:, None], len(q) - 1)), float).T
     if quantity == "command":
@@ -225,7 +209,7 @@ def torque_law_from_tables(
     """
     label, possible = f"law@{location}", allowed_torque_law_quantity_names(system, location)
     if not possible:
-        places = (*flexible_segment_names(system), *arm_joint_names(system))
+        places = (*base.flexible_segment_names(system), *base.arm_joint_names(system))
         what, choice = f"there is no location '{location}' for a law", unknown_name_error_arguments(location, places)
         raise ConfigError(what, where=label, **choice)
     definitions, entries = [], []
@@ -236,7 +220,7 @@ def torque_law_from_tables(
         for k, (at, torque) in enumerate(zip(table.knots, table.torque, strict=True)):
             said = f"torque at {at:.4g} {TORQUE_LAW_QUANTITY_UNITS[table.quantity]}"
             name, size = f"{table.quantity}{k}", min(torque_scale, 1e6)
-            definitions.append(ParameterDefinition(name, "N m", 0.0, -math.inf, math.inf, (-size, size), said))
+            definitions.append(base.ParameterDefinition(name, "N m", 0.0, -math.inf, math.inf, (-size, size), said))
             entries.append(Parameter(f"{label}.{name}", float(torque), "N m", description=said))
     inner = {f"{label}.time": ca.SX.sym(f"{label}.time")} if any(t.quantity == "time" for t in tables) else {}
     knots = {table.quantity: np.asarray(table.knots, float) for table in tables}

@@ -15,16 +15,7 @@ import numpy as np
 from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_bodies, rpy_from_rotation
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import mechanism_to_urdf
-from yid_ocp.virtual.mjcf import (
-    MUJOCO_APPROXIMATED_ASPECTS,
-    ExpressionEvaluator,
-    JointDynamicsTerms,
-    effect_joint_terms_and_changed_aspects,
-    format_elements,
-    format_xml_numbers,
-    model_aspects_depending_on_symbols,
-    system_joint_dynamics_terms,
-)
+from yid_ocp.virtual import mjcf
 
 EXPORT_MANIFEST_FORMAT = "yid-export/1"
 _SupportStatus = Literal["native", "emulated", "not representable"]
@@ -41,14 +32,14 @@ def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
     root = ElementTree.fromstring(mechanism_to_urdf(tree))
     sizes = {"boundmass": _MIN_LINK_MASS, "boundinertia": _MIN_LINK_INERTIA}
     mujoco = Element("mujoco")
-    limits = {key: format_xml_numbers([value]) for key, value in sizes.items()}
+    limits = {key: mjcf.format_xml_numbers([value]) for key, value in sizes.items()}
     SubElement(mujoco, "compiler", {**limits, "fusestatic": "false"})
     root.insert(0, mujoco)
     for joint in root.findall("joint"):
         own = terms.get(joint.get("name", ""))
         if own is not None and joint.get("type") != "fixed":
             sizes = {"damping": own.damping, "friction": own.dry_friction}
-            SubElement(joint, "dynamics", {key: format_xml_numbers([value]) for key, value in sizes.items()})
+            SubElement(joint, "dynamics", {key: mjcf.format_xml_numbers([value]) for key, value in sizes.items()})
     return _xml_text(root)
 
 
@@ -57,11 +48,12 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
-    SubElement(world, "gravity").text = format_xml_numbers(ExpressionEvaluator(system, values)(system.gravity))
+    gravity = mjcf.ExpressionEvaluator(system, values)(system.gravity)
+    SubElement(world, "gravity").text = mjcf.format_xml_numbers(gravity)
     model = SubElement(world, "model", name="model")
     for i, joint in enumerate(tree.joints):
         _sdf_link(model, tree, i)
-        _sdf_joint(model, tree, joint, terms.get(joint.name, JointDynamicsTerms()))
+        _sdf_joint(model, tree, joint, terms.get(joint.name, mjcf.JointDynamicsTerms()))
     for name, frame in tree.frames.items():
         # frames of the world are placed in the model frame, which is at the world's origin
         attached = {} if frame.joint_index < 0 else {"attached_to": f"{tree.joints[frame.joint_index].name}_link"}
@@ -74,10 +66,10 @@ def _xml_text(root: Element) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, JointDynamicsTerms]]:
+def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, mjcf.JointDynamicsTerms]]:
     """The tree with numbers and without separate weights of bodies, and the dynamics of its joints."""
     tree = system.numeric_mechanism(values).with_gravity_fraction(None)
-    return tree, system_joint_dynamics_terms(system, ExpressionEvaluator(system, values))
+    return tree, mjcf.system_joint_dynamics_terms(system, mjcf.ExpressionEvaluator(system, values))
 
 
 def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
@@ -96,13 +88,13 @@ def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
     _add_numbers(SubElement(inertial, "inertia"), {key: tensor[at] for key, at in places.items()})
 
 
-def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynamicsTerms) -> None:
+def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: mjcf.JointDynamicsTerms) -> None:
     element = SubElement(model, "joint", name=joint.name, type=joint.kind)
     parent = "world" if joint.parent_index < 0 else f"{tree.joints[joint.parent_index].name}_link"
     for tag, text in (("parent", parent), ("child", f"{joint.name}_link")):
         SubElement(element, tag).text = text
     axis = SubElement(element, "axis")
-    SubElement(axis, "xyz").text = format_xml_numbers(joint.axis)
+    SubElement(axis, "xyz").text = mjcf.format_xml_numbers(joint.axis)
     limits = {key: getattr(joint, f"{key}_limit") for key in ("lower", "upper", "effort", "velocity")}
     _add_numbers(SubElement(axis, "limit"), {key: size for key, size in limits.items() if math.isfinite(size)})
     sizes = {"damping": terms.damping, "friction": terms.dry_friction}
@@ -113,13 +105,13 @@ def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynami
 
 def _sdf_pose(element: Element, placement: Placement, attributes: Mapping[str, str] | None = None) -> None:
     turn, at = np.array(ca.DM(placement.rotation)), np.array(ca.DM(placement.translation)).ravel()
-    text = format_xml_numbers([*at, *rpy_from_rotation(turn)])
+    text = mjcf.format_xml_numbers([*at, *rpy_from_rotation(turn)])
     SubElement(element, "pose", dict(attributes or {})).text = text
 
 
 def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
     for tag, value in values.items():
-        SubElement(element, tag).text = format_xml_numbers([value])
+        SubElement(element, tag).text = mjcf.format_xml_numbers([value])
 
 
 @dataclass(frozen=True)
@@ -142,16 +134,16 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
-    known = format_elements()[aspect]
+    known = mjcf.format_elements()[aspect]
     if aspect == "reading":
         return _READING
     if form not in known:
         return FeatureExportSupport("not representable", f"{form.upper()} has nothing for {known['is']}")
-    return FeatureExportSupport("emulated" if aspect in MUJOCO_APPROXIMATED_ASPECTS else "native", known[form])
+    return FeatureExportSupport("emulated" if aspect in mjcf.MUJOCO_APPROXIMATED_ASPECTS else "native", known[form])
 
 
 _READING = FeatureExportSupport(
-    "not representable", f"{format_elements()['reading']['is']}: correct the readings instead"
+    "not representable", f"{mjcf.format_elements()['reading']['is']}: correct the readings instead"
 )
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
 _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
@@ -159,7 +151,7 @@ _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
     """Support of the export format `form` (`mjcf`, `urdf` or `sdf`) for each effect of a system."""
-    value, found = ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
+    value, found = mjcf.ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
@@ -167,7 +159,7 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
         if amplitudes and all(theta[name] == neutral[name] for name in amplitudes):
             found[label] = _NEUTRAL
         else:
-            _, aspects = effect_joint_terms_and_changed_aspects(system, effect, value)
+            _, aspects = mjcf.effect_joint_terms_and_changed_aspects(system, effect, value)
             found[label] = _worst([_aspect_support(x, form) for x in sorted(aspects)])
     return found
 
@@ -178,7 +170,8 @@ def export_support_by_parameter(
     """Support of the export format `form` for each parameter. Parameters of an effect have its support in `effects`."""
     found = {}
     for entry in system.parameters:
-        owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_depending_on_symbols(system, entry.symbol))
-        parts = [_aspect_support(aspect, form) for aspect in aspects] or [_UNUSED]
+        owner = entry.name.rpartition(".")[0]
+        aspects = mjcf.model_aspects_depending_on_symbols(system, entry.symbol)
+        parts = [_aspect_support(aspect, form) for aspect in sorted(aspects)] or [_UNUSED]
         found[entry.name] = effects[owner] if owner in effects else _worst(parts)
     return found

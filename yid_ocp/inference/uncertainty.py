@@ -12,13 +12,8 @@ import scipy.special
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import Issue
+from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
-from yid_ocp.inference.null_test import (
-    DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-    channels_with_residual_indices,
-    residual_chi2_null_test,
-    residuals_exceed_noise,
-)
 from yid_ocp.problem.episodes import EpisodeAndPrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -95,7 +90,7 @@ class EstimateShiftByLinksAndTimeStep:
 def assess_goodness_of_fit(
     problem: EstimationProblem,
     evaluation: Evaluation,
-    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
+    limits: ExcessResidualCriteria = null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> GoodnessOfFit:
     """Test a fit on its own recordings. Residuals are in noise units for any weighting of the problem."""
     if not evaluation.ok:
@@ -107,10 +102,10 @@ def assess_goodness_of_fit(
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
                 parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
         residual = np.concatenate(parts)
-    series = channels_with_residual_indices(problem)
+    series = null_test.channels_with_residual_indices(problem)
     fitted = effective_parameter_count(problem, evaluation)
-    found = residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, fitted)
-    explains = not residuals_exceed_noise((found,), limits)
+    found = null_test.residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, fitted)
+    explains = not null_test.residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.no_data_issue_exceeds_warning)
 
 
@@ -214,7 +209,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     blocks: dict[tuple[str, int], list[IntArray]] = {}
     recordings: dict[str, list[IntArray]] = {}
     channels: list[list[IntArray]] = []
-    for series in channels_with_residual_indices(problem):
+    for series in null_test.channels_with_residual_indices(problem):
         channels.append([series.residual_indices])
         recordings.setdefault(series.recording, []).append(series.residual_indices)
         at = (series.t / length).astype(int)
@@ -420,7 +415,9 @@ def parameter_estimates(
         value, std, low, high, scale = (float(v[at]) for v in (x, spread, lower, upper, scales))
         std = std if std < MIN_RELATIVE_STD_TAKEN_AS_INFINITE * max(abs(value), scale) else math.inf
         near = _AT_BOUND_FRACTION * scale
-        side = (-1 if value - low <= near else 1 if high - value <= near else 0) if known else 0
+        side = 0  # -1 at the lower bound, 1 at the upper
+        if known and min(value - low, high - value) <= near:
+            side = -1 if value - low <= near else 1
         explains = fit is None or (fit.explains and fit.believed)
         said = parameter_verdict(value, std, scale=sizes[entry.name], explains=explains, at_bound=side != 0)
         interval = None
@@ -480,7 +477,7 @@ def finite_or_none(value: float) -> float | None:
 
 def percent_number_text(part: float) -> str:
     """Format a fraction as a percentage with two digits, without exponents below 10000 %."""
-    return f"{100 * part:.2g}" if 100 * part < 99.5 else f"{100 * part:.0f}" if part < 100 else f"{100 * part:.2g}"
+    return f"{100 * part:.0f}" if 100 * part >= 99.5 and part < 100 else f"{100 * part:.2g}"
 
 
 def interval_text(lower: float | None, upper: float | None) -> str:

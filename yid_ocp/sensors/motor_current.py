@@ -10,21 +10,12 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.model.system import NodeStateSymbols
-from yid_ocp.sensors.base import (
-    CHANNEL_KINDS,
-    SENSOR_READERS,
-    RecordedChannelKind,
-    RecordedExtraSensor,
-    SensorData,
-    SensorDataInputs,
-    expand_to_joint_values,
-    missing_noise_level_error,
-)
+from yid_ocp.sensors import base
 from yid_ocp.sensors.joints import JointSensor, filtered_effort_measurements
 
 _TORQUE_CONSTANT = "torque_constant"
-_CURRENT = CHANNEL_KINDS.register("motors.current")(
-    RecordedChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
+_CURRENT = base.CHANNEL_KINDS.register("motors.current")(
+    base.RecordedChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
 )
 
 
@@ -49,13 +40,13 @@ class _MotorCurrentSensor(JointSensor):
         return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
 
 
-@SENSOR_READERS.register("motors.current")
-def _read_motor_currents(around: SensorDataInputs) -> list[SensorData]:
+@base.SENSOR_READERS.register("motors.current")
+def _read_motor_currents(around: base.SensorDataInputs) -> list[base.SensorData]:
     groups = (group for group in around.recording.channel_groups if _CURRENT.matches_group_name(group.name))
     return [found for group in groups if (found := _currents(around, group)) is not None]
 
 
-def _currents(around: SensorDataInputs, group: RecordedExtraSensor) -> SensorData | None:
+def _currents(around: base.SensorDataInputs, group: base.RecordedExtraSensor) -> base.SensorData | None:
     key, where = f"{group.name}.{_CURRENT.quantity}", f"recording '{around.recording.name}': {group.name}"
     choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
     if choice.use is False or not names or around.recording.joints is None:
@@ -72,9 +63,9 @@ def _currents(around: SensorDataInputs, group: RecordedExtraSensor) -> SensorDat
         hint = f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}}"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     if std is None:
-        raise missing_noise_level_error("the motor currents", where, key, "A")
+        raise base.missing_noise_level_error("the motor currents", where, key, "A")
     by_joint = [
-        expand_to_joint_values(given, group.names, names, f"sensors.{key}.{setting}")
+        base.expand_to_joint_values(given, group.names, names, f"sensors.{key}.{setting}")
         for given, setting in ((constants, "constants"), (std, "std"), (bias, "bias_std"))
     ]
     if not np.all(by_joint[0] != 0):

@@ -12,18 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.model.system import NodeStateSymbols
-from yid_ocp.sensors.base import (
-    CHANNEL_KINDS,
-    SENSOR_READERS,
-    RecordedChannelKind,
-    RecordedExtraSensor,
-    Sensor,
-    SensorData,
-    SensorDataInputs,
-    expand_to_joint_values,
-    missing_noise_level_error,
-    sensor_reading_function,
-)
+from yid_ocp.sensors import base
 from yid_ocp.sensors.joints import (
     JOINT_POSITION_GROUP_NAME,
     is_noise_std_stated,
@@ -35,7 +24,7 @@ _Kind = TypeVar("_Kind", bound="MountedSensor")
 
 
 @dataclass(frozen=True)
-class MountedSensor(Sensor):
+class MountedSensor(base.Sensor):
     """Base class of sensors mounted on frames. Each sensor has three components along its frame's axes."""
 
     naive_prediction: ClassVar = "stays"
@@ -60,11 +49,11 @@ class MountedSensor(Sensor):
 
 def register_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
     """Register the reader of a kind of mounted sensor, which makes one `SensorData` per recorded group."""
-    SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
+    base.SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
     return kind
 
 
-def _read_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[SensorData]:
+def _read_sensors(around: base.SensorDataInputs, kind: type[MountedSensor]) -> list[base.SensorData]:
     channel, found = kind.channel, []
     for group in around.recording.channel_groups:
         key = f"{group.name}.{channel.quantity}"
@@ -74,7 +63,9 @@ def _read_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[S
     return found
 
 
-def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: RecordedExtraSensor, key: str) -> SensorData:
+def _measured(
+    around: base.SensorDataInputs, kind: type[MountedSensor], group: base.RecordedExtraSensor, key: str
+) -> base.SensorData:
     choice, tree = around.sensor_usage(key), around.system.mechanism
     where, channel, names = f"{around.recording.name}: {group.name}", kind.channel, group.names
     frames = tuple(choice.frame_by_recorded_name.get(name, name) for name in names)
@@ -89,13 +80,13 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in channel.std_attribute_names]
     std = stated[0] if choice.std is None else choice.std
     if std is None:
-        raise missing_noise_level_error(channel.quantity, where, key, channel.unit)
+        raise base.missing_noise_level_error(channel.quantity, where, key, channel.unit)
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
     by_output = [
-        np.repeat(expand_to_joint_values(given, names, names, f"sensors.{key}.{setting}"), 3)
+        np.repeat(base.expand_to_joint_values(given, names, names, f"sensors.{key}.{setting}"), 3)
         for given, setting in ((std, "std"), (bias, "bias_std"))
     ]
-    signs = expand_to_joint_values(choice.constants.get("sign", 1.0), names, names, f"sensors.{key}.constants")
+    signs = base.expand_to_joint_values(choice.constants.get("sign", 1.0), names, names, f"sensors.{key}.constants")
     if not np.all(np.abs(signs) == 1):
         what = f"the sign of {key} is {', '.join(f'{sign:g}' for sign in signs)}"
         raise DataError(what, where=f"sensors.{key}.constants.sign", allowed="1 or -1")
@@ -107,16 +98,16 @@ def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: Record
         last = around.node_times[list(inner)]
         kept = (group.t >= last[0] - 1e-9) & (group.t <= last[1] + 1e-9)
         own = np.broadcast_to(by_output[0], values[kept].shape)
-        return SensorData(sensor, group.t[kept], values[kept], own, inner, by_output[1])
+        return base.SensorData(sensor, group.t[kept], values[kept], own, inner, by_output[1])
     nodes, measured = nodes_and_decorrelated_values(around, group.t, values, key, like_path=True)
     times, period = around.node_times[nodes], float(np.median(np.diff(group.t)))
     own = by_output[0] * around.path_filter.noise_gains_of_value_and_rates(period)[0]
     total, correlation = _with_encoder_noise(around, sensor, own, times)
-    return SensorData(sensor, times, measured, total, inner, by_output[1], correlation)
+    return base.SensorData(sensor, times, measured, total, inner, by_output[1], correlation)
 
 
 def _with_encoder_noise(
-    around: SensorDataInputs, sensor: MountedSensor, own: Array, times: Array
+    around: base.SensorDataInputs, sensor: MountedSensor, own: Array, times: Array
 ) -> tuple[Array, Array | None]:
     """Noise std (M, k) and correlation (M, k, k) of smoothed readings that are predicted from noisy encoders.
 
@@ -135,7 +126,7 @@ def _with_encoder_noise(
     columns = [joints.names.index(name) for name in names]
     q = np.zeros((len(times), n))
     q[:, at] = np.stack([np.interp(times, joints.t, joints.position[:, column]) for column in columns], axis=1)
-    function = sensor_reading_function(system, sensor, ())
+    function = base.sensor_reading_function(system, sensor, ())
     symbols = [ca.SX.sym(name, function.size1_in(name)) for name in ("q", "theta")]
     slopes = function(q=symbols[0], theta=symbols[1])
     gains = around.path_filter.noise_gains_of_value_and_rates(float(np.median(np.diff(joints.t))))
@@ -152,11 +143,11 @@ def _with_encoder_noise(
 
 
 _XYZ = ("x", "y", "z")
-_ANGULAR_VELOCITY = CHANNEL_KINDS.register("imu.angular_velocity")(
-    RecordedChannelKind("imu", "angular_velocity", "rad/s", _XYZ)
+_ANGULAR_VELOCITY = base.CHANNEL_KINDS.register("imu.angular_velocity")(
+    base.RecordedChannelKind("imu", "angular_velocity", "rad/s", _XYZ)
 )
-_SPECIFIC_FORCE = CHANNEL_KINDS.register("imu.specific_force")(
-    RecordedChannelKind("imu", "specific_force", "m/s^2", _XYZ)
+_SPECIFIC_FORCE = base.CHANNEL_KINDS.register("imu.specific_force")(
+    base.RecordedChannelKind("imu", "specific_force", "m/s^2", _XYZ)
 )
 
 

@@ -12,24 +12,14 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols
-from yid_ocp.sensors.base import (
-    CHANNEL_KINDS,
-    SENSOR_READERS,
-    RecordedChannelKind,
-    RecordedPointGroup,
-    Sensor,
-    SensorData,
-    SensorDataInputs,
-    SensorOptions,
-    missing_noise_level_error,
-)
+from yid_ocp.sensors import base
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
-_POINTS = CHANNEL_KINDS.register("points")(RecordedChannelKind("points", "position", "m", ("x", "y", "z")))
+_POINTS = base.CHANNEL_KINDS.register("points")(base.RecordedChannelKind("points", "position", "m", ("x", "y", "z")))
 
 
 @dataclass(frozen=True)
-class PointSensor(Sensor):
+class PointSensor(base.Sensor):
     """Sensor of the world positions of named frames [m], such as motion capture or a camera."""
 
     channel = _POINTS
@@ -50,13 +40,15 @@ class PointSensor(Sensor):
         return ca.vertcat(*(state.kinematics.frame_position(frame) for frame in self.frame_names))
 
 
-@SENSOR_READERS.register("points")
-def _read_point_groups(around: SensorDataInputs) -> list[SensorData]:
+@base.SENSOR_READERS.register("points")
+def _read_point_groups(around: base.SensorDataInputs) -> list[base.SensorData]:
     groups = ((group, around.sensor_usage(group.name)) for group in around.recording.points)
     return [_points(around, group, choice) for group, choice in groups if choice.use is not False]
 
 
-def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorOptions) -> SensorData:
+def _points(
+    around: base.SensorDataInputs, group: base.RecordedPointGroup, choice: base.SensorOptions
+) -> base.SensorData:
     where = f"recording '{around.recording.name}': {group.name}"
     wanted = choice.used_points if choice.used_points is not None else group.names
     frames = {p: choice.frame_by_recorded_name.get(p, p) for p in wanted}
@@ -89,14 +81,14 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
     elif group.std is not None:
         std = group.std[inside][:, columns].reshape(value.shape)
     else:
-        raise missing_noise_level_error(f"group '{group.name}'", where, group.name, "m")
+        raise base.missing_noise_level_error(f"group '{group.name}'", where, group.name, "m")
     sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), measuring_camera_pose(group))
     change = _clock_offset_std(around, sensor, group, choice) * _rates(group.t[inside], value)
-    return SensorData(sensor, group.t[inside], value, std, change_by_clock=change if np.any(change) else None)
+    return base.SensorData(sensor, group.t[inside], value, std, change_by_clock=change if np.any(change) else None)
 
 
 def _clock_offset_std(
-    around: SensorDataInputs, sensor: PointSensor, group: RecordedPointGroup, choice: SensorOptions
+    around: base.SensorDataInputs, sensor: PointSensor, group: base.RecordedPointGroup, choice: base.SensorOptions
 ) -> float:
     """Standard deviation of the clock's offset [s]: stated, recorded, or half a sample unless an effect delays it."""
     stated = group.clock_offset_std if choice.clock_offset_std is None else choice.clock_offset_std
@@ -119,7 +111,7 @@ def _rates(t: Array, values: Array) -> Array:
     return rates
 
 
-def measuring_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
+def measuring_camera_pose(group: base.RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
     """Pose (4, 4) of the camera that measured a point group. None if no camera measured it.
 
     A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Without a pose, the camera is

@@ -23,15 +23,7 @@ from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, unknowns_covariance
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EvaluateFunction, Evaluation
-from yid_ocp.solvers.base import (
-    SOLVERS,
-    AcceptedIterateRecorder,
-    Iterate,
-    IterationCallback,
-    SolverResult,
-    SolverWithCheckedSettings,
-    Status,
-)
+from yid_ocp.solvers import base
 
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
@@ -44,9 +36,9 @@ _PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = 20, 0.05, 0
 _LOWEST = "the cost cannot be lowered any further"
 
 
-@SOLVERS.register("gauss_newton")
+@base.SOLVERS.register("gauss_newton")
 @dataclass(frozen=True)
-class GaussNewton(SolverWithCheckedSettings):
+class GaussNewton(base.SolverWithCheckedSettings):
     """Gauss-Newton method with bounded, damped linear least-squares steps on the cost 1/2 |r(x)|^2.
 
     Each iteration solves min |J d + r|^2 + mu |d/s|^2 for the step d, subject to lower <= x + d <= upper, with the
@@ -82,19 +74,19 @@ class GaussNewton(SolverWithCheckedSettings):
         self,
         problem: EstimationProblem,
         start: Array,
-        callback: IterationCallback | None,
+        callback: base.IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
-    ) -> SolverResult:
+    ) -> base.SolverResult:
         """Minimize the cost from `start` by Gauss-Newton steps. `evaluate` replaces `problem.evaluate`."""
         evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
-        recorder, x = AcceptedIterateRecorder(callback), start.copy()
+        recorder, x = base.AcceptedIterateRecorder(callback), start.copy()
         now = evaluate(x)
         recorder.n_evaluations += 1
         if not now.ok or now.jacobian is None:
-            return recorder.solver_result_with_iterates(Status.FAILED, now.message, x)
+            return recorder.solver_result_with_iterates(base.Status.FAILED, now.message, x)
 
-        def ended(status: Status, message: str) -> SolverResult:
+        def ended(status: base.Status, message: str) -> base.SolverResult:
             made = recorder.solver_result_with_iterates(status, message, x, now.equilibrium_guesses)
             return replace(made, evaluation=now)
 
@@ -110,10 +102,11 @@ class GaussNewton(SolverWithCheckedSettings):
                 if saved is not None:
                     last = f"the last {_PATIENCE_STEPS} steps lowered the cost by {saved:.2g} together"
                     message = f"{last} and moved nothing by a tenth of its standard deviation"
-                    return replace(ended(Status.CONVERGED, message), stopped_at_noise_level=True)
+                    return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
-                remedy = "raise solver.max_iterations or free fewer parameters"
-                return ended(Status.ITERATION_LIMIT, f"no convergence in {self.max_iterations} iterations; {remedy}")
+                message = f"no convergence in {self.max_iterations} iterations; "
+                message += "raise solver.max_iterations or free fewer parameters"
+                return ended(base.Status.ITERATION_LIMIT, message)
             # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
@@ -122,7 +115,7 @@ class GaussNewton(SolverWithCheckedSettings):
             promised = predicted_cost_reduction(jacobian, residual, step)
             # damping makes any step promise little
             if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary_point(problem, x, now):
-                return ended(Status.CONVERGED, _LOWEST)
+                return ended(base.Status.CONVERGED, _LOWEST)
             trial = evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
             recorder.n_evaluations += 1
             gain = (now.cost - trial.cost) / promised if trial.ok and promised > 0 else -1.0
@@ -134,7 +127,7 @@ class GaussNewton(SolverWithCheckedSettings):
                 if moved < self.step_tolerance and now.jacobian is not None and is_stationary_point(problem, x, now):
                     slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
                     recorder.record_iterate(now.cost, x, slope)
-                    return ended(Status.CONVERGED, "the step is below its tolerance")
+                    return ended(base.Status.CONVERGED, "the step is below its tolerance")
                 continue
             # the parabola through both costs with the slope of the first has its minimum at this fraction of the step
             slope = float(residual @ (jacobian @ step))
@@ -143,9 +136,10 @@ class GaussNewton(SolverWithCheckedSettings):
             rejected, mu = True, max(mu, _MIN_REJECTED_DAMPING)
             if np.max(np.abs(scaled)) < self.step_tolerance:
                 if is_stationary_point(problem, x, now):
-                    return ended(Status.CONVERGED, _LOWEST)
-                reason = f"no step lowers the cost ({trial.message or 'the linear model does not hold'})"
-                return ended(Status.STALLED, f"{reason}; start nearer, shorten the recording, or use multiple_shooting")
+                    return ended(base.Status.CONVERGED, _LOWEST)
+                message = f"no step lowers the cost ({trial.message or 'the linear model does not hold'}); "
+                message += "start nearer, shorten the recording, or use multiple_shooting"
+                return ended(base.Status.STALLED, message)
 
 
 def _step_within_length(
@@ -162,7 +156,7 @@ def _step_within_length(
         mu *= 3.0
 
 
-def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluation) -> float | None:
+def _saved(problem: EstimationProblem, history: Sequence[base.Iterate], now: Evaluation) -> float | None:
     """Decrease of the cost over the last steps together if it is negligible, else None."""
     if len(history) <= _PATIENCE_STEPS:
         return None
@@ -176,9 +170,9 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
     return saved if np.all(np.abs(last.x - before.x) <= _NEGLIGIBLE_MOVE_STDS * std) else None
 
 
-@SOLVERS.register("single_shooting")
+@base.SOLVERS.register("single_shooting")
 @dataclass(frozen=True)
-class SingleShooting(SolverWithCheckedSettings):
+class SingleShooting(base.SolverWithCheckedSettings):
     """Single shooting with SciPy's L-BFGS-B on unknowns scaled to order one.
 
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
@@ -191,15 +185,15 @@ class SingleShooting(SolverWithCheckedSettings):
     name: ClassVar[str] = "single_shooting"
 
     def minimize_cost(
-        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
-    ) -> SolverResult:
+        self, problem: EstimationProblem, start: Array, callback: base.IterationCallback | None
+    ) -> base.SolverResult:
         """Minimize the problem's cost from `start` by L-BFGS-B."""
         (lower, upper), scale = problem.bounds, problem.unknown_scales
-        recorder = AcceptedIterateRecorder(callback)
+        recorder = base.AcceptedIterateRecorder(callback)
         cost, gradient, first = problem.cost_and_gradient(start)
         recorder.n_evaluations += 1
         if not first.ok:
-            return recorder.solver_result_with_iterates(Status.FAILED, first.message, start)
+            return recorder.solver_result_with_iterates(base.Status.FAILED, first.message, start)
         unit, warm = max(cost, 1e-300), first.equilibrium_guesses
         seen: dict[bytes, tuple[float, Array]] = {start.tobytes(): (cost, gradient)}
 
@@ -226,13 +220,13 @@ class SingleShooting(SolverWithCheckedSettings):
             function, start / scale, jac=True, method="L-BFGS-B", bounds=bounds, callback=accepted, options=options
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
-        status = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(result.status, Status.STALLED)
+        status = {0: base.Status.CONVERGED, 1: base.Status.ITERATION_LIMIT}.get(result.status, base.Status.STALLED)
         return recorder.solver_result_with_iterates(status, str(result.message).lower(), best.x, warm)
 
 
-@SOLVERS.register("steepest_descent")
+@base.SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
-class SteepestDescent(SolverWithCheckedSettings):
+class SteepestDescent(base.SolverWithCheckedSettings):
     """Projected steepest descent with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
 
     The gradient g comes from the adjoint method and is not scaled, as in the paper (Caldwell et al. 2014). The first
@@ -264,16 +258,16 @@ class SteepestDescent(SolverWithCheckedSettings):
     name: ClassVar[str] = "steepest_descent"
 
     def minimize_cost(
-        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
-    ) -> SolverResult:
+        self, problem: EstimationProblem, start: Array, callback: base.IterationCallback | None
+    ) -> base.SolverResult:
         """Minimize the problem's cost from `start` by projected steepest descent."""
-        (lower, upper), recorder, x = problem.bounds, AcceptedIterateRecorder(callback), start.copy()
+        (lower, upper), recorder, x = problem.bounds, base.AcceptedIterateRecorder(callback), start.copy()
         cost, gradient, evaluation = problem.cost_and_gradient(x)
         recorder.n_evaluations += 1
         if not evaluation.ok:
-            return recorder.solver_result_with_iterates(Status.FAILED, evaluation.message, x)
+            return recorder.solver_result_with_iterates(base.Status.FAILED, evaluation.message, x)
 
-        def ended(status: Status, message: str) -> SolverResult:
+        def ended(status: base.Status, message: str) -> base.SolverResult:
             best = min(recorder.history, key=lambda entry: entry.cost)
             return recorder.solver_result_with_iterates(status, message, best.x, evaluation.equilibrium_guesses)
 
@@ -285,7 +279,7 @@ class SteepestDescent(SolverWithCheckedSettings):
             recorder.record_iterate(cost, x, slope)
             reference = max(entry.cost for entry in recorder.history[-self.nonmonotone_memory :])
             if slope <= self.gradient_tolerance * max(cost, 1e-300):
-                return ended(Status.CONVERGED, "the projected gradient vanishes")
+                return ended(base.Status.CONVERGED, "the projected gradient vanishes")
             while True:
                 trial = np.clip(x - length * gradient, lower, upper)
                 attempt = problem.evaluate(trial, False, evaluation.equilibrium_guesses)
@@ -295,7 +289,7 @@ class SteepestDescent(SolverWithCheckedSettings):
                     break
                 length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
-                    return ended(Status.STALLED, "no step along the gradient lowers the cost")
+                    return ended(base.Status.STALLED, "no step along the gradient lowers the cost")
             moved, before, x = trial - x, gradient, trial
             cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
             length /= self.backtracking_factor
@@ -305,4 +299,4 @@ class SteepestDescent(SolverWithCheckedSettings):
         size = np.maximum(np.abs(x), problem.unknown_scales)
         recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, size))
         message = f"no convergence in {self.max_iterations} iterations, as is usual for this method; try gauss_newton"
-        return ended(Status.ITERATION_LIMIT, message)
+        return ended(base.Status.ITERATION_LIMIT, message)

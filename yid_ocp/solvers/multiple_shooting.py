@@ -23,27 +23,13 @@ from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.episodes import InitialStateWithSensitivity
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.solvers.base import (
-    SOLVERS,
-    AcceptedIterateRecorder,
-    IterationCallback,
-    SolverResult,
-    SolverWithCheckedSettings,
-    Status,
-    StopSearch,
-)
+from yid_ocp.solvers import base, symbolic_transcription
 from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, mean_square_residual_without_efforts
 from yid_ocp.solvers.nonlinear_program import (
     QUIET_NLPSOL_OPTIONS,
     HessianKind,
     NonlinearProgram,
     available_memory_bytes,
-)
-from yid_ocp.solvers.symbolic_transcription import (
-    MIN_HESSIAN_RIDGE,
-    check_no_effect_changes_inputs,
-    problem_unknowns_from_program,
-    transcribe,
 )
 
 log = logging.getLogger(__name__)
@@ -61,9 +47,9 @@ _MAX_TRUSTED_DAMPING, _STALLED_DAMPING = 0.1, 1e2
 _CLOSED_DEFECT = 1e-7
 
 
-@SOLVERS.register("multiple_shooting")
+@base.SOLVERS.register("multiple_shooting")
 @dataclass(frozen=True)
-class MultipleShooting(SolverWithCheckedSettings):
+class MultipleShooting(base.SolverWithCheckedSettings):
     """Multiple shooting, which minimises 1/2 |r|^2 over parameters and node states under the equations of motion.
 
     IPOPT solves the program of `transcribe`, whose constraints are the discrete Euler-Lagrange equations of every step.
@@ -116,11 +102,11 @@ class MultipleShooting(SolverWithCheckedSettings):
         return not self.condensing
 
     def minimize_cost(
-        self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
-    ) -> SolverResult:
+        self, problem: EstimationProblem, start: Array, callback: base.IterationCallback | None
+    ) -> base.SolverResult:
         """Minimize the problem's cost from `start` by IPOPT or condensed Gauss-Newton steps."""
         if self.condensing:
-            return self._by_condensing(problem, start, AcceptedIterateRecorder(callback))
+            return self._by_condensing(problem, start, base.AcceptedIterateRecorder(callback))
         told: tuple[str, ...] = ()
         if self.hessian not in ("gauss_newton", "exact"):
             hint = "use hessian: gauss_newton"
@@ -134,10 +120,12 @@ class MultipleShooting(SolverWithCheckedSettings):
             told = f"node_interval = {self.node_interval} without condensing", "node_interval", "1", hint
         if told:
             raise SolverError(told[0], where=f"solver.{told[1]}", allowed=told[2], hint=told[3])
-        return self._by_ipopt(problem, start, AcceptedIterateRecorder(callback))
+        return self._by_ipopt(problem, start, base.AcceptedIterateRecorder(callback))
 
-    def _by_ipopt(self, problem: EstimationProblem, start: Array, recorder: AcceptedIterateRecorder) -> SolverResult:
-        program = transcribe(problem, start)
+    def _by_ipopt(
+        self, problem: EstimationProblem, start: Array, recorder: base.AcceptedIterateRecorder
+    ) -> base.SolverResult:
+        program = symbolic_transcription.transcribe(problem, start)
         assert program.ridge is not None
         ridge = _AdaptiveRidge(program.ridge.scale, program.w.numel())
         program = replace(program, ridge=replace(program.ridge, factor=ridge))
@@ -146,12 +134,11 @@ class MultipleShooting(SolverWithCheckedSettings):
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
             message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
-            return recorder.solver_result_with_iterates(Status.FAILED, message + "gauss_newton", start)
+            return recorder.solver_result_with_iterates(base.Status.FAILED, message + "gauss_newton", start)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
         watch = _Watch(problem, program, functions, ridge, recorder)
-        solver = program.make_solver(
-            "ipopt", self.hessian, iteration_callback=watch, **self._solver_options(1.0 / watch.unit)
-        )
+        options = self._solver_options(1.0 / watch.unit)
+        solver = program.make_solver("ipopt", self.hessian, iteration_callback=watch, **options)
         w = np.array(solver(**program.solver_arguments)["x"]).ravel()
         if watch.stop_request is not None:
             raise watch.stop_request
@@ -161,8 +148,8 @@ class MultipleShooting(SolverWithCheckedSettings):
         status, message = self._ipopt_status(stats["return_status"], defect)
         n = problem.step.sizes["n"]
         warm = tuple(w[program.variables[f"q[{episode.name}]"].index[:n, 0]] for episode in problem.episodes)
-        x = problem_unknowns_from_program(problem, program, w)
-        return SolverResult(status, message, x, tuple(recorder.history), int(stats["n_call_nlp_g"]), warm)
+        x = symbolic_transcription.problem_unknowns_from_program(problem, program, w)
+        return base.SolverResult(status, message, x, tuple(recorder.history), int(stats["n_call_nlp_g"]), warm)
 
     def _solver_options(self, cost_factor: float) -> dict[str, Any]:
         told = {"max_iter": self.max_iterations, "tol": self.ipopt_tolerance, "mu_init": self.relative_mu_init}
@@ -179,28 +166,28 @@ class MultipleShooting(SolverWithCheckedSettings):
         }
         return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt_options}}
 
-    def _ipopt_status(self, returned: str, defect: float) -> tuple[Status, str]:
+    def _ipopt_status(self, returned: str, defect: float) -> tuple[base.Status, str]:
         closed = f"largest defect {defect:.1e}"
         if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
-            return Status.CONVERGED, f"IPOPT: {returned}, {closed}"
+            return base.Status.CONVERGED, f"IPOPT: {returned}, {closed}"
         if returned == "Maximum_Iterations_Exceeded":
             limit = f"IPOPT stopped after {self.max_iterations} iterations, {closed}"
-            return Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
-        return Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer, or use gauss_newton"
+            return base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
+        return base.Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer, or use gauss_newton"
 
     def _by_condensing(
-        self, problem: EstimationProblem, start: Array, recorder: AcceptedIterateRecorder
-    ) -> SolverResult:
+        self, problem: EstimationProblem, start: Array, recorder: base.AcceptedIterateRecorder
+    ) -> base.SolverResult:
         intervals = _ShootingIntervals(problem, self.node_interval or _CONDENSING_NODE_INTERVAL)
         x, nodes = intervals.initial_guess(start)
 
-        def ended(status: Status, message: str) -> SolverResult:
+        def ended(status: base.Status, message: str) -> base.SolverResult:
             return recorder.solver_result_with_iterates(status, message, x, intervals.equilibrium_guesses)
 
         recorder.n_evaluations += 1
         now = intervals.linearize(x, nodes)
         if isinstance(now, str):
-            return ended(Status.FAILED, now)
+            return ended(base.Status.FAILED, now)
         mu, filtered = 1e-4, _StepFilter(now)
         for _ in range(self.max_iterations):
             size = np.maximum(np.abs(x), problem.unknown_scales)
@@ -214,7 +201,7 @@ class MultipleShooting(SolverWithCheckedSettings):
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
             if moved < self.step_tolerance or flat:
                 if now.defect < _CLOSED_DEFECT:
-                    return ended(Status.CONVERGED, f"closed to {now.defect:.1e}")
+                    return ended(base.Status.CONVERGED, f"closed to {now.defect:.1e}")
                 # steps along uninformed directions would only increase the defects
                 step = np.zeros_like(step)
             slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
@@ -232,10 +219,10 @@ class MultipleShooting(SolverWithCheckedSettings):
             else:
                 if mu > _STALLED_DAMPING:
                     reason = trial if isinstance(trial, str) else "no step lowers the cost or closes the defects"
-                    return ended(Status.STALLED, f"{reason}; try more nodes, or gauss_newton")
+                    return ended(base.Status.STALLED, f"{reason}; try more nodes, or gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
         limit = f"no convergence in {self.max_iterations} iterations; largest defect {now.defect:.1e}"
-        return ended(Status.ITERATION_LIMIT, limit)
+        return ended(base.Status.ITERATION_LIMIT, limit)
 
 
 class _AdaptiveRidge(ca.Callback):
@@ -243,7 +230,7 @@ class _AdaptiveRidge(ca.Callback):
 
     def __init__(self, scale: Array, size: int) -> None:
         ca.Callback.__init__(self)
-        self.factor = MIN_HESSIAN_RIDGE
+        self.factor = symbolic_transcription.MIN_HESSIAN_RIDGE
         self._scale, self._change, self._size = scale, np.zeros(len(scale)), size
         self.construct("factor", {})
 
@@ -256,7 +243,7 @@ class _AdaptiveRidge(ca.Callback):
     def update(self, before: Array, after: Array) -> None:
         change = (after - before) / np.maximum(np.abs(after), self._scale)
         turned = float(change @ self._change) < 0
-        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, MIN_HESSIAN_RIDGE)
+        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, symbolic_transcription.MIN_HESSIAN_RIDGE)
         self._change = change
 
 
@@ -269,12 +256,12 @@ class _Watch(ca.Callback):
         program: NonlinearProgram,
         functions: ca.Function,
         ridge: _AdaptiveRidge,
-        recorder: AcceptedIterateRecorder,
+        recorder: base.AcceptedIterateRecorder,
     ) -> None:
         ca.Callback.__init__(self)
         self.recorder, self.best, self._ridge = recorder, program.initial_guess, ridge
         self._problem, self._program, self._functions = problem, program, functions
-        self.stop_request: StopSearch | None = None
+        self.stop_request: base.StopSearch | None = None
         cost = float(functions(program.initial_guess, program.parameter_values)[0])
         self.unit = max(cost, 0.5 * program.residual.numel() * problem.rms_noise_of_data_residuals**2)
         nw, ng = program.w.numel(), program.g.numel()
@@ -294,12 +281,12 @@ class _Watch(ca.Callback):
         at = self._program.ridge.index
         self._ridge.update(self.best[at], w[at])
         self.best = w
-        x = problem_unknowns_from_program(self._problem, self._program, w)
+        x = symbolic_transcription.problem_unknowns_from_program(self._problem, self._program, w)
         self.recorder.n_evaluations += 1
         note = "" if self.recorder.history else "start"
         try:
             self.recorder.record_iterate(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
-        except StopSearch as stop:
+        except base.StopSearch as stop:
             self.stop_request = stop  # IPOPT would replace it by its own error
             return [1]
         return [0]
@@ -356,7 +343,7 @@ class _ShootingIntervals:
     """Recordings cut at nodes into intervals, each rolled out from its node state, condensed onto the parameters."""
 
     def __init__(self, problem: EstimationProblem, node_interval: int) -> None:
-        check_no_effect_changes_inputs(problem, "multiple shooting")
+        symbolic_transcription.check_no_effect_changes_inputs(problem, "multiple shooting")
         self.problem, self.node_steps = problem, list[IntArray]()
         for episode in problem.episodes:
             steps = episode.grid.steps

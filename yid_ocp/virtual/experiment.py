@@ -20,13 +20,7 @@ from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo
-from yid_ocp.virtual.joint_motion import (
-    BAXTER_JOINT_NAMES_WITHOUT_SIDE,
-    MultisineMotion,
-    MultisineOptions,
-    grasping_joint_angles,
-    random_multisine_motion,
-)
+from yid_ocp.virtual import joint_motion
 from yid_ocp.virtual.mjcf import ExpressionEvaluator, import_mujoco
 from yid_ocp.virtual.mujoco_simulation import (
     InjectedSimulatorTerms,
@@ -53,7 +47,7 @@ def baxter_foam_y_system(arms: int) -> System:
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="arms", allowed="1 or 2")
     sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINT_NAMES_WITHOUT_SIDE]
+    names = [f"{side}_{joint}" for side in sides for joint in joint_motion.BAXTER_JOINT_NAMES_WITHOUT_SIDE]
     robot = read_urdf("package:baxter", joints=names)
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
     return System.build(robot, objects=[(foam_y_object(), None, None)], grasps=grasps, driven=names, damping=0.05)
@@ -121,7 +115,7 @@ class VirtualExperimentSettings:
     The noise of each sensor has its own random stream from `seed`, so removing a sensor changes no other noise.
     """
 
-    motion: MultisineMotion | None = None  # default: `random_multisine_motion` with `seed`
+    motion: joint_motion.MultisineMotion | None = None  # default: `random_multisine_motion` with `seed`
     initial_joint_angles: Mapping[str, float] | None = None  # [rad or m]; default: `grasping_joint_angles`
     simulation: SimulationOptions = field(default_factory=SimulationOptions)
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
@@ -145,9 +139,9 @@ def run_virtual_experiment(
     chosen = experiment or VirtualExperimentSettings()
     duration = chosen.simulation.duration
     posture = chosen.initial_joint_angles
-    posture = grasping_joint_angles(system, values) if posture is None else posture
-    excitation = MultisineOptions(duration=duration)
-    motion = chosen.motion or random_multisine_motion(
+    posture = joint_motion.grasping_joint_angles(system, values) if posture is None else posture
+    excitation = joint_motion.MultisineOptions(duration=duration)
+    motion = chosen.motion or joint_motion.random_multisine_motion(
         system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation
     )
     times = np.empty(0)

@@ -23,13 +23,7 @@ from numpy.typing import ArrayLike
 from yid_ocp import files
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, OutputError, unknown_name_error_arguments
-from yid_ocp.vision.frames import (
-    CameraIntrinsics,
-    FrameSequence,
-    PointColourArray,
-    import_open3d,
-    validated_camera_pose,
-)
+from yid_ocp.vision import frames
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
 _DEPTH_IMAGE_SUFFIX = ".png"
@@ -39,7 +33,7 @@ _PCD_POINT_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
 _MAX_FRAME_BYTES = 1 << 28  # largest size of one cloud or image
 
 
-_Cloud = tuple[Array, PointColourArray | None]
+_Cloud = tuple[Array, frames.PointColourArray | None]
 """Points in the file's unit, and their red, green and blue where it has them, both (N, 3)."""
 
 
@@ -90,7 +84,7 @@ def _read_xyz(path: Path) -> _Cloud:
 
 
 def _read_pcd(path: Path) -> _Cloud:
-    o3d = import_open3d()
+    o3d = frames.import_open3d()
     with path.open("rb") as file:
         declared = _PCD_POINT_COUNT.search(file.read(_PCD_HEADER_BYTES))
     if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
@@ -107,7 +101,7 @@ def _read_pcd(path: Path) -> _Cloud:
 
 def _read_depth_image(path: Path) -> Array:
     """A depth image (height, width) in the file's unit. `DataError` if it is not a grey 16-bit PNG."""
-    o3d = import_open3d()
+    o3d = frames.import_open3d()
     with files.check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
         head = file.read(24)  # the last eight bytes are a PNG's width and height
     files.check_max_input_numbers(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
@@ -212,7 +206,7 @@ _CAMERA_FILE_KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_uni
 
 def read_frame_folder(
     folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None
-) -> FrameSequence:
+) -> frames.FrameSequence:
     """Read a folder of point clouds or depth images as a frame sequence, one frame at a time.
 
     `camera.json` (`yid-frames/1`) holds `pose` (4x4), `frame` ("camera" or "world") and `unit` ("m" or "mm") of clouds,
@@ -227,7 +221,7 @@ def read_frame_folder(
         raise DataError("there is no such folder", where=str(path), allowed=allowed, hint="check the path")
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
-    camera = validated_camera_pose(head.get("pose") if pose is None else pose, where)
+    camera = frames.validated_camera_pose(head.get("pose") if pose is None else pose, where)
     scale = metres_per_unit(str(unit or head.get("unit", "m")), where)
     frame = head.get("frame", "camera")
     if frame not in ("camera", "world"):
@@ -246,15 +240,15 @@ def read_frame_folder(
         points = _read_cloud(file)[0] * scale
         return (points - camera[:3, 3]) @ camera[:3, :3] if frame == "world" else points
 
-    def colours(index: int) -> PointColourArray | None:
+    def colours(index: int) -> frames.PointColourArray | None:
         return None if names[index].lower().endswith(_DEPTH_IMAGE_SUFFIX) else _read_cloud(path / names[index], True)[1]
 
-    return FrameSequence(times, names, camera, load, intrinsics, str(path), colours)
+    return frames.FrameSequence(times, names, camera, load, intrinsics, str(path), colours)
 
 
-def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) -> None:
+def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike[str]) -> None:
     """Write a frame sequence as binary PLY clouds for `read_frame_folder`. Raises `OutputError`."""
-    path, o3d = files.make_folder(folder), import_open3d()
+    path, o3d = files.make_folder(folder), frames.import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):
         # float32 keeps 0.2 um at 2 m in half the space
@@ -297,7 +291,7 @@ def _read_camera(path: Path) -> dict[str, Any]:
     return head
 
 
-def _check_kinds(names: Sequence[str], folder: Path, intrinsics: CameraIntrinsics | None) -> None:
+def _check_kinds(names: Sequence[str], folder: Path, intrinsics: frames.CameraIntrinsics | None) -> None:
     known = (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)
     for name in names:
         kind = Path(name).suffix.lower()
@@ -310,10 +304,10 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: CameraIntrinsic
             raise DataError(what, where=str(folder / _CAMERA_FILE), allowed=allowed, hint=hint)
 
 
-def _intrinsics(entry: object, where: str) -> CameraIntrinsics | None:
+def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     if entry is None:
         return None
-    known = [f.name for f in fields(CameraIntrinsics)]
+    known = [f.name for f in fields(frames.CameraIntrinsics)]
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
@@ -323,8 +317,8 @@ def _intrinsics(entry: object, where: str) -> CameraIntrinsics | None:
     coefficients = entry.get("coefficients", ())
     if not isinstance(coefficients, (list, tuple)) or not all(type(k) in (int, float) for k in coefficients):
         raise DataError(f"the coefficients are {coefficients!r}", where=f"{where}: intrinsics", allowed="numbers")
-    model = str(entry.get("model", "plumb_bob"))
-    return CameraIntrinsics(int(width), int(height), fx, fy, cx, cy, model, tuple(float(k) for k in coefficients))
+    model, distortion = str(entry.get("model", "plumb_bob")), tuple(float(k) for k in coefficients)
+    return frames.CameraIntrinsics(int(width), int(height), fx, fy, cx, cy, model, distortion)
 
 
 def _number(value: object, name: str, where: str) -> float:

@@ -34,13 +34,7 @@ from yid_ocp.model.mechanism import Mechanism, homogeneous_transform, rotation_f
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.options import OptionInfo, PositiveFloat
-from yid_ocp.vision.frames import (
-    XTION_INTRINSICS,
-    CameraIntrinsics,
-    FrameSequence,
-    import_open3d,
-    validated_camera_pose,
-)
+from yid_ocp.vision import frames
 
 UrdfMeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
@@ -136,7 +130,7 @@ class ArticulatedSurfaces:
     """
 
     def __init__(self, mechanism: Mechanism, meshes: Mapping[int, TriangleMesh]) -> None:
-        o3d = import_open3d()
+        o3d = frames.import_open3d()
         self.part_joints = tuple(sorted(meshes))
         self._scenes, self._boxes = list[Any](), list[Array]()
         for mesh in (meshes[joint] for joint in self.part_joints):
@@ -203,7 +197,7 @@ class ArticulatedSurfaces:
         return distance, normal, owner
 
     def render_depth_incidence_and_part(
-        self, pinhole: CameraIntrinsics, pose: ArrayLike, q: ArrayLike
+        self, pinhole: frames.CameraIntrinsics, pose: ArrayLike, q: ArrayLike
     ) -> tuple[Array, Array, IntArray]:
         """Render noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
 
@@ -249,7 +243,7 @@ class ArticulatedSurfaces:
         return answer["t_hit"].numpy().astype(np.float64), answer["primitive_normals"].numpy()
 
     def _window(
-        self, pinhole: CameraIntrinsics, rotation: Array, origin: Array, part: int
+        self, pinhole: frames.CameraIntrinsics, rotation: Array, origin: Array, part: int
     ) -> tuple[slice, slice] | None:
         """Rows and columns of the image that can show a part."""
         seen = (np.array(list(product(*self._boxes[part].T))) - origin) @ rotation
@@ -265,7 +259,7 @@ class ArticulatedSurfaces:
 
 
 def _tensor(values: NDArray[Any]) -> Any:
-    return import_open3d().core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
+    return frames.import_open3d().core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
 
 
 def load_robot_meshes_by_joint(
@@ -290,7 +284,9 @@ def load_robot_meshes_by_joint(
         raise ModelError(what, where=str(path), allowed="a URDF file with links and joints", hint=hint) from error
     parts: dict[int, list[TriangleMesh]] = {}
     for link in robot.robot.links:
-        for shape in (link.visuals if kind == "visual" else link.collisions) if link.name in mechanism.frames else ():
+        if link.name not in mechanism.frames:
+            continue
+        for shape in link.visuals if kind == "visual" else link.collisions:
             geometry, origin = shape.geometry, np.eye(4) if shape.origin is None else np.asarray(shape.origin, float)
             tube = geometry.cylinder and (geometry.cylinder.radius, geometry.cylinder.length)
             mesh = _solid(geometry.box and geometry.box.size, tube, geometry.sphere and geometry.sphere.radius)
@@ -429,7 +425,7 @@ _PERIOD_JITTER = 0.25  # largest variation of a period, as a fraction of the mea
 class DepthCameraModel:
     """A structured-light depth camera with its noise and lost pixels. The defaults represent an Asus Xtion Pro Live."""
 
-    intrinsics: CameraIntrinsics = XTION_INTRINSICS
+    intrinsics: frames.CameraIntrinsics = frames.XTION_INTRINSICS
     baseline: float = 0.075  # between projector and camera, along x [m]
     # range of depths that it measures [m]
     min_depth: float = 0.8
@@ -515,7 +511,7 @@ class VirtualCameraTiming:
 class VirtualFramesWithTruth:
     """Frame sequence of a virtual camera, with the true times and configurations."""
 
-    sequence: FrameSequence
+    sequence: frames.FrameSequence
     capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
     true_configuration_at: Callable[[float], Array]  # function of time: configuration (n,)
 
@@ -539,7 +535,7 @@ def render_virtual_frames(
     In a scene with a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or
     `ModelError` if Open3D or an object is missing, a mesh is unreadable, or the pose is invalid.
     """
-    lens, pose = camera.sensor_model.intrinsics, validated_camera_pose(camera.pose, "sequence")
+    lens, pose = camera.sensor_model.intrinsics, frames.validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
     taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, np.asarray(q, float), axis=0)
@@ -556,5 +552,6 @@ def render_virtual_frames(
         rng = np.random.default_rng([camera.seed, index])
         return lens.points_from_depth(camera.sensor_model._simulate_depth_image(depth, cosine, rng))
 
-    made = FrameSequence(stamps, tuple(f"frame {i}" for i in range(len(taken))), pose, cloud, lens, "virtual camera")
+    names = tuple(f"frame {i}" for i in range(len(taken)))
+    made = frames.FrameSequence(stamps, names, pose, cloud, lens, "virtual camera")
     return VirtualFramesWithTruth(made, taken, lambda at: np.asarray(course(at)))

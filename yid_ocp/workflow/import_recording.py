@@ -14,14 +14,7 @@ from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, write_recording
 from yid_ocp.data.checks import recording_quality_issues
 from yid_ocp.data.merge import merge_recordings
-from yid_ocp.data.readers import preview_file, read_any, reader_option_names
-from yid_ocp.data.readers.base import (
-    MOTOR_CURRENT_UNITS,
-    JointPointAndUnitOptions,
-    convert_to_si_and_validate,
-    guess_units,
-    parse_quantity_units,
-)
+from yid_ocp.data.readers import base, preview_file, read_any, reader_option_names
 from yid_ocp.data.readers.csv import column_pattern
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
@@ -136,7 +129,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
 
 def recording_issue_lines(recording: Recording) -> list[str]:
     """Describe issues of a recording itself, such as units, clocks, few samples, no motion or channels."""
-    units, reasons = guess_units(recording)
+    units, reasons = base.guess_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
     said = [f"in doubt ({issue.certainty_word}): {issue.what}; {issue.advice}" for issue in found]
@@ -157,7 +150,7 @@ def _merged(
             raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint="leave it out")
     late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
     units = dict(options.get("units") or {})
-    if units.get("effort") in MOTOR_CURRENT_UNITS:
+    if units.get("effort") in base.MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}
     columns, matched = options.get("column_meanings") or {}, set[str]()
     parts = []
@@ -179,7 +172,7 @@ def _merged(
         raise DataError(what, where=", ".join(files), allowed=allowed, hint="rename one of them")
     parts = [replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)]
     merged = merge_recordings(parts, offsets)
-    return convert_to_si_and_validate(merged, ", ".join(files), JointPointAndUnitOptions(**late))
+    return base.convert_to_si_and_validate(merged, ", ".join(files), base.JointPointAndUnitOptions(**late))
 
 
 def recording_contents_summary(recording: Recording) -> dict[str, Any]:
@@ -208,7 +201,7 @@ def reader_options_from_arguments(arguments: argparse.Namespace) -> dict[str, An
     for key in (*_LISTS, *_MAPPINGS):
         if entries := _split(getattr(arguments, key)):
             options[key] = tuple(entries) if key in _LISTS else _pairs(entries, key)
-    units = parse_quantity_units(_split(arguments.units))
+    units = base.parse_quantity_units(_split(arguments.units))
     return options | ({"units": units} if units else {})
 
 

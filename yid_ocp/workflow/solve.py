@@ -10,13 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.estimation import (
-    FitWithOrWithoutCableMemory,
-    channels_worse_than_naive_prediction,
-    choose_cable_memory_fit,
-    prediction_errors_and_units,
-    solve,
-)
+from yid_ocp.analysis import estimation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByLinksAndTimeStep, covariance_to_dict
@@ -47,7 +41,7 @@ def run_solve(
         progress.begin_stage("building the model and its compiled step", ahead=20.0)
         problem = build_problem(run)
         log_iterate = _iterate_logger(problem, folder, progress, is_live)
-        solution = solve(problem, run.solver, callback=log_iterate, progress=progress)
+        solution = estimation.solve(problem, run.solver, callback=log_iterate, progress=progress)
         problem, checks = solution.problem or problem, solution.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
@@ -75,12 +69,12 @@ run_from_arguments = make_settings_command(run_solve, "live")
 
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
-) -> FitWithOrWithoutCableMemory:
+) -> estimation.FitWithOrWithoutCableMemory:
     """Estimate with the run's solver, and choose between the fits with and without a cable's shape memory."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.solve(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
-    return choose_cable_memory_fit(problem, run.solver, found, limits)
+    return estimation.choose_cable_memory_fit(problem, run.solver, found, limits)
 
 
 def _iterate_logger(
@@ -133,9 +127,9 @@ def solution_to_result_dict(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> dict[str, Any]:
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
-    errors, units, residuals = prediction_errors_and_units(problem, solution, held_out)
+    errors, units, residuals = estimation.prediction_errors_and_units(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
-    worse = channels_worse_than_naive_prediction(errors, units)
+    worse = estimation.channels_worse_than_naive_prediction(errors, units)
     return {
         "format": _RESULT_FORMAT,
         "status": solution.status.value,

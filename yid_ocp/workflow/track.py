@@ -14,22 +14,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from yid_ocp import files
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import OutputSettings, RecordingsSettings, RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.display import Progress
 from yid_ocp.errors import DataError, YidError
-from yid_ocp.files import (
-    attributes_to_dict,
-    dataclass_from_plain_data,
-    file_sha256,
-    json_sha256,
-    make_folder,
-    read_input_text,
-    to_lossless_plain_data,
-    write_text,
-)
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
@@ -71,7 +62,7 @@ def _run_track(
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.settings, system)
                 config = tasks.work_folder / _CONFIG_FILE
-                _LAST_TRACKER[:] = [((read_input_text(config), config), tracker)]
+                _LAST_TRACKER[:] = [((files.read_input_text(config), config), tracker)]
                 doubts = [] if recording is None else all_recording_quality_issues(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_shared_values()
@@ -105,8 +96,8 @@ def _run_track(
             told = [animation_of_trajectories("tracked", [shape], tracked)]
             result["truth_errors"] = {} if made is None else _truth_errors(system, found, made)
         result |= {"doubts": issues_to_plain_data(doubts), "refused": "" if refused is None else refused.what}
-        files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
-        more = {"pictures": [path for path in files if path.exists()]}
+        drawn = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
+        more = {"pictures": [path for path in drawn if path.exists()]}
         written = folder.write_result_and_report(run, progress, result, animations=told, section_data=more)
         tasks.delete_files()
     if refused is not None:
@@ -150,9 +141,10 @@ def _track_result(
 
 def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, Any]:
     names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
+    names += " nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds"
     known = {"distance": "mean_distance", "covered": "visible_length_coverage", "contested": "contested_fraction"}
     found = {key: fit and getattr(fit, name) for key, name in known.items()}
-    return found | attributes_to_dict(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
+    return found | files.attributes_to_dict(frame, names)
 
 
 def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:
@@ -268,19 +260,19 @@ class _FrameTasks:
         [found] = require_task_values(self._run(_calibrate_sequence_task, {"what is common": {}}, InlineExecutor()))
         if "refused" in found:
             raise DataError(**found["refused"])
-        return dataclass_from_plain_data(SharedFrameEstimates, found)
+        return files.dataclass_from_plain_data(SharedFrameEstimates, found)
 
     def track_frames(
         self, tracker: FrameTracker, common: SharedFrameEstimates, workers: WorkerConfig | Executor, progress: Progress
     ) -> list[FrameReport]:
-        names, told = tracker.sequence.frame_names, to_lossless_plain_data(common)
+        names, told = tracker.sequence.frame_names, files.to_lossless_plain_data(common)
         tasks = {names[i]: {"common": told, "index": i} for i in tracker.frame_order}
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
         require_task_values([result for result in results if "abruptly" not in result.error])
         return [
             tracker.initial_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
             if "abruptly" in result.error
-            else dataclass_from_plain_data(FrameReport, result.value)
+            else files.dataclass_from_plain_data(FrameReport, result.value)
             for i, result in zip(tracker.frame_order, results, strict=True)
         ]
 
@@ -297,7 +289,10 @@ class _FrameTasks:
 
     def delete_files(self) -> None:
         for path in (*self.own_files, self.work_folder):
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self.work_folder.parent.rmdir()
 
@@ -325,13 +320,13 @@ def _frame_tasks(
     recordings = RecordingsSettings(estimate=() if joints is None else (str(joints),))
     track = replace(said, frames_path=str(frames), n_drawn_frames=0, write_virtual_frames=False)
     own = replace(run, track=track, recordings=recordings, output=OutputSettings(), name="", description="")
-    files = {"frames": frames, "joints": joints, "background": said.background_frames_path}
+    sources = {"frames": frames, "joints": joints, "background": said.background_frames_path}
     with add_setting_location_to_errors(run, "track", "frames_path"):
-        inputs = {key: file_sha256(Path(path)) for key, path in files.items() if path is not None}
+        inputs = {key: files.file_sha256(Path(path)) for key, path in sources.items() if path is not None}
         text = config_yaml_with_defaults(own)
-        work_folder = work / json_sha256([text, inputs])[:16]
-        make_folder(work_folder)
-        write_text(work_folder / _CONFIG_FILE, text)
+        work_folder = work / files.json_sha256([text, inputs])[:16]
+        files.make_folder(work_folder)
+        files.write_text(work_folder / _CONFIG_FILE, text)
     if said.frames_path is not None:
         folder.input_hashes[said.frames_path] = inputs["frames"]
     return _FrameTasks(own, work_folder, inputs, own_files), made
@@ -341,16 +336,17 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # part of the key of the result
     try:
-        return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).estimate_shared_values()))
+        tracker = _tracker(files.read_input_text(config), config)
+        return dict(files.to_lossless_plain_data(tracker.estimate_shared_values()))
     except DataError as error:
-        return {"refused": attributes_to_dict(error, "what where allowed hint")}
+        return {"refused": files.attributes_to_dict(error, "what where allowed hint")}
 
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     del inputs
-    tracker = _tracker(read_input_text(config), config)
-    found = tracker.process_frame(index, dataclass_from_plain_data(SharedFrameEstimates, common))
-    return dict(to_lossless_plain_data(found))
+    tracker = _tracker(files.read_input_text(config), config)
+    found = tracker.process_frame(index, files.dataclass_from_plain_data(SharedFrameEstimates, common))
+    return dict(files.to_lossless_plain_data(found))
 
 
 def _tracker(text: str, config: Path) -> FrameTracker:

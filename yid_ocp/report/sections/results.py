@@ -19,17 +19,10 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.predictions import ChannelPrediction
-from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
+from yid_ocp.report import diagnosis_summaries, figures, summaries, terminal  # noqa: F401, they register
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, animations_to_dict
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
-from yid_ocp.report.terminal import (
-    SUMMARY_BY_RESULT_FORMAT,
-    StatementTableOrCode,
-    SummaryStatement,
-    SummaryTable,
-    scale_and_unit_with_metres_as_mm,
-)
 
 _MAX_ANIMATIONS = 4  # a page with more is slow to open
 _MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
@@ -57,13 +50,15 @@ def _remaining_tables(findings: ReportData) -> Mapping[str, Any] | None:
     return {"blocks": rest} if rest else None
 
 
-def _result_blocks(findings: ReportData) -> tuple[list[str], list[StatementTableOrCode], list[StatementTableOrCode]]:
+def _result_blocks(
+    findings: ReportData,
+) -> tuple[list[str], list[terminal.StatementTableOrCode], list[terminal.StatementTableOrCode]]:
     """Conclusions and verdicts of a result, then the other blocks, split at the end of its key table."""
-    known = SUMMARY_BY_RESULT_FORMAT.get(str(findings.result.get("format")))
+    known = terminal.SUMMARY_BY_RESULT_FORMAT.get(str(findings.result.get("format")))
     blocks = [] if known is None else known(findings.result)
-    ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, SummaryTable) and block.is_key_table)
+    ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, terminal.SummaryTable) and block.is_key_table)
     end = next(ends, 0)
-    told = [block for block in blocks if isinstance(block, SummaryStatement) and block.kind != "note"]
+    told = [block for block in blocks if isinstance(block, terminal.SummaryStatement) and block.kind != "note"]
     said = [block.text for kind in ("conclusion", "verdict") for block in told if block.kind == kind]
     first, rest = ([block for block in part if block not in told] for part in (blocks[:end], blocks[end:]))
     return said, first, rest
@@ -265,7 +260,7 @@ def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
     pairs: Sequence[tuple[ChannelPrediction, ChannelPrediction]] = findings.section_data.get("overlay", ())
     for first, second in pairs[:_MAX_FIT_FIGURES]:
         own, other = findings.result["runs"]
-        factor, shown = scale_and_unit_with_metres_as_mm(first.unit)
+        factor, shown = terminal.scale_and_unit_with_metres_as_mm(first.unit)
         apart, curves = second.predicted_at(first.t) - first.predicted, list[TimePlotData]()
         for i, name in enumerate("xyz" if apart.shape[1] == 3 else [first.channel.rpartition(".")[2]]):
             lines = {own: (first.t, first.predicted[:, i]), other: (second.t, second.predicted[:, i])}
