@@ -176,12 +176,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
         ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are merged on one clock"),
         ("--field", "message_fields", "CHANNEL=/TOPIC.FIELD", "of a bag: array of any message; joints are 1, 2, ..."),
         ("--joints", "joints", "NAME[=NEW]", "joints to keep, in this order, and their names in the URDF"),
-        (
-            "--points",
-            "point_names",
-            "SOURCE=POINT",
-            "topic, TOPIC:FRAME, marker or stem, and its point if it differs",
-        ),
+        ("--points", "point_names", "SOURCE=POINT", "topic, TOPIC:FRAME, marker or stem, and its point if it differs"),
         ("--columns", "column_meanings", "COLUMN=MEANING", "t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),
         ("--units", "units", "UNIT", "units that are not SI: deg, mm, ms, or QUANTITY=UNIT"),
         ("--torque-constants", "torque_constants", "JOINT=N_M_PER_A", "where the efforts are currents; * is any text"),

@@ -178,9 +178,8 @@ def problem_without_error_of_links(
             fine = finer.evaluate(point, False, warm)
             if not fine.ok:
                 return None
-            episodes = list(
-                map(_with_data_shifted, problem.episodes, at_x.episode_predictions, fine.episode_predictions)
-            )
+            predictions = at_x.episode_predictions, fine.episode_predictions
+            episodes = list(map(_with_data_shifted, problem.episodes, *predictions))
             after = problem.with_episodes(episodes, ()).evaluate(x, False, guesses).residual
             if len(after) != len(before):
                 return None  # events have removed samples
@@ -516,9 +515,8 @@ def _alternating_mode_magnitude(
     """Largest magnitude of eigenvalues of A - B K with negative real part at a node; None if A is not finite."""
     n, fixed = step.system.n_coordinates, list(step.system.prescribed_coordinate_indices)
     state, after = rollout.state[node], rollout.state[node + 1]
-    a, by_torque, _ = step.jacobians(
-        state[:n], state[n : 2 * n], rollout.torque[node], theta, (state[fixed], after[fixed]), state[2 * n :], names=()
-    )
+    q, p, z, path = state[:n], state[n : 2 * n], state[2 * n :], (state[fixed], after[fixed])
+    a, by_torque, _ = step.jacobians(q, p, rollout.torque[node], theta, path, z, names=())
     if feedback is not None:
         a[:, feedback.state_indices] -= by_torque @ feedback.gain[node]
     if not np.isfinite(a).all():
@@ -543,8 +541,7 @@ def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> Al
         feedback = inputs.feedback_with_corrected_reference(
             episode.tracking_feedback, system.actuated_coordinate_indices, episode.measured_driven_angles
         )
-        rollout = simulate(
-            problem.step, theta, begin.state, episode.grid.steps, inputs.torque, inputs.prescribed_path, feedback
-        )
+        driven_by = inputs.torque, inputs.prescribed_path, feedback
+        rollout = simulate(problem.step, theta, begin.state, episode.grid.steps, *driven_by)
         found.append(_error_growth_along(problem.step, theta, rollout, feedback, episode.name, looks))
     return max(found, key=lambda growth: (growth.growth_decades, growth.max_step_factor), default=None)

@@ -108,7 +108,11 @@ def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
         if op == ca.OP_OUTPUT:
             results[given[1]] = at[taken[0]]
             continue
-        value = float(taken[1]) if op == ca.OP_INPUT else function.instruction_constant(i) if op == ca.OP_CONST else 0.0
+        value = 0.0
+        if op == ca.OP_INPUT:
+            value = float(taken[1])
+        elif op == ca.OP_CONST:
+            value = function.instruction_constant(i)
         parts = () if op in _LEAF_OPERATIONS else tuple(at[register] for register in taken)
         at[given[0]] = len(nodes)
         nodes.append((op, parts, float(value)))

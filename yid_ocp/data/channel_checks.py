@@ -116,7 +116,8 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
         if isinstance(said, Mapping):
             return float(said.get(name, 0.0))
         recorded = getattr(joints, CHANNEL_KINDS[f"joints.{quantity}"].std_attribute_names[0])
-        given = said if said is not None else recorded if recorded is not None else 0.0
+        given = recorded if said is None else said
+        given = 0.0 if given is None else given
         if quantity == "position" and said is None and joints.position_resolution is not None:
             given = np.hypot(given, joints.position_resolution / math.sqrt(12))
         return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])

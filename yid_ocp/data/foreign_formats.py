@@ -14,8 +14,8 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, PointGroup
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 
-_AXES = ("x", "y", "z")
-_Meaning = tuple[str, str] | None
+AXES = ("x", "y", "z")
+ColumnMeaning = tuple[str, str] | None
 """Meaning of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None if it is omitted."""
 _EXACT_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
 _TIME_WORDS = "t time times timestamp timestamps time_stamp stamp header_stamp sec secs seconds elapsed elapsed_time"
@@ -48,22 +48,22 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_WORDS)
 
 def column_meanings(
     header: Sequence[str], sensor_components: Sequence[str]
-) -> tuple[list[_Meaning], list[tuple[str, str]]]:
+) -> tuple[list[ColumnMeaning], list[tuple[str, str]]]:
     """Find the meaning of every column of `header` from its name (None if unclear), and quantities with their units.
 
     `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
     """
     split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
-    meanings: list[_Meaning] = []
+    meanings: list[ColumnMeaning] = []
     units: dict[tuple[str, str], None] = {}
     for name, unit in split:
         meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name)
-        if meaning is None and set(_AXES) <= whole and name.strip().lower() in _AXES:
+        if meaning is None and set(AXES) <= whole and name.strip().lower() in AXES:
             meaning = name.strip().lower(), "marker"  # a table of one point
         meanings.append(meaning)
         if meaning and unit and not (meaning[0] in sensor_components and unit in ("N m", "rad/s")):
-            units["points" if meaning[0] in _AXES else meaning[0], unit] = None
+            units["points" if meaning[0] in AXES else meaning[0], unit] = None
     return meanings, list(units)
 
 
@@ -83,7 +83,7 @@ def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str
     return column, ""
 
 
-def _exact_meaning(column: str, sensor_components: Sequence[str]) -> _Meaning:
+def _exact_meaning(column: str, sensor_components: Sequence[str]) -> ColumnMeaning:
     """Meaning in this package's own spelling, in which joints, points and sensors keep their names."""
     if column.lower() in _TIME_WORDS.split():
         return "t", ""
@@ -94,10 +94,10 @@ def _exact_meaning(column: str, sensor_components: Sequence[str]) -> _Meaning:
         if (name := column.removesuffix(f"_{component}")) not in ("", column):
             return component, name
     point, _, axis = column.rpartition("_")
-    return (axis, point) if point and axis in _AXES and not _NO_POINT.fullmatch(point) else None
+    return (axis, point) if point and axis in AXES and not _NO_POINT.fullmatch(point) else None
 
 
-def _spelled_meaning(column: str) -> _Meaning:
+def _spelled_meaning(column: str) -> ColumnMeaning:
     """Meaning in the spelling of other tools: `pos_elbow`, `elbow.vel`, `tau_J[0]`, `/joint_states/elbow/effort`."""
     plain = re.sub(r"[\s./:\-\[\]%]+", "_", column).strip("_")
     if plain.lower() in _TIME_WORDS.split() or plain.lower() in ("field_header_stamp", "header_stamp_sec"):

@@ -260,9 +260,8 @@ class Recording(ReprMixin):
         counts = " and ".join(count_with_noun(len(own), noun) for noun, own in names.items())
         rows = [("group", "names", "samples", "channels")]
         for g in self.all_groups:
-            channels = (
-                g.values_by_channel if isinstance(g, JointGroup) else getattr(g, "values_by_quantity", ("position",))
-            )
+            quantities = getattr(g, "values_by_quantity", ("position",))
+            channels = g.values_by_channel if isinstance(g, JointGroup) else quantities
             rows.append((g.name, ", ".join(g.names), _sampled(g.t), ", ".join(channels)))
         span = f", {self.duration:.4g} s" if self.all_groups else ""
         return ReprLineAndTableRows(f"'{self.name}', {counts}{span}", rows)
@@ -354,16 +353,13 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
         what, hint = f"a group of points is called '{group.name}'", f"rename it, such as points_{group.name}"
         raise_data_error_unless(legal, what, origin, "points, points_<name>", hint)
-        once = names.count(group.name) == 1
-        raise_data_error_unless(
-            once, f"two groups of points are called '{group.name}'", origin, "every name once", "rename one"
-        )
+        what = f"two groups of points are called '{group.name}'"
+        raise_data_error_unless(names.count(group.name) == 1, what, origin, "every name once", "rename one")
         _validate_points(group, f"{origin}: {group.name}")
+    names = [channels.name for channels in recording.channel_groups]
     for channels in recording.channel_groups:
-        repeated = sum(group.name == channels.name for group in recording.channel_groups) > 1
-        raise_data_error_unless(
-            not repeated, f"two groups are called '{channels.name}'", origin, "every name once", "rename one"
-        )
+        what = f"two groups are called '{channels.name}'"
+        raise_data_error_unless(names.count(channels.name) == 1, what, origin, "every name once", "rename one")
         _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
@@ -477,10 +473,9 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     declared = {channel.quantity: channel for channel in additional_sensor_channel_kinds(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
-    hint = "add a dataset of this name, or leave the group out"
-    raise_data_error_unless(
-        own, "the group has no values", where, ", ".join(declared) or "a group that a sensor declares", hint
-    )
+    allowed, hint = ", ".join(declared), "add a dataset of this name, or leave the group out"
+    allowed = allowed or "a group that a sensor declares"
+    raise_data_error_unless(own, "the group has no values", where, allowed, hint)
     for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:
             what = f"no sensor declares a {noun} '{name}' here"
@@ -519,10 +514,8 @@ def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "a rigid transform")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
     raise_data_error_unless(np.isfinite(pose).all(), "the pose has a value that is not finite", where, allowed)
-    last_is_unit, orthonormal = (
-        np.allclose(array, expected, rtol=0, atol=1e-6)
-        for array, expected in ((pose[3], np.eye(4)[3]), (rotation.T @ rotation, np.eye(3)))
-    )
+    last_is_unit = np.allclose(pose[3], np.eye(4)[3], rtol=0, atol=1e-6)
+    orthonormal = np.allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-6)
     raise_data_error_unless(last_is_unit, f"the last row of the pose is {pose[3].tolist()}", where, allowed)
     raise_data_error_unless(orthonormal, "the axes of the pose are not orthonormal", where, allowed)
     raise_data_error_unless(np.linalg.det(rotation) > 0, "the pose is a reflection", where, allowed)

@@ -109,11 +109,10 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         key: _text(file.attrs[key], f"{origin}, attribute {key}") if key in file.attrs else ""
         for key in ("format", "description", "source", "truth", "notes")
     }
-    what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file has no format"
+    form, where = texts["format"], f"{origin}, attribute format"
+    what = f"the format of the file is '{form}'" if form else "the file has no format"
     hint = "update yid_ocp if a newer version wrote the file; else import the original data with this version"
-    raise_data_error_unless(
-        texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT, hint
-    )
+    raise_data_error_unless(form == _RECORDING_FORMAT, what, where, _RECORDING_FORMAT, hint)
     joints, points, straight, channels, gain = None, [], None, [], {}
     if _GAIN in file.attrs:  # of all joints alike
         gain = {_GAIN: read_only_copy(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
@@ -123,9 +122,8 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         where, declared = f"{origin}: {name}", additional_sensor_channel_kinds(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_question(name, ("joints", "points", *further, _STRAIGHT))
-        raise_data_error_unless(
-            legal, f"the format has no group '{name}'", origin, allowed, hint or "rename or delete the group"
-        )
+        what, hint = f"the format has no group '{name}'", hint or "rename or delete the group"
+        raise_data_error_unless(legal, what, origin, allowed, hint)
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
             continue
@@ -173,10 +171,8 @@ def _read_group(
         for name in sorted(wanted - found):
             what, hint = f"the {noun} '{name}' is missing", f"add the {noun}, or leave the group out"
             raise DataError(what, where=where, allowed=", ".join(known), hint=hint)
-    both = "std" in group and "std" in group.attrs
-    raise_data_error_unless(
-        not both, "`std` is both a dataset and an attribute", where, "one of the two", "delete one of them"
-    )
+    what, is_twice = "`std` is both a dataset and an attribute", "std" in group and "std" in group.attrs
+    raise_data_error_unless(not is_twice, what, where, "one of the two", "delete one of them")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
     for name, value in group.attrs.items():
         place = f"{where}, attribute {name}"

@@ -54,9 +54,8 @@ class _ScaledBodies(EffectBase):
         raise NotImplementedError
 
     def apply_to_system(self, system: System) -> System:
-        return base.system_with_changed_bodies(
-            system, self._joints(system), lambda bodies: (b.scaled_by(self["scale"]) for b in bodies)
-        )
+        joints, scale = self._joints(system), self["scale"]
+        return base.system_with_changed_bodies(system, joints, lambda bodies: (b.scaled_by(scale) for b in bodies))
 
 
 @EFFECTS.register("density")

@@ -55,9 +55,8 @@ class _JointFriction(EffectBase):
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        return EffectStepTerms(
-            dissipative_force=base.generalized_force_at_joint(state.system, self.location, -self._friction(v))
-        )
+        force = base.generalized_force_at_joint(state.system, self.location, -self._friction(v))
+        return EffectStepTerms(dissipative_force=force)
 
 
 def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
@@ -185,9 +184,8 @@ class _JointPresliding(EffectBase):
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
         force = base.generalized_force_at_joint(state.system, self.location, -self["tau_c"] * mean)
-        return EffectStepTerms(
-            generalized_force=force, internal_equations={name: state.h * rate - change}, static_equations={name: s}
-        )
+        equations = {name: state.h * rate - change}
+        return EffectStepTerms(generalized_force=force, internal_equations=equations, static_equations={name: s})
 
 
 def _left(x: ca.SX) -> ca.SX:

@@ -112,14 +112,10 @@ class _Hysteresis(_SegmentMemory):
 
     equation = "F = -stiffness z, dz/dt = v - |v| z / yield_angle"
     declared_parameters = (
-        ParameterDefinition(
-            "stiffness",
-            "N m/rad",
-            0.0,
-            0.0,
-            50.0,
-            (0.05, 1.0),
-            "stiffness of the element before it yields",
+        replace(
+            ParameterDefinition(
+                "stiffness", "N m/rad", 0.0, 0.0, 50.0, (0.05, 1.0), "stiffness of the element before it yields"
+            ),
             range_scale=_bending_stiffness,
         ),
         ParameterDefinition("yield_angle", "rad", 0.15, 5e-3, 5.0, (0.05, 0.5), "angle over which it yields", True),

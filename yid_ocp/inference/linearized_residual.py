@@ -79,11 +79,11 @@ class ResidualDerivativesByStateAndEffort:
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
         found: list[IntArray] = []
         parts: list[tuple[Array, ...]] = []
-        functions = [trajectory.model_functions.compiled_sensor_function(s.sensor) for s in trajectory.measurements]
-        pairs = zip(functions, trajectory.measurements, strict=True)
-        readings = [
-            function(trajectory.state_values_at_nodes.select_nodes(s.evaluation_nodes), theta) for function, s in pairs
-        ]
+        readings = []
+        for samples in trajectory.measurements:
+            read_sensor = trajectory.model_functions.compiled_sensor_function(samples.sensor)
+            values = trajectory.state_values_at_nodes.select_nodes(samples.evaluation_nodes)
+            readings.append(read_sensor(values, theta))
         n_forces, width = (step.sizes["m"], 4) if any(read.needs_neighbours for read in readings) else (0, 2)
         for samples, read in zip(trajectory.measurements, readings, strict=True):
             used = samples.evaluation_nodes

@@ -128,9 +128,7 @@ def _smoother_unknowns(course: _LinearizedEpisode) -> _SmootherUnknowns:
     return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
 
 
-def _unknown_forces(
-    course: _LinearizedEpisode,
-) -> tuple[list[str], list[SmoothedUnknownGroup], list[float], IntArray]:
+def _unknown_forces(course: _LinearizedEpisode) -> tuple[list[str], list[SmoothedUnknownGroup], list[float], IntArray]:
     """Names, sources, reference sizes and coordinates of the unknown forces."""
     system, joint_names = course.system, course.system.mechanism.joint_names
     place = {joint: s.name for s in system.segment_layouts for link in s.link_joints for joint in link}
@@ -241,10 +239,7 @@ class LinearResidualModel:
 
 
 def residual_models_with_smoother_unknowns(
-    problem: EstimationProblem,
-    x: Array,
-    evaluation: Evaluation,
-    interval: float = _MIN_INTERVAL,
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, interval: float = _MIN_INTERVAL
 ) -> tuple[LinearResidualModel, ...]:
     """Linearize every recording's residual with respect to unknown forces, offsets and biases.
 

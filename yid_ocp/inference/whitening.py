@@ -211,9 +211,8 @@ def _filter_steps(
     # stepwise matrices of all steps stand together, so that a column is filtered in one call
     moves, blocks = np.empty((count, ns, len(columns))), list[Array]()
     observe, by_torque, projected = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu)), np.empty((ends[-1], na))
-    for state, effort in step_derivatives_along_rollout(
-        course.model_functions.step, course.theta, course.rollout, inputs, feedback
-    ):
+    along = course.model_functions.step, course.theta, course.rollout
+    for state, effort in step_derivatives_along_rollout(*along, inputs, feedback):
         span = slice(begun, begun + len(state))
         move = moves[span]
         move[:] = state if ns == nx else state[:, kept[:, None], columns]
@@ -236,9 +235,8 @@ def _filter_steps(
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
     """Constant torque errors (nu,) [N m] of the driven joints, estimated from the prediction `result` of an episode."""
-    return whitening.whiten_and_estimate_torque_bias(
-        _plain(episode, result)[:, None], result.feedback_torque_and_sensitivity
-    )[1][:, 0]
+    rows, push = _plain(episode, result)[:, None], result.feedback_torque_and_sensitivity
+    return whitening.whiten_and_estimate_torque_bias(rows, push)[1][:, 0]
 
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:

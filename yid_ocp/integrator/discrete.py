@@ -106,9 +106,8 @@ class DiscreteEquations:
     # Jacobians without differentiating the tree
     balance_remainder: ca.SX
     p1_remainder: ca.SX
-    force_with_derivatives: (
-        ForceWithDerivativeFactors | None
-    )  # sum of those that effects give with their slopes, at the midpoint
+    # sum of those that effects give with their slopes, at the midpoint
+    force_with_derivatives: ForceWithDerivativeFactors | None
     force_with_derivatives_shares: tuple[float, float]  # parts of its impulse h F in `momentum_balance` and in `p1`
     constraint_impulses: _ConstraintImpulses
     row_scale: ca.SX  # factor on rows of the bodies' part and of `constraint_impulses`: 1, or a compliance, (n, 1)

@@ -46,9 +46,8 @@ class Step(ReprMixin):
 
     def _summary(self) -> ReprLineAndTableRows:
         how = "compiled" if self.is_compiled else "interpreted"
-        return ReprLineAndTableRows(
-            f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().one_line}"
-        )
+        of_what = self.system._summary().one_line
+        return ReprLineAndTableRows(f"{self.time_step:g} s, {self.force_split}, {how}, of {of_what}")
 
     @property
     def system(self) -> System:
@@ -346,11 +345,9 @@ def dynamic_observable_state_mask(
     states with an initial error; if given, states are also excluded that neither these errors nor torque errors reach.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
-    chosen = (slice(0, 1), slice(count - 1, count))
-    ends = [
-        next(step_derivatives_along_rollout(step, theta, rollout, np.repeat(inputs, count, 0), None, loads, one))
-        for one in chosen
-    ]
+    given = (step, theta, rollout, np.repeat(inputs, count, 0), None, loads)
+    first, last = slice(0, 1), slice(count - 1, count)
+    ends = [next(step_derivatives_along_rollout(*given, chosen)) for chosen in (first, last)]
     by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
     by_state, moved = by_all[:, :nx], np.any(by_all > 0, axis=1)
     moved[list(step.system.prescribed_coordinate_indices)] = False

@@ -24,9 +24,8 @@ _MAX_COMMAND_DELAY = 0.5  # [s]
 _MAX_DEAD_BAND = 0.2  # [rad or m]
 MOTOR_OFF_COMMAND = 1e6  # input of a servo whose motor is off; from half of it on there is no torque [rad or m]
 _DEAD_BAND_ROUNDING = 1e-4  # smoothing range at the ends of a servo's dead band [rad or m]
-SERVO_GAIN_FACTOR_PARAMETER = (
-    "servo_gain_factor"  # parameter by which a recording states the proportional gain of a firmware
-)
+# parameter by which a recording states the proportional gain of a firmware
+SERVO_GAIN_FACTOR_PARAMETER = "servo_gain_factor"
 
 _MotorKind = Literal["ideal", "dc"]
 _MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]

@@ -225,9 +225,8 @@ class _ServoIntegral(Effect):
         row, rate = state.internal_rows[name], state.z_rate[state.internal_rows[name]]
         if self.location in system.servos:  # not while the joint is held
             command = state.u[system.driven.index(self.location)]
-            rate -= system.servos[self.location].position_error_beyond_dead_band(
-                command, state.q[system.mechanism.joint_index(self.location)]
-            )
+            angle = state.q[system.mechanism.joint_index(self.location)]
+            rate -= system.servos[self.location].position_error_beyond_dead_band(command, angle)
         return EffectStepTerms(internal_equations={name: rate}, static_equations={name: state.z[row]})
 
 

@@ -194,9 +194,8 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
             allowed = "positions within the limits of the joints"
             hint = "set plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
-    broken = limits.worst_value_and_bound_by_violated_limit(
-        limits.limited_quantity_values(mover.simulate_path(still), still)[0]
-    )
+    values, _ = limits.limited_quantity_values(mover.simulate_path(still), still)
+    broken = limits.worst_value_and_bound_by_violated_limit(values)
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{name}: {x:.4g}, limit {bound:.4g}, {what}" for what, name, x, bound in parts)

@@ -75,9 +75,8 @@ class PlanResidualAndLimitFunctions:
             return None
         begin = self.simulator.start_configuration[None]
         first = self.point.positions_and_jacobian(begin, self.simulator.theta)[0][0, :3]
-        places = np.vstack(
-            [first, *(first + np.asarray(via) for via in self.options.point_waypoint_offsets_from_start), self.target]
-        )
+        vias = (first + np.asarray(offset) for offset in self.options.point_waypoint_offsets_from_start)
+        places = np.vstack([first, *vias, self.target])
         at = np.linspace(0.0, self.simulator.path.duration, len(places))
         # clamped ends, so that the reference motion starts and stops smoothly
         return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.simulator.node_times, at[-1])))

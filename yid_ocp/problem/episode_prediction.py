@@ -76,12 +76,9 @@ class EpisodePredictor:
     def estimated_initial_state_indices(self) -> tuple[int, ...]:
         """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
-        hidden = list(self.system.effect_internal_coordinate_symbols)
+        hidden, begin = list(self.system.effect_internal_coordinate_symbols), {"q": 0, "p": n, "z": 2 * n}
         split = (name.split(".", 1) for name in self.unknowns.initial_state_names)
-        return tuple(
-            2 * n + hidden.index(name) if kind == "z" else joints(name) + (n if kind == "p" else 0)
-            for kind, name in split
-        )
+        return tuple(begin[kind] + (hidden.index(name) if kind == "z" else joints(name)) for kind, name in split)
 
     def episode_with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
         """Fit an episode's initial state to the first measured points, if the option `initial_state` says so."""
@@ -207,9 +204,8 @@ class EpisodePredictor:
             torque, first = torque - errors.recorded_torque_noise, first - errors.recorded_torque_noise[0]
         if nu and (late is not None or corrections.corrects_efforts):
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
-            _, true, _, by_theta, by_reading = corrections.true_angles_and_efforts(
-                np.zeros_like(readings), readings, theta, names
-            )
+            angles = np.zeros_like(readings)
+            _, true, _, by_theta, by_reading = corrections.true_angles_and_efforts(angles, readings, theta, names)
             by_theta = by_theta[:, :nu].copy()
             if by_recorded is not None and names:
                 by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
@@ -220,9 +216,8 @@ class EpisodePredictor:
             left = errors.estimated_torque_error_to_subtract
             torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
-            true, _, by_angle, _, _ = corrections.true_angles_and_efforts(
-                np.hstack([arm, path]), episode.joint_loads, theta, names
-            )
+            angles, loads = np.hstack([arm, path]), episode.joint_loads
+            true, _, by_angle, _, _ = corrections.true_angles_and_efforts(angles, loads, theta, names)
             arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
         return CorrectedInputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
 
@@ -245,9 +240,8 @@ class EpisodePredictor:
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 
         width = len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices)
-        each = [
-            8 * (e.grid.steps + 1) * self.integrator_step.sizes["nx"] * (derivatives * width + 1) for e, *_ in queries
-        ]
+        bytes_per_node = 8 * self.integrator_step.sizes["nx"] * (derivatives * width + 1)
+        each = [(episode.grid.steps + 1) * bytes_per_node for episode, *_ in queries]
         found: list[EpisodePrediction | str] = []
         while len(found) < len(queries):
             held = np.cumsum(each[len(found) :][:_MAX_PARALLEL_ROLLOUTS])
@@ -390,9 +384,8 @@ class EpisodePredictor:
     ) -> tuple[Array, Array]:
         """Readings (nodes, k) at the samples' nodes, and their derivatives (nodes, k, d) in d directions."""
         n, nodes = self.system.n_coordinates, samples.evaluation_nodes
-        read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(
-            along.values.select_nodes(nodes), theta
-        )
+        function = self.model_functions.compiled_sensor_function(samples.sensor, wanted)
+        read = function(along.values.select_nodes(nodes), theta)
         if along.by_state is None:
             return read.output, np.zeros((*read.output.shape, 0))
         total = read.by_q @ along.by_state[nodes, :n]

@@ -114,10 +114,8 @@ class EstimationProblem(ReprMixin):
         episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
-        ready, other = (
-            tuple(episode_at_equilibrium_with_denoised_gear_loads(self.predictor, e, theta) for e in group)
-            for group in (fitted, others)
-        )
+        finish = partial(episode_at_equilibrium_with_denoised_gear_loads, self.predictor, theta=theta)
+        ready, other = (tuple(map(finish, group)) for group in (fitted, others))
         check_unique_recording_names([episode.name for episode in ready])
         check_no_known_value_of_free_parameters((*ready, *other), free)
         self._set(functions, options, tuple(free), theta, ready, other)
@@ -168,9 +166,8 @@ class EstimationProblem(ReprMixin):
         rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
         table = zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
         rows += [(name, *(f"{value:.4g}" for value in own)) for name, *own in table]
-        return ReprLineAndTableRows(
-            f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows
-        )
+        line = f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out"
+        return ReprLineAndTableRows(line, rows)
 
     @property
     def initial_unknowns(self) -> Array:
@@ -228,9 +225,8 @@ class EstimationProblem(ReprMixin):
     @property
     def are_input_corrections_neutral_and_fixed(self) -> bool:
         """Whether all effects that correct recorded inputs, times or tracked references are neutral and fixed."""
-        return all(
-            self.predictor.are_input_corrections_neutral_and_fixed(episode, self.theta) for episode in self.episodes
-        )
+        neutral_and_fixed = self.predictor.are_input_corrections_neutral_and_fixed
+        return all(neutral_and_fixed(episode, self.theta) for episode in self.episodes)
 
     def theta_and_initial_state_deviation(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""

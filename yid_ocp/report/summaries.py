@@ -106,10 +106,8 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     groups = dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"])
     for group in groups:
         channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]
-        unit, fitted = (
-            result["residuals"][channels[0]]["unit"],
-            _rms([result["residuals"][c]["rmse"] for c in channels]),
-        )
+        unit = result["residuals"][channels[0]]["unit"]
+        fitted = _rms([result["residuals"][c]["rmse"] for c in channels])
         entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
         if not entries:
             continue
@@ -176,7 +174,10 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
     hidden: set[str] = set()
     for group in errors:
         members = {channel for channel in errors if channel.startswith(f"{group}.")}
-        hidden |= members if len(members) > MAX_CHANNELS_SHOWN_SINGLY else {group} if members else set()
+        if len(members) > MAX_CHANNELS_SHOWN_SINGLY:
+            hidden |= members
+        elif members:
+            hidden.add(group)
     return [channel for channel in errors if channel not in hidden]
 
 

@@ -294,9 +294,8 @@ class _Calibrator:
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
             state = self._rounds(state, chosen, _STAGE_REACHES[-1], True, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
-            state, cost, used = self._rounds(
-                state, chosen, _RAY_REACH, True, _LAST_STAGE_POINTS, _LAST_STAGE_ITERATIONS
-            )
+            last = _LAST_STAGE_POINTS, _LAST_STAGE_ITERATIONS
+            state, cost, used = self._rounds(state, chosen, _RAY_REACH, True, *last)
             placed = [(g.stamp, state.measured_to_world_points(g.points)) for g in used]
             own = [frame_stamp_delay(self.arm, state, *seen, self.rng) for seen in placed]
             on_time, usual = _find_on_time_frames(own)

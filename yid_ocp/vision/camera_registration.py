@@ -110,9 +110,8 @@ class CalibrationState:
         pose[:3, 3] += change[TRANSLATION_SLICE]
         scale, offset, clock, drift = map(float, change[DEPTH_SCALE_INDEX:])
         depth = self.depth_scale * math.exp(scale), self.depth_offset + offset
-        return CalibrationState(
-            pose, *depth, self.clock_offset + clock, self.clock_drift + drift, self.clock_reference_stamp
-        )
+        clocks = self.clock_offset + clock, self.clock_drift + drift, self.clock_reference_stamp
+        return CalibrationState(pose, *depth, *clocks)
 
     def difference_from(self, other: CalibrationState) -> Array:
         """Difference (10,) of this state from another one."""

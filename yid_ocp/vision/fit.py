@@ -182,9 +182,8 @@ class ShapeFitter:
             # a part of the object is misplaced: something similar was nearer to the initial guess
             if left[0].any() and left[1].any():
                 other = self._attempt(cloud, [self._rested(best.q, failed), *begun], left)
-                if other[1].covered_fraction_of_visible_links(
-                    self._lengths
-                ) > evidence.covered_fraction_of_visible_links(self._lengths):
+                covered = [own.covered_fraction_of_visible_links(self._lengths) for own in (evidence, other[1])]
+                if covered[1] > covered[0]:
                     best, evidence = other
         return self._judged(best, evidence, self._rivals(best, evidence, cloud), cloud)
 
@@ -282,12 +281,9 @@ class ShapeFitter:
             def about(bends: Array, task: _Task = task, q: Array = end.q) -> LocalQuadraticModel:
                 return self._quadratic(self._with_free(q, bends), task)
 
+            begin = end.q[list(self.free_joints)]
             found = minimize_by_damped_newton(
-                about,
-                end.q[list(self.free_joints)],
-                max_iterations=most,
-                step_tolerance=_PASS_TOLERANCE,
-                cost_tolerance=_PASS_TOLERANCE,
+                about, begin, max_iterations=most, step_tolerance=_PASS_TOLERANCE, cost_tolerance=_PASS_TOLERANCE
             )
             end = _Minimum(self._with_free(end.q, found.x), found.final_model.hessian, found.final_model.cost)
         return end

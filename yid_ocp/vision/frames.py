@@ -162,9 +162,8 @@ def import_open3d() -> ModuleType:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        raise missing_package_error(
-            DataError, f"vision needs Open3D, which cannot be loaded ({error})", "vision"
-        ) from error
+        what = f"vision needs Open3D, which cannot be loaded ({error})"
+        raise missing_package_error(DataError, what, "vision") from error
     return open3d
 
 

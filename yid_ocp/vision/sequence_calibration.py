@@ -28,9 +28,8 @@ from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLin
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _BACKGROUND_NOISE_STDS = 3.0  # stds of a point within which it belongs to the background
-_MIN_STILL_FRAME_FRACTION = (
-    0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
-)
+# fraction of the frames in which what stands still must be seen: arm and object hide it from time to time
+_MIN_STILL_FRAME_FRACTION = 0.5
 _SAME_THING_DISTANCE = 1.0  # of a cluster's size; closer clusters in other frames are the same object
 _MAX_STILL_WANDER = 0.3  # of its size; largest motion of the centre of a static object
 _MAX_FOLLOWING_WANDER = 0.5  # of its motion in the world, below which an object moves with a link

@@ -256,9 +256,12 @@ class ShapeGuessFinder:
         behind = (next(k for k, tip in enumerate(tips) if last in ways[tip]) for last in lasts)
         self._links = [link._replace(tip=tip) for link, tip in zip(found, behind, strict=True)]
         self._root_to_tip_lengths = np.array([ends[tip] for tip in tips])
-        shared = [[max((ends[j] for j in ways[a] & ways[b] if j in ends), default=0.0) for b in tips] for a in tips]
+        shared = np.zeros((len(tips), len(tips)))  # length that the ways to two tips have in common
+        for a, b in np.ndindex(shared.shape):
+            common = ways[tips[a]] & ways[tips[b]]
+            shared[a, b] = max((ends[joint] for joint in common if joint in ends), default=0.0)
         to_tips = np.array([0.0, *self._root_to_tip_lengths])
-        self._end_distances = to_tips[:, None] + to_tips - 2 * np.pad(np.array(shared), ((1, 0), (1, 0)))
+        self._end_distances = to_tips[:, None] + to_tips - 2 * np.pad(shared, ((1, 0), (1, 0)))
         np.fill_diagonal(self._end_distances, 0.0)
 
     def shape_guesses_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from yid_ocp import files
 from yid_ocp.analysis.run_estimates import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
@@ -24,15 +25,6 @@ from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel,
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError
-from yid_ocp.files import (
-    dataclass_from_plain_data,
-    json_sha256,
-    read_input_json,
-    to_json_types,
-    to_lossless_plain_data,
-    write_strict_json,
-    write_text,
-)
 from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
@@ -70,9 +62,8 @@ def run_diagnose(
     """Diagnose and write the run folder. Finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
         folder.record_run_start(run, "diagnose", _flags(run))
-        refits = _SingleJsonFileRefitStore(
-            folder, folder.input_hashes, config_yaml_with_defaults(run), software_and_plugin_versions()
-        )
+        made_from = folder.input_hashes, config_yaml_with_defaults(run), software_and_plugin_versions()
+        refits = _SingleJsonFileRefitStore(folder, *made_from)
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step", ahead=18.5)
         runs = run_history.estimates_of_each_baseline_run(run)
@@ -107,19 +98,18 @@ def run_diagnose(
         predicted = _held_out_predictions(finding)
         prediction_outputs.write_diagnosis_hdf5(folder.path / "trajectories.h5", finding, predicted)
         if finding.law is not None:
-            write_text(folder.path / "law.csv", torque_law_tables_csv(finding.law.tables))
+            files.write_text(folder.path / "law.csv", torque_law_tables_csv(finding.law.tables))
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
         follows_points = bool(last.problem.options.clamp_pose_definitions_from_points)
         moving = not follows_points and bool(system.driven or system.prescribed)
         x = last.problem.unknown_vector(last.values)
+        recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
         own = {
             "model": _final_model_to_dict(finding),
             "doubts": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.estimated_torque_offsets(last.problem, x),
-            "not_candidates": effect_kinds_without_recorded_signals(
-                [episode.recording for episode in (*problem.episodes, *problem.held_out)]
-            ),
+            "not_candidates": effect_kinds_without_recorded_signals(recordings),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
@@ -139,7 +129,7 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
             free = entry.name in shared
-            std = to_json_types(fit.std[entry.name]) if free else 0.0
+            std = files.to_json_types(fit.std[entry.name]) if free else 0.0
             found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
     matrix, _ = unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
     covariance = covariance_to_dict(shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared])
@@ -286,7 +276,7 @@ class _SingleJsonFileRefitStore:
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
         self.file = folder.resume_folder / "refits.json"
-        self._folder, self._key = folder, json_sha256(made_from)
+        self._folder, self._key = folder, files.json_sha256(made_from)
         self._lock, self._warned = threading.Lock(), False
         self._known = self._read()
 
@@ -306,8 +296,8 @@ class _SingleJsonFileRefitStore:
             self._known[name] = refitted
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                data = {"format": _STORE_FORMAT, "key": self._key, "refits": to_lossless_plain_data(self._known)}
-                write_strict_json(self.file, data)
+                data = {"format": _STORE_FORMAT, "key": self._key, "refits": files.to_lossless_plain_data(self._known)}
+                files.write_strict_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
                     log.warning("finished refits cannot be stored (%s); the diagnosis continues", error)
@@ -324,9 +314,9 @@ class _SingleJsonFileRefitStore:
         if not self.file.exists():
             return {}
         try:
-            held = read_input_json(self.file)
+            held = files.read_input_json(self.file)
             if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
-                return {name: dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
+                return {name: files.dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
             reason = "other inputs, another configuration or another version"
         except (DataError, ValueError, LookupError, TypeError, AttributeError):
             reason = "something that cannot be read"

@@ -34,10 +34,8 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             law: replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
             for law in EFFECT_KINDS_BY_FRICTION_LAW
         }
-        problems = [
-            friction_law_comparison.problem_estimating_on_held_out_too(build_problem(settings))
-            for settings in by_law.values()
-        ]
+        estimating_on_all = friction_law_comparison.problem_estimating_on_held_out_too
+        problems = [estimating_on_all(build_problem(settings)) for settings in by_law.values()]
         kinds = friction_law_comparison.recording_names_by_name_stem(problems[0])
         if len(kinds) < 2:
             allowed = "two recordings or more in which the motors are on"

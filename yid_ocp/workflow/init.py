@@ -236,9 +236,8 @@ def _config_text(
     """Commented YAML; every setting has a comment on its line or the line above."""
     import jinja2  # slow to import
 
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("yid_ocp.workflow"), undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
+    loader = jinja2.PackageLoader("yid_ocp.workflow")
+    environment = jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters |= {"yaml": _value, "wrapped": _wrapped_list, "number": _number}
     environment.filters["settings"] = lambda settings: "\n".join(_settings_lines("    ", settings))
     known: dict[str, Any] = {"about": about, "robot": robot, "item": item, "files": recordings, "imports": imports}

@@ -66,9 +66,8 @@ def run_plan(
         folder.log_event("end", reached=found.is_successful, message=found.message)
         told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(run, found)
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]
-        scene = animation_of_trajectories(
-            "planned", [ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)]
-        )
+        planned = ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)
+        scene = animation_of_trajectories("planned", [planned])
         result = _motion_result(run, found, source) | told
         shown: dict[str, Any] = {"animations": [scene], "section_data": {"plan": found}}
         written = folder.write_result_and_report(run, progress, result, **shown)
@@ -210,10 +209,8 @@ def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collectio
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
         what = f"{run.plan.parameter_run_folder} has the effect {', '.join(lacking)}, which this model does not have"
-        hint = "list the same effects under model.effects"
-        raise run.config_error(
-            what, "plan", "parameter_run_folder", allowed="a run of `solve` on the same model", hint=hint
-        )
+        allowed, hint = "a run of `solve` on the same model", "list the same effects under model.effects"
+        raise run.config_error(what, "plan", "parameter_run_folder", allowed=allowed, hint=hint)
 
 
 def _parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:

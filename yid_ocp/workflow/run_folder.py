@@ -232,7 +232,10 @@ def _is_of_a_run(temporary: Path) -> bool:
 def _remove_all_but_lock(temporary: Path) -> None:
     for entry in temporary.iterdir():
         if entry.name != _LOCK:
-            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
 
 
 def _locked(temporary: Path) -> FileLock | None:

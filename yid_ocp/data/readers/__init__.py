@@ -82,7 +82,6 @@ def _format_of(path: Path) -> str:
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        raise DataError(
-            f"there is no reader for '{key}' files", where=str(path), **unknown_name_error_arguments(key, READERS)
-        )
+        what, known = f"there is no reader for '{key}' files", unknown_name_error_arguments(key, READERS)
+        raise DataError(what, where=str(path), **known)
     return key

@@ -65,10 +65,9 @@ class OpenBag:
     """An open ROS 1 bag, ROS 2 bag or MCAP file with its topics and reader. Raises `DataError` if it is unreadable."""
 
     def __init__(self, path: Path) -> None:
-        highlevel, typesys = (
-            import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags")
-            for name in ("highlevel", "typesys")
-        )
+        reason = "reading bags needs the package rosbags"
+        highlevel = import_optional("rosbags.highlevel", "bags", reason)
+        typesys = import_optional("rosbags.typesys", "bags", reason)
         self.path = path
         for file in path.iterdir() if path.is_dir() else (path,):
             if not file.is_dir():
@@ -116,9 +115,8 @@ class OpenBag:
     def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
         """Return the `DataError` for a bag without usable topics, with a list of its topics."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
-        return DataError(
-            what, where=f"{self.path}, with {held}", allowed=allowed, hint="choose a field by --field, or another bag"
-        )
+        where, hint = f"{self.path}, with {held}", "choose a field by --field, or another bag"
+        return DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def time_since_first_message_function(

@@ -18,7 +18,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import mean_sample_rate
-from yid_ocp.data.foreign_formats import UNIT_WORDS, column_meanings, select_mocap_table_reader
+from yid_ocp.data.foreign_formats import AXES, UNIT_WORDS, ColumnMeaning, column_meanings, select_mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -32,9 +32,6 @@ from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
 from yid_ocp.sensors import CHANNEL_KINDS
 
-_AXES = ("x", "y", "z")
-_Meaning = tuple[str, str] | None
-"""Meaning of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None if it is omitted."""
 _MOUNTED = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
 _COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
 """Components of vectors measured by sensors on a link, such as `force_x`."""
@@ -119,8 +116,8 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     joint_names = tuple(dict.fromkeys(joint for _, joint in found))
     used = dict.fromkeys(["position", *(channel for channel, _ in found)]) if found else {}
     channels = {name: _gather(meanings, table, [(name, joint) for joint in joint_names], where) for name in used}
-    point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in _AXES))
-    wanted = [(axis, name) for name in point_names for axis in _AXES]
+    point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in AXES))
+    wanted = [(axis, name) for name in point_names for axis in AXES]
     position = _gather(meanings, table, wanted, where).reshape(len(table), len(point_names), 3)
     mounted = _mounted_sensors(meanings, table, where)
     is_alone = bool(joint_names) + bool(point_names) + len(mounted) < 2
@@ -347,7 +344,7 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Meaning], where: str) -> list[float]:
+def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
     if len(cells) != len(header):
         what, allowed = f"the row has {len(cells)} cells", f"{len(header)} cells, as the header"
         raise DataError(what, where=where, allowed=allowed, hint=f"correct the row{_OR_SKIP}")
@@ -368,7 +365,9 @@ def column_pattern(key: str) -> re.Pattern[str]:
     return re.compile(re.escape(key).replace(r"\*", "(.*)"))
 
 
-def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> tuple[list[_Meaning], dict[str, str]]:
+def _meanings(
+    header: Sequence[str], columns: Mapping[str, str], where: str
+) -> tuple[list[ColumnMeaning], dict[str, str]]:
     given: dict[str, str] = {}
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
@@ -376,7 +375,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
-    meanings: dict[str, _Meaning] = {}
+    meanings: dict[str, ColumnMeaning] = {}
     meant: dict[tuple[str, str], str] = {}
     by_name, stated = column_meanings(header, _COMPONENTS)
     units: dict[str, str] = {}
@@ -405,13 +404,13 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
     return list(meanings.values()), units
 
 
-def _given_meaning(column: str, given: str, where: str) -> _Meaning:
+def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
     if given == base.SKIPPED_COLUMN_MEANING:
         return None
     if given == "t":
         return "t", ""
     kind, _, name = given.partition(":")
-    known = (*JOINT_CHANNEL_UNITS, *_AXES, *_COMPONENTS)
+    known = (*JOINT_CHANNEL_UNITS, *AXES, *_COMPONENTS)
     if not name or kind not in known:
         what = f"the meaning '{given}' of column '{column}' is unknown"
         allowed = f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with the name of a joint, point or sensor and the "

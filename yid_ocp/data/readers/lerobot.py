@@ -88,9 +88,8 @@ def read_lerobot_episode(
     raw, where = Recording(group, (), description, *own, notes=notes), f"{dataset.folder}, episode {episode}"
     if "position" not in (units or {}):
         _check_are_radians(group, dataset, where)
-    return base.convert_to_si_and_validate(
-        raw, where, base.JointPointAndUnitOptions(joints, None, units, torque_constants, gear_ratios)
-    )
+    options = base.JointPointAndUnitOptions(joints, None, units, torque_constants, gear_ratios)
+    return base.convert_to_si_and_validate(raw, where, options)
 
 
 @base.FILE_PREVIEWERS.register("LeRobot dataset")
@@ -103,7 +102,10 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     for name, feature in dataset.info.features.items():
         becomes = {_ACTION: "position_command", _STATE: f"joints {', '.join(names)}"}.get(name, _CHANNELS.get(name, ""))
         own = (becomes, "") if name not in left else ("", left[name])
-        own = ("t", "") if name == "frame_index" else ("", "numbers frames and tasks") if name in _BOOKKEEPING else own
+        if name == "frame_index":
+            own = ("t", "")
+        elif name in _BOOKKEEPING:
+            own = ("", "numbers frames and tasks")
         sources.append(base.TopicOrColumnSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
     units, guesses = base.guess_units(Recording(group))
     if "position" in units and _widest(group) <= _MAX_NORMALISED:  # degrees or normalised: reading asks which

@@ -60,9 +60,8 @@ class ClampPoseDefinition:
 class CableTopology:
     """Vertices of a branched cable along the parent and child branches, and their undeformed positions."""
 
-    main_branch_vertex_names: tuple[
-        str, ...
-    ]  # parent, from clamp to clamp; clamps hold the first and last two vertices
+    # parent, from clamp to clamp; clamps hold the first and last two vertices
+    main_branch_vertex_names: tuple[str, ...]
     child_branch_vertex_names: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
     undeformed_positions: Mapping[str, ArrayLike]  # position of every unloaded vertex, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
@@ -155,9 +154,8 @@ def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Map
     """Return the numbers that an object requires, in the order of `meanings`. Raises `ConfigError` if one is absent."""
     for name, meaning in meanings.items():
         if name not in numbers:
-            flag, value = (
-                (f"--{name}", " NUMBER") if name in SIZE_AND_MASS_DESCRIPTIONS else ("--number", f" {name}=NUMBER")
-            )
+            has_own_flag = name in SIZE_AND_MASS_DESCRIPTIONS
+            flag, value = (f"--{name}", " NUMBER") if has_own_flag else ("--number", f" {name}=NUMBER")
             raise ConfigError(f"{noun} needs a {name}", where=flag, allowed=meaning, hint=f"add {flag}{value}")
     return [float(numbers[name]) for name in meanings]
 

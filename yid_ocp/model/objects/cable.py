@@ -29,14 +29,7 @@ from annotated_types import Ge, Gt, Le, Len
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, ModelError, require_known_names
 from yid_ocp.files import read_input_text
-from yid_ocp.model.flexible import (
-    AXIS_UNIT_VECTORS,
-    ElasticJoint,
-    FlexibleObject,
-    FlexibleSegment,
-    edge_to_edge_transport_rotations,
-    flexible_object,
-)
+from yid_ocp.model import flexible
 from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement, symbolic_rotation_from_axis_angle
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectBuilder
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -132,7 +125,7 @@ def clamped_cable_system(
     the last edge `clamp_end.roll` [rad]. Raises `ModelError` if the cable is inconsistent.
     """
     options = options or CableOptions()
-    item = flexible_object(_segments(cable, lengths, options), name="cable")
+    item = flexible.flexible_object(_segments(cable, lengths, options), name="cable")
     if options.has_rest_angle_parameters:
         item = _with_rest_angles(item)
     if options.shape_memory_fraction is not None:
@@ -144,7 +137,7 @@ def clamped_cable_system(
         text = "roll of the end clamp about the last edge"
         end_roll = Parameter(f"{END_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
         clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
-        rotation = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], end_roll.symbol)
+        rotation = symbolic_rotation_from_axis_angle(flexible.AXIS_UNIT_VECTORS["z"], end_roll.symbol)
     hung = (_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None)
     held = Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp_grasp_kind, rotation)
     known: SystemBuildArguments = {"objects": [hung], "grasps": [held], "prescribed": clamps.joint_names, "damping": {}}
@@ -152,7 +145,7 @@ def clamped_cable_system(
     return System.build(clamps, **known)
 
 
-def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
+def _with_rest_angles(item: flexible.FlexibleObject) -> flexible.FlexibleObject:
     text = "rest angle relative to the undeformed shape's"
     bends = (spring.joint_name for spring in item.elastic_joints if spring.deformation == "bend")
     rest = {name: Parameter(f"{name}.rest", 0.0, "rad", -np.pi, np.pi, text) for name in bends}
@@ -162,13 +155,13 @@ def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
 
 
 def _with_parameters(
-    item: FlexibleObject, entries: Iterable[Parameter], elastic: Iterable[ElasticJoint]
-) -> FlexibleObject:
+    item: flexible.FlexibleObject, entries: Iterable[Parameter], elastic: Iterable[flexible.ElasticJoint]
+) -> flexible.FlexibleObject:
     tree = replace(item.mechanism, parameters=item.mechanism.parameters.with_added(entries))
     return replace(item, mechanism=tree, elastic_joints=tuple(elastic))
 
 
-def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
+def _with_memory(item: flexible.FlexibleObject, memory: float) -> flexible.FlexibleObject:
     text = "share of the start's shape in the rest shape"
     shares = {s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, text) for s in item.segment_layouts}
     text = "speed of the vertices at the recording's start"
@@ -177,12 +170,10 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     scale = Parameter(SHAPE_MEMORY_HALVING_SPEED_PARAMETER, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
-    told = (("rad", "angle at the recording's start"), ("N m", "torque borne at the recording's start"))
     for spring in item.elastic_joints:
-        angle, load = (
-            Parameter(f"{spring.joint_name}.{suffix}", 0.0, unit, description=text)
-            for suffix, (unit, text) in zip(INITIAL_ANGLE_AND_TORQUE_SUFFIXES, told, strict=True)
-        )
+        names = [f"{spring.joint_name}.{suffix}" for suffix in INITIAL_ANGLE_AND_TORQUE_SUFFIXES]
+        angle = Parameter(names[0], 0.0, "rad", description="angle at the recording's start")
+        load = Parameter(names[1], 0.0, "N m", description="torque borne at the recording's start")
         entries += [angle, load]
         shift = angle.symbol - load.symbol / (spring.stiffness + _MIN_STIFFNESS)
         share = trust * shares[spring.segment_name].symbol
@@ -191,8 +182,8 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
 
 
 def _with_vertices(
-    item: FlexibleObject, cable: CableTopology, lengths: Mapping[tuple[str, str], float]
-) -> FlexibleObject:
+    item: flexible.FlexibleObject, cable: CableTopology, lengths: Mapping[tuple[str, str], float]
+) -> flexible.FlexibleObject:
     """The object with its vertices as frames; the parent's arc length runs from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
@@ -205,9 +196,8 @@ def _with_vertices(
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
     edges = np.array([lengths[edge] for edge in pairwise(cable.main_branch_vertex_names)])
-    whole = ArcLengthChain(
-        (cable.main_branch_vertex_names[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
-    )
+    frames_along = (cable.main_branch_vertex_names[1], *parent.tip_frames)
+    whole = ArcLengthChain(frames_along, tuple(map(float, edges / edges.sum())))
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
 
@@ -217,7 +207,7 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     roll = Parameter(f"{START_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
     edge = Parameter(f"{START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
     carrier = clamp.frame(START_CLAMP)
-    turn = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], roll.symbol)
+    turn = symbolic_rotation_from_axis_angle(flexible.AXIS_UNIT_VECTORS["z"], roll.symbol)
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     first, second = cable.main_branch_vertex_names[:2]
     frames = {**clamp.frames, first: carrier, second: tip, _START_EDGE_FRAME: tip}
@@ -226,9 +216,9 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
 
 def _segments(
     cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions
-) -> list[FlexibleSegment]:
+) -> list[flexible.FlexibleSegment]:
     parent = cable.main_branch_vertex_names
-    turns = edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
+    turns = flexible.edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
     for turn in turns[1:]:
@@ -240,11 +230,11 @@ def _segments(
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
             junction = parent.index(chain[0])
-            own = edge_to_edge_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1])
+            own = flexible.edge_to_edge_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1])
             before = None
             at = junction - 2
         edges = [lengths[edge] for edge in pairwise(chain)]
-        segment = FlexibleSegment(
+        segment = flexible.FlexibleSegment(
             name,
             sum(edges),
             branch.linear_density * sum(edges),

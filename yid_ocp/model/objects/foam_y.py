@@ -36,9 +36,8 @@ def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObje
 
 def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
     names = [f"{segment.name}.{quantity}" for segment in foam_y_segments() for quantity in ("bend", "twist")]
-    return ObjectWithInitialValues(
-        _FoamY(links=links), dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]", True
-    )
+    values, text = dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]"
+    return ObjectWithInitialValues(_FoamY(links=links), values, text, True)
 
 
 @OBJECT_KINDS.register("foam_y")

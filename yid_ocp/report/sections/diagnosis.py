@@ -90,24 +90,18 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
 def _figures_by_model(
     rows: Sequence[tuple[str, str, Mapping[str, tuple[float, float | None]]]], axis: str, nominal_label: str
 ) -> _TitledFigures:
-    colors = {
-        nominal_label: figures.BEFORE_COLOR,
-        _EXTENDED_LABEL: figures.AFTER_COLOR,
-        "noise alone": figures.MEASURED_COLOR,
-    }
-    return draw_figure_per_unit(
-        rows, lambda own, unit: figures.parameter_values_by_source_figure(own, f"{axis} [{unit}]", colors)
-    )
+    colors = {nominal_label: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
+    colors["noise alone"] = figures.MEASURED_COLOR
+    draw = figures.parameter_values_by_source_figure
+    return draw_figure_per_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]", colors))
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
     smoothed = finding.smoother_result
     if smoothed is None:
         return None
-    noticed, silent = (
-        ", ".join(place.location for place in finding.gap_locations if place.is_observable == seen)
-        for seen in (True, False)
-    )
+    noticed = ", ".join(place.location for place in finding.gap_locations if place.is_observable)
+    silent = ", ".join(place.location for place in finding.gap_locations if not place.is_observable)
     verdicts = {
         "plant": "the mechanics, not what sensors read",
         "sensor": "what sensors read, not the mechanics",
