@@ -181,17 +181,20 @@ def test_dry_friction_needs_no_time_to_turn(urdf_folder):
     assert np.abs(np.diff(samples.value[:, 1])).max() > 30 * samples.std.max()
 
 
-@pytest.mark.parametrize("free", [True, False])
-def test_an_effort_where_an_estimated_dry_friction_may_hold_the_joint_is_no_measurement(free, urdf_folder):
+@pytest.mark.parametrize(("free", "size"), [(True, 1.0), (False, 1.0), (True, 6.0)], ids=["free", "known", "fast"])
+def test_an_effort_where_an_estimated_dry_friction_may_hold_the_joint_is_no_measurement(free, size, urdf_folder):
     friction = [("joint_coulomb", "elbow", {"tau_c": 0.4}), ("joint_viscous", "shoulder", {"b": 0.1})]
-    step, path = pendulum_step(urdf_folder, friction, prescribed=JOINTS), motion()
+    step, path = pendulum_step(urdf_folder, friction, prescribed=JOINTS), size * motion()
     names = ("joint_viscous@shoulder.b", *(("joint_coulomb@elbow.tau_c",) if free else ()))
     [samples] = arm(step, path, np.ones_like(path), angle=0.0, free=names).episodes[0].measurements
-    speed, reach = np.abs(np.gradient(path[:, 1], 0.01)), round(1 / (2 * CUTOFF) / 0.01)
-    slowest = np.array([speed[node - reach : node + reach].min() for node in samples.node])
+    speed, reach = np.gradient(path[:, 1], 0.01), round(1 / (2 * CUTOFF) / 0.01)
+    windows = [speed[node - reach : node + reach] for node in samples.node]
+    slow = np.array([np.abs(own).min() < 0.06 for own in windows])
+    stops = slow | [own.min() < 0 < own.max() for own in windows]
     assert not np.isnan(samples.value[:, 0]).any()
-    np.testing.assert_array_equal(np.isnan(samples.value[:, 1]), free & (slowest < 0.06))
-    assert 5 < np.count_nonzero(slowest < 0.06) < 0.5 * len(slowest)
+    np.testing.assert_array_equal(np.isnan(samples.value[:, 1]), free & stops)
+    assert 4 < np.count_nonzero(stops) < 0.5 * len(stops)
+    assert np.any(stops & ~slow) == (size > 1), "a fast joint turns between two samples"
 
 
 def test_friction_laws_are_compared_on_the_samples_that_all_of_them_use(urdf_folder):
@@ -259,6 +262,7 @@ def test_neighbours_that_repeat_each_other_are_left_out(efforts_of):
     plain, smooth = (efforts_of(nothing, cutoff).episodes[0].measurements[0] for cutoff in (math.inf, LOW_CUTOFF))
     np.testing.assert_array_equal(plain.node, np.arange(1, 600))
     np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(77, 524, 10))
+    assert efforts_of(nothing, 0.0).options.path_cutoff == 20.0, "angles without noise are all motion"
 
 
 @pytest.mark.parametrize(("kind", "late"), [(None, 0.0), ("sample", 0.0), ("mean", 0.005), ("command", 0.005)])

@@ -107,6 +107,11 @@ def white_noise_std(t: Array, values: Array) -> float:
     return float(1.4826 * np.median(np.abs(np.diff(values, NOISE_ESTIMATE_DIFFERENCE_ORDER)[together])) / size)
 
 
+def seen_noise_std(t: Array, values: Array) -> float:
+    """Standard deviation of the noise that a channel's samples show: white or from quantization, the larger one."""
+    return max(white_noise_std(t, values), quantization_step(values) / math.sqrt(12))
+
+
 def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, channel: str) -> float:
     """Standard deviation of a channel from settings or recording, or zero if neither states it."""
     joints = recording.joints

@@ -29,6 +29,7 @@ from yid_ocp.effects.base import EffectBase, elastic_joints_within_segment
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.recorded_inputs import lowest_path_cutoff
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import (
     INJECTABLE_EFFECT_KINDS,
@@ -334,7 +335,10 @@ class BlindCaseGenerator:
     def _nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
-        return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
+        # motions differ between cases, and a filter for the first one could remove those of others
+        cutoff = max(nominal.options.path_cutoff, lowest_path_cutoff(recordings, nominal.system.prescribed))
+        options = replace(nominal.options, path_cutoff=cutoff)
+        return EstimationProblem(nominal.step, list(recordings), nominal.free, options, values)
 
     def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:
         """Draw recordings and label of a planned case from its seed. Raises `ModelError` if no draw succeeds."""

@@ -158,7 +158,7 @@ def _examined(
     screened = screen_candidates(composed, (), nominal.values)
     evidence = NominalModelGapEvidence(nominal, *tests, screened)
     _end_stage(search, "screening")
-    if evidence.may_have_gap(limits) and evidence.are_data_sufficient(limits):
+    if evidence.warrants_search(limits):
         # without the error of its discretisation, the gap may be none
         gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
         fall = _fall_at_half_time_step(search, nominal, events)
@@ -266,9 +266,7 @@ def _happened(
         return NO_EVENTS, None
     test = _null_test(judged, residual.residual, len(fit.values), limits)
     is_flagged = any(window.is_flagged for window in test.windows)
-    evaluation = residual if judged is own and not is_flagged else own.evaluate(x, is_flagged, guesses)
-    if not evaluation.ok:
-        return NO_EVENTS, None
+    evaluation = own.evaluate(x, is_flagged, guesses)
     smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
     (pushed, others), share = found.split_force_from_other_events(), 1 - _MIN_FORCE_EVENT_GAP_FRACTION

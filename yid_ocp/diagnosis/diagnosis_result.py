@@ -250,11 +250,17 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in a text on gap, locations, effects, events and the next experiment."""
     text = [_gap(result)]
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
-    if stated != used:
-        used = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
-        text.append(f"The discretisation error of {stated} s steps looks like a gap, {used}.")
-    if result.is_corrected_for_links:
-        text.append("The error of few links looks like a gap. It was removed here; other commands need more links.")
+    step = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
+    links = "The error of few links looks like a gap. It was removed here; other commands need more links."
+    notes = (
+        (stated != used, f"The discretisation error of {stated} s steps looks like a gap, {step}."),
+        (result.is_corrected_for_links, links),
+        (
+            result.is_split_in_blocks,
+            "No other recording could be held out, so alternate blocks of the recordings were.",
+        ),
+    )
+    text += [note for applies, note in notes if applies]
     if result.verdict not in ("insufficient_data", "no_gap"):
         text += [_places(result), *_causes(result), *_remains(result)]
     if result.law is not None:
@@ -262,8 +268,6 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     stopped = f"The search stopped after {result.search_seconds:.3g} s; it would go on with "
     text += [_listed(stopped, result.untried), *map(held_out_truncation_message, result.truncated_recordings)]
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
-    if result.is_split_in_blocks:
-        text.append("No other recording could be held out, so alternate blocks of the recordings were.")
     events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
     text += [_listed("Excluded as brief disturbances: ", events), *ignored_after_overspeed_messages(result.events)]
     return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))

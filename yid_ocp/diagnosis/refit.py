@@ -265,8 +265,6 @@ def _evaluated(
 
 def restore_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
     """A refit with its problem and evaluation in the step of all candidates; its estimates and predictions are kept."""
-    if fit.problem.step is problem.problem.step:
-        return fit
     own, finish = _evaluated(problem, fit.effects, fit.values)
     return replace(fit, problem=own, evaluation=finish, cost=finish.cost) if finish.ok else fit
 
@@ -364,11 +362,11 @@ def refit_with_each_effect(
     values: Mapping[str, float],
     where: str = "",
 ) -> list[RefitStatistics]:
-    """Refit the model with each of several effects, or pairs of effects, added to `base`. Failed refits are omitted.
+    """Refit the model with each of several effects, or pairs of effects, added to `base`. Failed ones are omitted.
 
-    Each entry of `tried` holds the added effects and their initial parameters; `values` are the initial values of all
-    other unknowns. `where` labels these initial values in the store of refits, so that refits of the same effects from
-    other values remain distinct.
+    A refit that cannot predict the held-out recordings has failed. Each entry of `tried` holds the added effects and
+    their initial parameters; `values` are the initial values of all other unknowns. `where` labels these initial values
+    in the store of refits, so that refits of the same effects from other values remain distinct.
     """
     if not tried:
         return []
@@ -398,7 +396,7 @@ def refit_with_each_effect(
         count = max(int(paced), 1)
         batch, rest = rest[:count], rest[count:]
         fits += map_with_merged_calls(one, batch)
-    return [fit for fit in fits if fit is not None]
+    return [fit for fit in fits if fit is not None and math.isfinite(fit.held_out_loss.total_chi2)]
 
 
 def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:

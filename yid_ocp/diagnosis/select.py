@@ -92,7 +92,7 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
     total = float(before.block_sample_counts.sum())
     difference = before.block_chi2 - after.block_chi2
     if not np.all(np.isfinite(difference)):
-        return (-np.inf if np.isfinite(before.chi2_per_sample) else np.inf), 0.0
+        return before.chi2_per_sample - after.chi2_per_sample, 0.0
     count = len(difference)
     error = np.sqrt(count) * float(np.std(difference, ddof=1)) if count > 1 else np.inf
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total

@@ -75,15 +75,22 @@ class NominalModelGapEvidence:
         return residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
 
     def may_have_gap(self, limits: Thresholds) -> bool:
-        """Whether the residual exceeds noise as a whole or, significantly, along a candidate's signature."""
+        """Whether the residual exceeds noise as a whole or along a candidate's signature, or shifted parameters do.
+
+        A gap that parameters close by leaving the estimates of an earlier run counts only if an effect explains it.
+        """
         p_value = bonferroni_corrected_min_candidate_p_value(self.screening.candidate_scores)
-        return p_value < limits.gap_significance_level or self.exceeds_noise(limits)
+        return self.has_left_baseline or p_value < limits.gap_significance_level or self.exceeds_noise(limits)
 
     def are_data_sufficient(self, limits: Thresholds) -> bool:
         """Whether the degrees of freedom suffice for the nominal model's unknowns, and a candidate is detectable."""
         is_seen = any(entry.is_detectable for entry in self.screening.detectability)
         enough = limits.min_samples_per_unknown * len(self.nominal_model.values)
         return is_seen and self.nominal_test.degrees_of_freedom >= enough
+
+    def warrants_search(self, limits: Thresholds) -> bool:
+        """Whether there may be a gap, and the data suffice to search for its cause."""
+        return self.may_have_gap(limits) and self.are_data_sufficient(limits)
 
 
 @dataclass(frozen=True)
@@ -188,11 +195,9 @@ def judge(
     `finished` is called with the name of each stage.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
-    suffices = evidence.are_data_sufficient(limits)
     fits: tuple[RefitStatistics, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
-    # a gap closed by shifted parameters counts only if an effect explains it
-    if suffices and (evidence.may_have_gap(limits) or evidence.has_left_baseline):
+    if evidence.warrants_search(limits):
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
     finished("refits")
     carried: tuple[EffectAmplitudeTransferCheck, ...] = ()
@@ -204,7 +209,8 @@ def judge(
         added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
     finished("carry_over")
     said = Judgement("", "", fits, added, explained, carried, 0.0)
-    verdict, reason = _verdict_and_reason(said, evidence.exceeds_noise(limits), suffices, limits)
+    exceeds, suffice = evidence.exceeds_noise(limits), evidence.are_data_sufficient(limits)
+    verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
     return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
 

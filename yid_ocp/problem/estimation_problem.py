@@ -47,6 +47,7 @@ from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_res
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
+from yid_ocp.problem.recorded_inputs import lowest_path_cutoff
 
 _HELD_OUT_START_WINDOW = 0.2
 """Duration of a sensor's first samples from which a held-out recording's initial state is estimated [s]."""
@@ -102,6 +103,9 @@ class EstimationProblem(ReprMixin):
         may_free: Sequence[str] = (),
     ) -> None:
         options = options or ProblemOptions()
+        if not options.path_cutoff:
+            cutoff = lowest_path_cutoff([*recordings, *held_out], step.system.prescribed)
+            options = replace(options, path_cutoff=cutoff)
         check_free_parameters(step.system, free, options)
         if not recordings:
             what, hint = "there is no recording to estimate on", "add one under recordings.estimate"

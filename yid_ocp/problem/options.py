@@ -119,8 +119,14 @@ class ProblemOptions:
         OptionInfo("residual in standard deviations above which the cost is linear; .inf for least squares"),
     ] = float("inf")
     path_cutoff: Annotated[
-        float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of compared efforts", "Hz")
-    ] = 10.0
+        float,
+        Ge(0),
+        OptionInfo(
+            "low-pass cutoff of prescribed paths and of compared efforts; 0: the lowest, from 10 Hz in octaves, above "
+            "which recorded angles are noise",
+            "Hz",
+        ),
+    ] = 0.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
     clamp_pose_definitions_from_points: tuple[ClampPoseDefinition, ...] = ()
     local_parameters: tuple[str, ...] = ()

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy.interpolate
+import scipy.special
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.data.channel_checks import median_sample_period
+from yid_ocp.data.channel_checks import median_sample_period, seen_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, unknown_name_error_arguments
@@ -24,6 +26,33 @@ from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
+_MIN_PATH_CUTOFF, _MAX_CUTOFF_OVER_RATE = 10.0, 0.2  # [Hz], and as a fraction of the sample rate
+_NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion in a frequency band
+
+
+def lowest_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -> float:
+    """Lowest cutoff [Hz], 10 Hz or octaves above it, above which angles are noise alone; at most a fifth of the rate.
+
+    What a filter of twice the cutoff keeps beyond this one is compared with white noise of the angles' own size. A
+    lower cutoff removes motion, and the prediction of efforts lacks the torques that this motion needs.
+    """
+    every = (recording.joints for recording in recordings)
+    groups = [group for group in every if group is not None and len(group.t) > 1]
+    most = min((_MAX_CUTOFF_OVER_RATE / median_sample_period(group.t) for group in groups), default=math.inf)
+    cutoff, most = min(_MIN_PATH_CUTOFF, most), float(f"{most:.3g}")
+    channels = [(g.t, g.position[:, [g.names.index(name)]]) for g in groups for name in joints if name in g.names]
+    sizes = [seen_noise_std(t, angle[:, 0]) for t, angle in channels]
+    while cutoff < most and min(sizes, default=0.0) > 0:
+        higher, p_values = LowPassFilter(min(2 * cutoff, most)), []
+        for (t, angle), std in zip(channels, sizes, strict=True):
+            impulse = std * (t == t[len(t) // 2])[:, None]
+            kept, noise = (higher(t, values) - LowPassFilter(cutoff)(t, values) for values in (angle, impulse))
+            degrees = 2 * (higher.cutoff - cutoff) * (t[-1] - t[0])
+            p_values.append(scipy.special.chdtrc(degrees, degrees * np.mean(kept**2) / np.sum(noise**2)))
+        if min(p_values) > _NOISE_ONLY_LEVEL:
+            break
+        cutoff = higher.cutoff
+    return cutoff
 
 
 def mean_step_inputs(

@@ -261,11 +261,13 @@ def _may_stick(inputs: SensorDataInputs, names: tuple[str, ...], times: Array) -
     if not np.any(limits):
         return np.zeros((len(times), len(names)), bool)
     position = joints.position[:, recorded_joint_column_indices(joints, names, inputs.recording.name)]
-    speed = np.abs(np.gradient(inputs.path_filter(joints.t, position), joints.t, axis=0))
+    speed = np.gradient(inputs.path_filter(joints.t, position), joints.t, axis=0)
     reach = inputs.effort_filter.decorrelation_stride(inputs.time_step) * inputs.time_step
     first, last = np.searchsorted(joints.t, times - reach), np.searchsorted(joints.t, times + reach)
-    slowest = np.array([speed[i : max(j, i + 1)].min(axis=0) for i, j in zip(first, last, strict=True)])
-    return np.asarray(slowest < limits)
+    windows = [speed[i : max(j, i + 1)] for i, j in zip(first, last, strict=True)]
+    # the filter hides a short standstill at a reversal, so that only the sign of the speed shows it
+    slowest = [np.maximum(np.maximum(own.min(axis=0), -own.max(axis=0)), 0.0) for own in windows]
+    return np.asarray(np.array(slowest) < limits)
 
 
 def _smoothed_effort_noise(

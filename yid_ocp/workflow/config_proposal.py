@@ -11,23 +11,21 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import mean_sample_rate, white_noise_std
+from yid_ocp.data.channel_checks import mean_sample_rate, seen_noise_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
-from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.recorded_inputs import lowest_path_cutoff
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import RecordedChannelKind, additional_sensor_channel_kinds
-from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
+from yid_ocp.sensors.joints import is_noise_std_stated
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
 """Usual names of the frame at the end of an arm, most likely first."""
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
-_CUTOFF, _CUTOFF_LEVEL = 10.0, 1e-3  # least cutoff [Hz]; p-value of noise alone below which motion lies above it
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
@@ -189,7 +187,7 @@ def propose_config_choices(
         _places(tree, first, branches, holder, standing) | _sensor_places(tree, first, holder),
         _noise(first, recorded, joints),
         _time_step(period),
-        _path_cutoff(recordings, joints, period) if branches and mode == "prescribed" else min(_CUTOFF, 0.2 / period),
+        lowest_path_cutoff(recordings, joints if branches and mode == "prescribed" else ()),
         {group.name: _clock(group) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
         *_motor_and_gain(robot, mode, recordings),
@@ -480,13 +478,14 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
         if values is not None:
             noise = _GroupNoise(None, unit, _STATED_NOISE)
             if not is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions()):
-                noise = _GroupNoise(max(least, *(_size(recorded.t, values[:, j]) for j in at)), unit, _SEEN_NOISE)
+                sizes = [seen_noise_std(recorded.t, values[:, j]) for j in at]
+                noise = _GroupNoise(max(least, *sizes), unit, _SEEN_NOISE)
             found[f"joints.{channel}"] = noise
     for key, group, kind in _mounted_channels(recording):
         noise = _GroupNoise(None, kind.unit, _STATED_NOISE)
         if kind.std_attribute_names[0] not in group.noise_and_bias_stds_by_attribute:
             values = group.values_by_quantity[kind.quantity]
-            sizes = (_size(group.t, column) for column in values.reshape(len(values), -1).T)
+            sizes = [seen_noise_std(group.t, column) for column in values.reshape(len(values), -1).T]
             noise = _GroupNoise(max(1e-3, *sizes), kind.unit, _SEEN_NOISE)
         found[key] = noise
     return found | {group.name: _point_noise(group) for group in recording.points}
@@ -499,15 +498,11 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
     sizes = [0.0]
     for i in range(len(group.names)):
         seen = np.isfinite(group.position[:, i]).all(axis=1)
-        sizes += [_size(group.t[seen], column) for column in group.position[seen, i].T]
+        sizes += [seen_noise_std(group.t[seen], column) for column in group.position[seen, i].T]
     if slow or max(sizes) <= 0:
         std = _CAMERA_STD if slow else _MARKER_STD
         return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")
     return _GroupNoise(max(sizes), "m", _SEEN_NOISE)
-
-
-def _size(t: Array, values: Array) -> float:
-    return max(white_noise_std(t, values), quantization_step(values) / math.sqrt(12))
 
 
 def _time_step(period: float) -> float:
@@ -517,28 +512,6 @@ def _time_step(period: float) -> float:
     else:
         step = period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
     return float(f"{step:.3g}")
-
-
-def _path_cutoff(recordings: Sequence[Recording], joints: Sequence[str], period: float) -> float:
-    """Lowest cutoff [Hz], by octaves, above which recorded angles are noise alone; at most a fifth of the rate.
-
-    What a filter of twice the cutoff keeps beyond this one is compared with white noise of the angles' own size.
-    """
-    most = float(f"{0.2 / period:.3g}")
-    cutoff, groups = min(_CUTOFF, most), [r.joints for r in recordings if r.joints is not None]
-    channels = [(group.t, group.position[:, [group.names.index(name)]]) for group in groups for name in joints]
-    sizes = [_size(t, angle[:, 0]) for t, angle in channels]
-    while cutoff < most and min(sizes) > 0:
-        higher, p_values = LowPassFilter(min(2 * cutoff, most)), []
-        for (t, angle), std in zip(channels, sizes, strict=True):
-            impulse = std * (t == t[len(t) // 2])[:, None]
-            kept, noise = (higher(t, values) - LowPassFilter(cutoff)(t, values) for values in (angle, impulse))
-            degrees = 2 * (higher.cutoff - cutoff) * (t[-1] - t[0])
-            p_values.append(chi2_p_value(degrees * float(np.mean(kept**2) / np.sum(noise**2)), degrees))
-        if min(p_values) > _CUTOFF_LEVEL:
-            break
-        cutoff = higher.cutoff
-    return cutoff
 
 
 def _clock(group: JointGroup | PointGroup) -> str:

@@ -23,7 +23,7 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import EstimatedParameterCovariance, TargetMotionPlan, plan_motion_to_target
 from yid_ocp.problem.measurements import recording_time_grid
-from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
+from yid_ocp.problem.recorded_inputs import lowest_path_cutoff, prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
@@ -95,7 +95,8 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
     clamps = () if cable is None else cable.clamp_pose_definitions_from_points
     grid = recording_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = prescribed_coordinates_at_nodes(recording, system, grid, LowPassFilter(run.problem.path_cutoff), clamps)
+        low_pass = LowPassFilter(run.problem.path_cutoff or lowest_path_cutoff([recording], system.prescribed))
+        path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, clamps)
     return dict(zip(system.prescribed, map(float, path[0]), strict=True))
 
 
