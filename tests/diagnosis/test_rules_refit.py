@@ -223,11 +223,12 @@ def test_a_stored_refit_that_cannot_be_rolled_out_is_solved_again(solved):
 
 def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     asked, heard = [], Heard()
-    other, third = effect("offset@elbow"), effect("third@x")
+    other, third, lost = effect("offset@elbow"), effect("third@x"), effect("lost@x")
 
     def one(problem, effects, start, store, name, limits):
         asked.append((problem, [e.kind for e in effects], start, store, name, limits))
-        return None if effects[-1] is third else fit(effects, loss(1.2345, 1.2345))
+        left = math.inf if effects[-1] is lost else 1.2345
+        return None if effects[-1] is third else fit(effects, loss(left, left))
 
     monkeypatch.setattr(module, "refit_with_effects", one)
     search = RefitContext("problem", LIMITS, heard, "store")
@@ -246,9 +247,10 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         "refitted with offset@elbow: held-out chi2/n 1.234",
         "refitted with third@x: no fit",
     ]
+    assert refit_with_each_effect(search, (), [((lost,), {})], {}) == [], "it predicts no held-out recording"
     # from elsewhere they have names of their own in the store
     refit_with_each_effect(search, (effect("base@x"),), tried, {}, "from there")
-    assert sorted(name for *_, name, _ in asked[3:]) == [
+    assert sorted(name for *_, name, _ in asked[4:]) == [
         f"base@x and {label} from there" for label in ("friction@elbow", "offset@elbow", "third@x")
     ]
 
