@@ -357,21 +357,16 @@ def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting)
 
 
 @cases(
-    "known, in_blocks, start, solved",
-    {
-        "a solution is there": (3.0, False, {"k": 3.0}, 0),
-        "it is solved first": (None, False, {"k": 2.0}, 1),
-        "a part of it is held out": (None, True, {}, 0),
-    },
+    "known, start, solved",
+    {"a solution is there": (3.0, {"k": 3.0}, 0), "it is solved first": (None, {"k": 2.0}, 1)},
 )
-def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, in_blocks, start, solved):
+def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, solved):
     def solution(value):
         return SimpleNamespace(unknown_names=("k",), x=np.array([value]))
 
     asked = []
     monkeypatch.setattr(diagnosing, "solve", lambda *given, **how: asked.append(given) or solution(2.0))
     monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
-    composed = SimpleNamespace(is_split_in_blocks=in_blocks)
     given = None if known is None else solution(known)
-    assert diagnosing.fit_nominal_model("problem", composed, given) == start
+    assert diagnosing.fit_nominal_model("problem", "composed", given) == start
     assert len(asked) == solved

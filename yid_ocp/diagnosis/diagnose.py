@@ -351,17 +351,13 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
 def _fitted_nominal_model(
     search: RefitContext, start: Mapping[str, float], name: str = "the nominal model"
 ) -> RefittedModel:
-    """The nominal model fitted from a start, with whitening fixed near its end. Raises `SolverError` if it fails."""
-    problem, limits = search.problem, search.thresholds
-    for store in (NO_REFIT_STORE, search.store) if problem.problem.has_process_noise else (search.store,):
-        problem = problem.with_whitening_linearized_at(start)
-        # a gap may move parameters so far that the solver's equilibrium is not found again from there
-        runs = (refit_with_effects(problem, (), own, store, name, limits) for own in (start, {}))
-        fit = next(filter(None, runs), None)
-        if fit is None:
-            raise failed_rollout_error("it fails at the fitted values", "nominal model")
-        start = fit.values
-    assert fit is not None
+    """The nominal model fitted from a start, with whitening fixed there. Raises `SolverError` if it fails."""
+    problem = search.problem.with_whitening_linearized_at(start)
+    # a gap may move parameters so far that the solver's equilibrium is not found again from there
+    runs = (refit_with_effects(problem, (), own, search.store, name, search.thresholds) for own in (start, {}))
+    fit = next(filter(None, runs), None)
+    if fit is None:
+        raise failed_rollout_error("it fails at the fitted values", "nominal model")
     return fit
 
 
@@ -404,12 +400,8 @@ def fit_nominal_model(
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
     """Fit the nominal model within the problem with all candidates. Raises `SolverError` if the fit fails."""
-    start: Mapping[str, float] = {}
-    # a single recording that is both fitted and held out has no solution yet
-    if solution is None and not composed.is_split_in_blocks:
-        solution = solve(problem, GaussNewton(max_iterations=30), verdicts=False)
-    if solution is not None:
-        start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
+    solution = solution or solve(problem, GaussNewton(max_iterations=30), verdicts=False)
+    start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
 
 
