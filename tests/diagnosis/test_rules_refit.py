@@ -19,6 +19,7 @@ from yid_ocp.diagnosis.refit import (
     refit_with_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.errors import SolverError
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import Status
 
@@ -253,6 +254,16 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     assert sorted(name for *_, name, _ in asked[4:]) == [
         f"base@x and {label} from there" for label in ("friction@elbow", "offset@elbow", "third@x")
     ]
+
+
+def test_where_the_model_with_all_candidates_fails_there_are_none(monkeypatch):
+    def snap(problem, base, values):
+        raise SolverError("it snaps", where="model")
+
+    monkeypatch.setattr(module, "screen_candidates", snap)
+    search = RefitContext("problem", LIMITS, Heard())
+    assert search.screen((FRICTION,), {A: 0.7}, "beside it").candidate_scores == ()
+    assert list(search.record.screenings) == ["beside it"]
 
 
 def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypatch):

@@ -34,7 +34,6 @@ from yid_ocp.inference.uncertainty import priors_that_determine_unknown
 _EFFECT = "kind location"
 _PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
-_PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range without a message
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that cannot be moved by themselves
 _GAP_ORIGIN_PHRASES = {
@@ -249,18 +248,6 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in a text on gap, locations, effects, events and the next experiment."""
     text = [_gap(result)]
-    stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
-    step = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
-    links = "The error of few links looks like a gap. It was removed here; other commands need more links."
-    notes = (
-        (stated != used, f"The discretisation error of {stated} s steps looks like a gap, {step}."),
-        (result.is_corrected_for_links, links),
-        (
-            result.is_split_in_blocks,
-            "No other recording could be held out, so alternate blocks of the recordings were.",
-        ),
-    )
-    text += [note for applies, note in notes if applies]
     if result.verdict not in ("insufficient_data", "no_gap"):
         text += [_places(result), *_causes(result), *_remains(result)]
     if result.law is not None:
@@ -268,6 +255,16 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     stopped = f"The search stopped after {result.search_seconds:.3g} s; it would go on with "
     text += [_listed(stopped, result.untried), *map(held_out_truncation_message, result.truncated_recordings)]
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
+    stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
+    step = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
+    links = "The error of few links looks like a gap. It was removed here; other commands need more links."
+    blocks = "No other recording could be held out, so alternate blocks of the recordings were."
+    notes = (
+        (stated != used, f"The discretisation error of {stated} s steps looks like a gap, {step}."),
+        (result.is_corrected_for_links, links),
+        (result.is_split_in_blocks, blocks),
+    )
+    text += [note for applies, note in notes if applies]
     events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
     text += [_listed("Excluded as brief disturbances: ", events), *ignored_after_overspeed_messages(result.events)]
     return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
@@ -387,10 +384,8 @@ def _named(effect: EffectBase, fit: RefitStatistics) -> str:
     for name, r in fit.effect_parameters_as_reported(effect).items():
         known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
-    for name in effect.amplitude_parameter_names:
-        (low, high), value = effect.prior_ranges[name], fit.values[name]
-        if abs(value - 0.5 * (low + high)) > (0.5 + _PRIOR_RANGE_TOLERANCE) * (high - low):
-            odd = f" (outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
+    for low, high in map(effect.prior_ranges.__getitem__, fit.amplitudes_beyond_prior_range(effect)):
+        odd = f" (outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
     return f"{effect.label} with {', '.join(values)}{odd}"
 
 

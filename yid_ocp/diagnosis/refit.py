@@ -6,6 +6,7 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import time
@@ -17,10 +18,11 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
-from yid_ocp.diagnosis.screening import ScoredCandidatePair, ScreeningResult, screen_candidates
+from yid_ocp.diagnosis.screening import NO_CANDIDATES, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
+from yid_ocp.errors import SolverError
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_factor
 from yid_ocp.inference.whitening import (
@@ -41,6 +43,7 @@ REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_toleranc
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
+_PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -98,6 +101,12 @@ class RefitStatistics(StoredFit):
     def effect_parameters_as_reported(self, effect: EffectBase) -> dict[str, ReportedParameterValue]:
         """Fitted parameters of an effect in reported units, with standard deviations."""
         return effect.parameters_as_reported(self.values, self.std)
+
+    def amplitudes_beyond_prior_range(self, effect: EffectBase) -> list[str]:
+        """Names of an effect's amplitudes beyond their prior range by more than a quarter of its width."""
+        ranges = {name: effect.prior_ranges[name] for name in effect.amplitude_parameter_names}
+        far = {name: abs(self.values[name] - (low + high) / 2) / (high - low) for name, (low, high) in ranges.items()}
+        return [name for name, away in far.items() if away > 0.5 + _PRIOR_RANGE_TOLERANCE]
 
 
 @dataclass(frozen=True)
@@ -193,8 +202,17 @@ class RefitContext:
         return refit_with_effects(whitened, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
-        """Screen all candidates in addition to some effects. `name` says which fit provides `values`."""
-        return self._answer(self.record.screenings, name, lambda: screen_candidates(self.problem, base, values))
+        """Screen all candidates in addition to some effects. `name` says which fit provides `values`.
+
+        There are no candidates if the model with all of them cannot be simulated at these values.
+        """
+
+        def screened() -> ScreeningResult:
+            with contextlib.suppress(SolverError):
+                return screen_candidates(self.problem, base, values)
+            return NO_CANDIDATES
+
+        return self._answer(self.record.screenings, name, screened)
 
     def ranked_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, without one label. See `_MAX_RECORDED_PAIRS`."""

@@ -362,6 +362,12 @@ class ScreeningResult:
     joint_score_model: AllCandidatesScoreModel
 
 
+NO_CANDIDATES = ScreeningResult(
+    (), (), ConfusabilityMatrix((), np.zeros((0, 0))), AllCandidatesScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
+)
+"""Screening where the model cannot be simulated: no candidate is known there."""
+
+
 def screen_candidates(
     problem: AllCandidatesProblem,
     base: Sequence[EffectBase],

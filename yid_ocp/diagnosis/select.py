@@ -17,7 +17,6 @@ from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics, 
 from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
-from yid_ocp.errors import SolverError
 
 _MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not noise
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
@@ -297,10 +296,7 @@ def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
     where = "from the earlier run's parameters"
     if search.record_skip_if_past_deadline(f"candidates {where}"):
         return []
-    try:
-        screened = search.screen((), {}, where)
-    except SolverError:
-        return []
+    screened = search.screen((), {}, where)
     return refit_with_each_effect(search, (), _refit_shortlist(screened, search.thresholds), {}, where)
 
 

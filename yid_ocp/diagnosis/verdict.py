@@ -23,6 +23,7 @@ UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
 
 _LOGISTIC_OFFSET, _LOGISTIC_SLOPE = 0.3, 1.3  # of the probability of effects over the logarithm of what is unexplained
+_LOG_ODDS_PER_DOUBT = 1.5  # by which implausible amplitudes, or a gap along one effect alone, lower the probability
 _MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
@@ -211,10 +212,11 @@ def judge(
     said = Judgement("", "", fits, added, explained, carried, 0.0)
     exceeds, suffice = evidence.exceeds_noise(limits), evidence.are_data_sufficient(limits)
     verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
-    return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
+    probability = _probability(said, exceeds, limits)
+    return replace(said, verdict=verdict, unknown_reason=reason, probability=probability)
 
 
-def _probability(said: Judgement, limits: Thresholds) -> float:
+def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> float:
     """Probability that the selected effects are the cause, from how much they explain of what is required.
 
     A logistic curve with constants set by hand on recordings of known cause; see `docs/design/verdicts.md`.
@@ -224,7 +226,10 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
     explained = 0.0 if said.failed_transfer_checks else said.fitted_or_held_out_explained_fraction
     unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
     margin = math.log((1.0 - said.required_total_explained_fraction(limits)) / unexplained)
-    return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
+    fit = said.selected_effects[-1].refitted_model
+    is_substitute = any(fit.amplitudes_beyond_prior_range(effect) for effect in fit.effects)
+    log_odds = _LOGISTIC_OFFSET + _LOGISTIC_SLOPE * margin - _LOG_ODDS_PER_DOUBT * (is_substitute + (not exceeds_noise))
+    return 1.0 / (1.0 + math.exp(-log_odds))
 
 
 def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits: Thresholds) -> float:
