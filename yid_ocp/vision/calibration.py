@@ -36,7 +36,7 @@ from yid_ocp.vision.camera_registration import (
     pooled_surface_observation_fractions,
     robust_gradient_and_hessian,
 )
-from yid_ocp.vision.point_cloud import weighted_median
+from yid_ocp.vision.point_cloud import MAD_TO_STD, weighted_median
 
 _OFF_ARM_DISTANCE = 0.04  # distance from the arm up to which a point belongs to it [m]
 _MAX_START_POINTS = 5000  # points of a frame among which starts are tried
@@ -50,7 +50,7 @@ _MIN_STAMP_ERROR = 0.02  # smallest deviation of a stamp from the common offset 
 _STAMP_ERROR_STDS = 4.0  # standard deviations
 _ARM_SHIFT_STD = 1e-3  # std of the arm's position in one frame relative to the calibration [m]
 _CORRELATED_GROUP_SIZE = 3.0  # group size of random points with correlated errors
-_MAD_TO_STD, _MIN_POINT_STD = 1.4826, 1e-3  # median absolute deviation to std; [m]
+_MIN_POINT_STD = 1e-3  # [m]
 _MAX_CLOCK_STEP = 0.05  # largest change of an offset in one iteration [s]
 _MAX_STAMP_DELAY = 0.03  # deviation of a stamp from the common offset that is allowed, as are four stds [s]
 _DRIFT_PRIOR_STD, _MAX_CLOCK_OFFSET_STD = 1e-3, 0.02  # of the camera's clock: std of its drift; largest std [s]
@@ -118,7 +118,7 @@ def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: floa
         met = arm.match_points_to_surface(points + x[1:], origin, t - x[0], share * _OFF_ARM_DISTANCE, along=True)
         if len(met.normal_distance) < MIN_ARM_POINTS_PER_FRAME:
             break
-        sigma = max(_MAD_TO_STD * float(np.median(np.abs(met.normal_distance))), _MIN_POINT_STD)
+        sigma = max(MAD_TO_STD * float(np.median(np.abs(met.normal_distance))), _MIN_POINT_STD)
         slope = np.column_stack([met.normal_velocity, met.normal])
         prior = np.array([0.0, *[_CORRELATED_GROUP_SIZE * (sigma / _ARM_SHIFT_STD) ** 2] * 3])
         hessian = slope.T @ slope + np.diag(prior) + 1e-9 * np.eye(4)

@@ -36,6 +36,7 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import CameraIntrinsics
+from yid_ocp.vision.point_cloud import MAD_TO_STD
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces
 
 ROTATION_SLICE, TRANSLATION_SLICE = slice(0, 3), slice(3, 6)
@@ -55,7 +56,6 @@ _MIN_START_SEPARATION = 0.08  # starts nearer together are one [m]
 _MIN_INCIDENCE_COSINE = 0.3  # cosine of ray and normal below which a point is not used
 _VELOCITY_TIME_STEP = 0.01  # over which velocities are taken [s]
 _MESH_ERROR_PATCH_SIZE = 0.08  # size of a link's patch with a common mesh error [m]
-_MAD_TO_STD = 1.4826
 _ROBUST_SCALE_STDS = 2.5  # scale of the robust sum in standard deviations
 _MIN_POINT_STD = 1e-3  # [m]
 _MIN_CURVATURE_FRACTION = 0.2  # lower bound of the robust sum's curvature, relative to that of its weights
@@ -255,7 +255,7 @@ class RobustCostDerivatives:
 def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostDerivatives:
     """Gradient and Hessian of the robust cost over all points of all frames, scaled by their median error."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    sigma = max(_MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
+    sigma = max(MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
     square = (residuals / min(_ROBUST_SCALE_STDS * sigma, reach)) ** 2
     weight = 1 / (1 + square) ** 2 / sigma**2
     scores = jacobian * (weight * residuals)[:, None]

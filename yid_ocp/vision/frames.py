@@ -189,14 +189,12 @@ class FrameSequence:
         return self.load_cloud(index) @ self.camera_pose[:3, :3].T + self.camera_pose[:3, 3]
 
     @staticmethod
-    def from_clouds(
-        t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence"
-    ) -> FrameSequence:
+    def from_clouds(t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike) -> FrameSequence:
         """Make a frame sequence from clouds (N, 3) [m] in the camera's frame, with stamps `t` (M,) [s]."""
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
-        camera = validated_camera_pose(pose, source)
-        return FrameSequence(np.asarray(t, float), names, camera, arrays.__getitem__, None, source)
+        camera = validated_camera_pose(pose, "sequence")
+        return FrameSequence(np.asarray(t, float), names, camera, arrays.__getitem__)
 
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:

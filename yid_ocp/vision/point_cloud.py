@@ -32,7 +32,7 @@ _REACH_MARGIN = 0.1  # beyond the longest branch, from the object's root [m]
 _MIN_SEGMENT_POINTS = 15  # a segment of the skeleton with fewer points gives no node
 _NODE_NEIGHBOURS = 4  # of a node in the skeleton's graph
 _MIN_COMPONENT_FRACTION = 0.04  # of the points; a smaller connected part is not part of the object
-_MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
+MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ def statistical_inlier_mask(cloud: WeightedCloud, mask: BoolArray | None = None)
     some = np.arange(0, len(cloud), max(1, len(cloud) // _SPACING_SAMPLE_POINTS))
     distance = apart(some)
     middle = weighted_median(distance, cloud.point_weights[some])
-    spread = _MAD_TO_STD * weighted_median(np.abs(distance - middle), cloud.point_weights[some])
+    spread = MAD_TO_STD * weighted_median(np.abs(distance - middle), cloud.point_weights[some])
     index = np.flatnonzero(np.ones(len(cloud), bool) if mask is None else mask)
     stays = np.zeros(len(cloud), bool)
     stays[index] = apart(index) <= middle + _OUTLIER_Z_MAX * spread

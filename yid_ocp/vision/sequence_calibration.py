@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
+from yid_ocp.vision.point_cloud import MAD_TO_STD
 from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, tube_link_projections
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
@@ -34,7 +35,6 @@ _SAME_THING_DISTANCE = 1.0  # of a cluster's size; closer clusters in other fram
 _MAX_STILL_WANDER = 0.3  # of its size; largest motion of the centre of a static object
 _MAX_FOLLOWING_WANDER = 0.5  # of its motion in the world, below which an object moves with a link
 _MIN_REPORTED_FRAMES = 2  # frames in which a thing is worth a word
-_MAD_TO_STD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
     """Link relative to which positions move much less than in the world; empty if none."""
 
     def wandering(own: Array) -> float:
-        return _MAD_TO_STD * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
+        return MAD_TO_STD * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
 
     inside = {"": math.inf}
     for name in poses[0]:
@@ -300,7 +300,7 @@ def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
     keep = np.ones(len(fits), bool)
     for column in ends[:, np.isfinite(ends).any(axis=0)].T:
         off = np.abs(column - np.nanmedian(column))
-        keep &= np.isnan(column) | (off < _OUTLIER_END_STDS * max(_MAD_TO_STD * float(np.nanmedian(off)), noise))
+        keep &= np.isnan(column) | (off < _OUTLIER_END_STDS * max(MAD_TO_STD * float(np.nanmedian(off)), noise))
     return [fit for fit, good in zip(fits, keep, strict=True) if good]
 
 

@@ -20,13 +20,12 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import OcclusionMap
-from yid_ocp.vision.point_cloud import weighted_median
+from yid_ocp.vision.point_cloud import MAD_TO_STD, weighted_median
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd
 
 _HIDDEN_SIDE_COSINE = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
 _MIN_LINK_STATIONS = 6  # fewest stations per link at which coverage is tested
 _ON_SURFACE_STDS = 3.0  # distance from the surface within which a point lies on it
-_MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
 _MAX_LINK_SPACINGS = 3.0  # times the usual spacing, within which two points are connected
 _MIN_THING_POINTS = 12  # points of a thing
 _FOREIGN_SURFACE_FRACTION = 0.5  # foreign fraction of the surface around a point, at which a thing continues there
@@ -165,7 +164,7 @@ def fit_quality_and_point_classes(
     tree, spacing = seen._point_tree, seen._point_spacing
     noise = near / _ON_SURFACE_STDS
     if close.any():
-        noise = _MAD_TO_STD * weighted_median(size[close], seen.point_weights[close])
+        noise = MAD_TO_STD * weighted_median(size[close], seen.point_weights[close])
     # positions are not known better than the spacing of the points
     noise = max(noise, spacing / math.sqrt(12.0))
     gate = min(_ON_SURFACE_STDS * noise, near)
