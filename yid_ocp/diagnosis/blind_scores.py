@@ -12,8 +12,11 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal, cast
 
 import numpy as np
+import scipy.optimize
+import scipy.special
 import scipy.stats
 
+from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
 from yid_ocp.diagnosis.refit import EffectSearchResults, RefitContext, RefitStatistics
@@ -255,15 +258,38 @@ def _calibration_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     z = [abs(value) for m in marks if m.category == "single" for value in m.z.values()]
     p = [m.p_value for m in marks if m.category == "null" and math.isfinite(m.p_value)]
     quantiles = {a: float(scipy.stats.norm.ppf(0.5 * (1 + a))) for a in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)}
-    named = sorted((m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-" and m.probability >= 0)
-    bins = [own for own in np.array_split(np.array(named, float).reshape(-1, 2), 5) if len(own)]
+    named = _probabilities_and_outcomes(marks)
+    bins = [own for own in np.array_split(named, 5) if len(own)]
     errors = [abs(float(np.sum(own[:, 0] - own[:, 1]))) for own in bins]
     return {
         "probabilities": [{"level": float(own[:, 0].mean()), **_binomial_proportion([*own[:, 1]])} for own in bins],
-        "expected_calibration_error": sum(errors) / len(named) if named else None,
+        "expected_calibration_error": sum(errors) / len(named) if len(named) else None,
         "intervals": [{"level": a, **_binomial_proportion([x <= q for x in z])} for a, q in quantiles.items()],
         "p_values": [{"level": a, **_binomial_proportion([x < a for x in p])} for a in (0.01, 0.05, 0.1, 0.2, 0.5)],
     }
+
+
+def _probabilities_and_outcomes(marks: Sequence[BlindCaseScore]) -> Array:
+    """Probabilities of the named sets, ascending, and whether they hold the cause (1 or 0), (n, 2)."""
+    named = sorted((m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-" and m.probability >= 0)
+    return np.array(named, float).reshape(-1, 2)
+
+
+def _log_odds_regression(marks: Sequence[BlindCaseScore]) -> dict[str, float]:
+    """Logistic regression of whether named sets hold the cause on the log odds of their probabilities.
+
+    The log odds that agree with the outcomes are `offset` + `slope` x the stated ones. Priors 0 ± 1 and 1 ± 0.5 keep
+    both finite where all sets are right.
+    """
+    probabilities, outcomes = _probabilities_and_outcomes(marks).T
+    log_odds, sides = scipy.special.logit(probabilities), 2 * outcomes - 1
+
+    def cost(line: Array) -> float:
+        misfit = np.logaddexp(0.0, -sides * (line[0] + line[1] * log_odds)).sum()
+        return float(misfit + line[0] ** 2 / 2 + ((line[1] - 1) / 0.5) ** 2 / 2)
+
+    offset, slope = map(float, scipy.optimize.minimize(cost, [0.0, 1.0]).x)
+    return {"cases": len(outcomes), "right": float(outcomes.sum()), "offset": offset, "slope": slope}
 
 
 _CALIBRATION_FORMAT = "yid-calibration/1"
@@ -400,7 +426,8 @@ def calibrate_thresholds(
             "effects_beyond": {f"{size:.3g}": _binomial_proportion(hits) for size, hits in beyond.items()},
             "strange_beyond": _binomial_proportion(strange),
         }
-    return {"format": _CALIBRATION_FORMAT, "asked": coverage, "rules": found, "settings": _recommended_settings(found)}
+    odds, settings = _log_odds_regression(marks), _recommended_settings(found)
+    return {"format": _CALIBRATION_FORMAT, "asked": coverage, "rules": found, "log_odds": odds, "settings": settings}
 
 
 def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
