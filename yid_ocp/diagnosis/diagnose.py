@@ -158,13 +158,13 @@ def _examined(
     screened = screen_candidates(composed, (), nominal.values)
     evidence = NominalModelGapEvidence(nominal, *tests, screened)
     _end_stage(search, "screening")
-    if evidence.warrants_search(limits):
+    if evidence.warrants_search(limits) and not is_corrected_for_links:
         # without the error of its discretisation, the gap may be none
         gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
         fall = _fall_at_half_time_step(search, nominal, events)
         if fall > gap / 2:
             return _examined(*_at_half_time_step(search, nominal, fall))
-        corrected = None if is_corrected_for_links else _without_error_of_links(with_events, nominal, gap)
+        corrected = _without_error_of_links(with_events, nominal, gap)
         if corrected is not None:
             return _examined(*corrected, cuts, True)
     found = nominal, cuts, whole, events, smoothed, evidence, is_corrected_for_links
@@ -191,15 +191,18 @@ def _at_half_time_step(search: RefitContext, fit: RefittedModel, fall: float) ->
 def _without_error_of_links(
     search: RefitContext, fit: RefittedModel, gap: float
 ) -> tuple[RefitContext, RefittedModel] | None:
-    """Hypotheses and nominal fit on data without the error of the links, if twice the links close half of the gap."""
+    """Hypotheses and nominal fit on data without the error of the links, if half of the gap is closed there."""
     search.progress.begin_stage("trying twice the links", 1.0, 8.5)
     composed, x = search.problem.problem, fit.problem.unknown_vector(fit.values)
     corrected = problem_without_error_of_links(composed, x, fit.evaluation, gap / 2)
     if corrected is None:
         return None
-    search.progress.begin_stage("twice the links close half of the gap: going on without this error")
     search = replace(search, problem=replace(search.problem, problem=corrected))
-    return search, _fitted_nominal_model(search, fit.values)
+    refitted = _fitted_nominal_model(search, fit.values, "the nominal model without the error of links")
+    if not 2 * (fit.cost - refitted.cost) > gap / 2:
+        return None
+    search.progress.begin_stage("twice the links close half of the gap: going on without this error")
+    return search, refitted
 
 
 def _followed(
