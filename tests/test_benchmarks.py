@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import importlib.util
 import json
 import subprocess
 import sys
@@ -275,3 +278,13 @@ def test_each_published_value_of_a_comparison_has_one_sentence(benchmark_module)
         assert module.explain(result) == []
     assert module.is_within_range(0.0, [0.04, 5.0])
     assert not module.is_within_range(0.0, [0.06, 5.0])
+
+
+def test_every_name_that_a_benchmark_imports_exists(repository):
+    for file in sorted((repository / "benchmarks").rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "yid_ocp":
+                module = importlib.import_module(node.module)
+                missing = [own.name for own in node.names if not hasattr(module, own.name)]
+                submodules = [name for name in missing if importlib.util.find_spec(f"{node.module}.{name}")]
+                assert missing == submodules, f"{file.name}: {node.module}"
