@@ -1,13 +1,14 @@
 """Innovations against dense algebra: the covariance of all residuals from rollouts whose inputs are wrong."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from held_rod import held_rod
 from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recording, seen, taken
 
-from yid_ocp.inference import kalman
+from yid_ocp.inference import kalman, whitening
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
@@ -275,3 +276,37 @@ def test_what_may_act_on_a_held_rod(urdf_folder):
         expected[f"T1.push_{axis}"] = ("T1", "push", pytest.approx(0.1 * 0.1 * 9.81))
         expected[f"points_arm.w_T1.{axis}"] = ("hand", "bias", pytest.approx(3 * 0.01))
     assert found == expected
+
+
+@dataclass
+class _Errors:
+    torque_bias: np.ndarray
+    torque_bias_std: np.ndarray
+
+
+@dataclass
+class _OvershootingFilter:
+    """Its estimate lies three times as far beyond the true offset 1 as the offset is short of it."""
+
+    input_error_model: _Errors
+
+    def whiten_and_estimate_torque_bias(self, rows, push):
+        apart = self.input_error_model.torque_bias[:, None] - 1.0
+        return apart, 1.0 - 3.0 * apart
+
+
+@dataclass
+class _Recorded:
+    input_errors: _Errors
+
+
+def test_a_torque_offset_whose_linear_estimate_overshoots_is_approached_by_halves(monkeypatch):
+    monkeypatch.setattr(whitening, "_plain", lambda episode, result: np.zeros(1))
+    predictor = SimpleNamespace(
+        theta_with_episode_values=lambda episode, theta: theta,
+        corrected_inputs=lambda episode, theta, names: SimpleNamespace(torque=np.zeros((3, 1))),
+        predict_episode=lambda *given: SimpleNamespace(feedback_torque_and_sensitivity=None),
+    )
+    errors = _Errors(np.zeros(1), np.ones(1))
+    found = whitening._settled(predictor, _OvershootingFilter(errors), _Recorded(errors), *3 * [np.zeros(1)])
+    np.testing.assert_allclose(found.input_error_model.torque_bias, 1.0, atol=0.3)

@@ -455,12 +455,21 @@ def _settled(
         return replace(whitening, input_error_model=replace(whitening.input_error_model, torque_bias=offset))
 
     made = trial = about(whitening.input_error_model.torque_bias + np.mean(now - before, axis=0))
+    least = np.inf
     for _ in range(_MAX_ROLLOUTS if np.any(whitening.input_error_model.torque_bias_std > 0) else 0):
         own = replace(episode, input_errors=trial.input_error_model)
         result = predictor.predict_episode(own, theta, start, False)
         if isinstance(result, str):
             break
-        made, trial = trial, about(estimate_episode_torque_bias(own, result, trial))
+        push = result.feedback_torque_and_sensitivity
+        innovations, bias = trial.whiten_and_estimate_torque_bias(_plain(own, result)[:, None], push)
+        cost = float(np.sum(innovations[:, 0] ** 2))
+        if cost < least:
+            least, made, offset = cost, trial, bias[:, 0]
+        else:
+            # with dry friction, the linear estimate can be too far
+            offset = (made.input_error_model.torque_bias + trial.input_error_model.torque_bias) / 2
+        trial = about(offset)
         if _apart(trial, made) < _TORQUE_BIAS_TOLERANCE:
             break
     return made
