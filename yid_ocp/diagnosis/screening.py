@@ -92,9 +92,7 @@ def _shape_grid(effect: EffectBase, size: int = _SHAPE_GRID_SIZE) -> list[dict[s
 
 
 def linearize_candidates(
-    problem: AllCandidatesProblem,
-    base: Sequence[EffectBase],
-    values: Mapping[str, float],
+    problem: AllCandidatesProblem, base: Sequence[EffectBase], values: Mapping[str, float]
 ) -> ProjectedCandidatesLinearization:
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
@@ -166,9 +164,7 @@ def _basis(matrix: Array) -> Array:
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
 
 
-def _candidate_detectable_amplitudes(
-    point: ProjectedCandidatesLinearization,
-) -> tuple[CandidateDetectability, ...]:
+def _candidate_detectable_amplitudes(point: ProjectedCandidatesLinearization) -> tuple[CandidateDetectability, ...]:
     """Smallest amplitudes of every candidate that are detectable at `DETECTABLE_AMPLITUDE_Z` stds."""
     found: dict[str, list[CandidateDetectability]] = {}
     for signature in point.signatures:
@@ -369,9 +365,7 @@ NO_CANDIDATES = ScreeningResult(
 
 
 def screen_candidates(
-    problem: AllCandidatesProblem,
-    base: Sequence[EffectBase],
-    values: Mapping[str, float],
+    problem: AllCandidatesProblem, base: Sequence[EffectBase], values: Mapping[str, float]
 ) -> ScreeningResult:
     """Screen all candidates not in `base` at `values` for detectability, scores and confusability."""
     point = linearize_candidates(problem, base, values)
