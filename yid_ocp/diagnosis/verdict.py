@@ -22,8 +22,8 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
 
-_LOGISTIC_OFFSET, _LOGISTIC_SLOPE = 0.3, 1.3  # of the probability of effects over the logarithm of what is unexplained
-_LOG_ODDS_PER_DOUBT = 1.5  # by which implausible amplitudes, or a gap along one effect alone, lower the probability
+_LOGISTIC_OFFSET, _LOGISTIC_SLOPE = 0.24, 1.05  # of the probability of effects over the logarithm of what is unexplained
+_LOG_ODDS_PER_DOUBT = 1.2  # by which implausible amplitudes, or a gap along one effect alone, lower the probability
 _MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
@@ -219,7 +219,7 @@ def judge(
 def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> float:
     """Probability that the selected effects are the cause, from how much they explain of what is required.
 
-    A logistic curve with constants set by hand on recordings of known cause; see `docs/design/verdicts.md`.
+    A logistic curve fitted to a calibration ensemble; see `docs/design/verdicts.md`.
     """
     if not said.selected_effects:
         return 0.0
