@@ -11,10 +11,14 @@ from factories import cases
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.diagnosis import law
 from yid_ocp.diagnosis.diagnose import _held_out_null_test, diagnose, fit_nominal_model
+from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
-from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_smoother_unknowns
@@ -230,6 +234,19 @@ def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
     # and what is looked for beside it stands on the same ground
     beside = linearize_candidates(made, [spring], found.values)
     assert 0.95 < float(beside.projected_residual @ beside.projected_residual) / (2 * found.cost) < 1.001
+
+
+def test_a_law_is_sought_at_another_joint_than_that_of_a_named_effect(sprung):
+    """The named effect is refitted in the step of its own joint, which lacks the law."""
+    problem, made = sprung
+    spring = next(e for e in made.candidate_effects if e.kind == "joint_spring")
+    nominal = fit_nominal_model(problem, made)
+    found = refit_with_effects(replace(made, problem=nominal.problem), [spring], nominal.values)
+    assert found.problem.step is not made.problem.step
+    search, sought = RefitContext(made, Thresholds(), NULL_PROGRESS), law._neutral_law(found, "elbow", ("angle",))
+    before, families = law._refitted_families(search, problem, found, [sought], NO_EVENTS)
+    assert [own.law.location for own in families] == ["elbow"]
+    assert families[0].fit.cost <= before.cost
 
 
 def with_absent(step: Step, effect: str) -> Step:

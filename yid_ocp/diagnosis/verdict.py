@@ -22,7 +22,7 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
 
-_LOGISTIC_OFFSET, _LOGISTIC_SLOPE = 0.24, 1.05  # of the probability of effects over the logarithm of what is unexplained
+_LOGISTIC_OFFSET, _LOGISTIC_SLOPE = 0.24, 1.05  # of the log odds over the logarithm of what is unexplained
 _LOG_ODDS_PER_DOUBT = 1.2  # by which implausible amplitudes, or a gap along one effect alone, lower the probability
 _MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
