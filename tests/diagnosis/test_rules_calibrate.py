@@ -102,16 +102,14 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
     assert found["candidate"]["quantile"] == 1e-6
 
 
-@pytest.mark.parametrize(
-    ("right", "wrong", "low", "high"), [(80, 20, 0.76, 0.84), (9, 1, 0.8, 0.95), (20, 0, 0.9, 0.99)]
-)
-def test_stated_log_odds_are_fitted_to_the_outcomes(right: int, wrong: int, low: float, high: float) -> None:
+@pytest.mark.parametrize(("right", "wrong", "low"), [(80, 20, 0.76), (9, 1, 0.82), (20, 0, 0.9)])
+def test_stated_log_odds_are_fitted_to_the_outcomes(right: int, wrong: int, low: float) -> None:
     named = [case("single", "effect", DAMPER, multiple=1.0) for _ in range(right)]
     false = replace(named[0][0], injected=(replace(DAMPER, location="T2"),))
     named += [(false, score_blind_case(false, named[0][2]["result"]), named[0][2]) for _ in range(wrong)]
     line = calibrated(*named)["log_odds"]
     assert (line["cases"], line["right"]) == (right + wrong, right)
-    assert low < 1 / (1 + math.exp(-line["offset"] - line["slope"] * math.log(9.0))) < high
+    assert low < 1 / (1 + math.exp(-line["offset"] - line["slope"] * math.log(9.0))) < low + 0.1
 
 
 def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:

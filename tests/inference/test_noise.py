@@ -1,6 +1,6 @@
 """Innovations against dense algebra: the covariance of all residuals from rollouts whose inputs are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -278,10 +278,7 @@ def test_what_may_act_on_a_held_rod(urdf_folder):
     assert found == expected
 
 
-@dataclass
-class _Errors:
-    torque_bias: np.ndarray
-    torque_bias_std: np.ndarray
+_Errors = make_dataclass("_Errors", ["torque_bias", "torque_bias_std"])
 
 
 @dataclass
@@ -295,11 +292,6 @@ class _OvershootingFilter:
         return apart, 1.0 - 3.0 * apart
 
 
-@dataclass
-class _Recorded:
-    input_errors: _Errors
-
-
 def test_a_torque_offset_whose_linear_estimate_overshoots_is_approached_by_halves(monkeypatch):
     monkeypatch.setattr(whitening, "_plain", lambda episode, result: np.zeros(1))
     predictor = SimpleNamespace(
@@ -308,5 +300,6 @@ def test_a_torque_offset_whose_linear_estimate_overshoots_is_approached_by_halve
         predict_episode=lambda *given: SimpleNamespace(feedback_torque_and_sensitivity=None),
     )
     errors = _Errors(np.zeros(1), np.ones(1))
-    found = whitening._settled(predictor, _OvershootingFilter(errors), _Recorded(errors), *3 * [np.zeros(1)])
+    recorded = make_dataclass("_Recorded", ["input_errors"])(errors)
+    found = whitening._settled(predictor, _OvershootingFilter(errors), recorded, *3 * [np.zeros(1)])
     np.testing.assert_allclose(found.input_error_model.torque_bias, 1.0, atol=0.3)

@@ -17,13 +17,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP, AllCandidatesProblem
-from yid_ocp.diagnosis.refit import (
-    HeldOutLoss,
-    RefitContext,
-    RefittedModel,
-    refit_with_effects,
-    restore_in_all_candidates_step,
-)
+from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
 from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.law import (
@@ -184,11 +178,10 @@ def _refitted_families(
 ) -> tuple[RefittedModel | None, list[_RefittedLaw]]:
     """The model without a law, refitted together with the laws in one step, and refits of the best families."""
     composed = _composed_with_laws(search, problem, last, laws, events)
-    before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
+    whole = replace(composed, functions_of_place=None)  # in the step that has the laws
+    before = refit_with_effects(whole, last.effects, last.values, limits=search.thresholds)
     if before is None:
         return None, []
-    # the refit's step may contain the effects of one location only
-    before = restore_in_all_candidates_step(composed, before)
     composed = replace(composed, problem=before.problem.with_free_parameters_without_recompiling(problem.free))
     found = []
     for family in _ranked_families(composed, before, laws):
