@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
+from yid_ocp.analysis import estimation
 from yid_ocp.cli import main
 from yid_ocp.errors import DataError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.workflow import simulate as simulate_module
-from yid_ocp.workflow import solve as solve_module
 
 
 def test_a_solve_that_does_not_converge(carried_out, pendulum):
@@ -48,7 +48,7 @@ def test_a_bug_is_told_from_wrong_input(cli, pendulum, left_nothing, monkeypatch
     def broken(*arguments, **named):
         raise ZeroDivisionError("a mistake of ours")
 
-    monkeypatch.setattr(solve_module, "solve", broken)
+    monkeypatch.setattr(estimation, "solve", broken)
     done = cli("solve", pendulum)
     assert done.code == 3
     assert "Traceback" not in done.err
@@ -69,7 +69,7 @@ def test_an_interruption_is_one_whatever_a_library_makes_of_it(cli, pendulum, le
         raise made_of_it
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr(solve_module, "solve", swallowed)
+    monkeypatch.setattr(estimation, "solve", swallowed)
     done = cli("solve", pendulum)
     signal.signal(signal.SIGINT, before)
     assert done.code == 130
@@ -78,7 +78,7 @@ def test_an_interruption_is_one_whatever_a_library_makes_of_it(cli, pendulum, le
 
 
 WAITING = """
-import signal, sys, time, yid_ocp.workflow.solve as s
+import signal, sys, time, yid_ocp.analysis.estimation as s
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
 def wait(*a, **k):
     print('SOLVING', flush=True)

@@ -78,7 +78,7 @@ def test_scores_scatter_with_the_encoders_noise_that_moves_an_arm(urdf_folder, h
     monkeypatch.setattr(null_test, "_N_PATH_NOISE_DRAWS", 12)
     step = pendulum_step(urdf_folder, **how)
     recording = taken(step, 3, camera=False, steps=80)
-    problem = EstimationProblem(step, [recording], ("elbow.damping",))
+    problem = EstimationProblem(step, [recording], ("elbow.damping",), ProblemOptions(path_cutoff=10.0))
     found = encoder_noise_residual_factor(problem, x := problem.initial_unknowns)
     channels = channels_with_residual_indices(problem)
     rows = np.concatenate([c.residual_indices for c in channels if c.group == "points_arm"])
@@ -90,7 +90,7 @@ def test_scores_scatter_with_the_encoders_noise_that_moves_an_arm(urdf_folder, h
     for _ in range(8):
         position = recording.joints.position + 1e-3 * rng.standard_normal(recording.joints.position.shape)
         noisy = replace(recording, joints=replace(recording.joints, position=position))
-        own = EstimationProblem(step, [noisy], ("elbow.damping",))
+        own = EstimationProblem(step, [noisy], ("elbow.damping",), problem.options)
         scatter.append((own.evaluate(x, False).residual - problem.evaluate(x, False).residual)[rows])
     assert np.sum(found[rows] ** 2) == pytest.approx(np.mean(np.sum(np.square(scatter), axis=1)), rel=0.5)
 
