@@ -18,11 +18,7 @@ from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import (
-    DETECTABLE_AMPLITUDE_Z,
-    ProjectedCandidatesLinearization,
-    linearize_candidates,
-)
+from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, ProjectedCandidatesLinearization, linearize_candidates
 from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_within_segment

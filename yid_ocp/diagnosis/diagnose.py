@@ -270,6 +270,8 @@ def _happened(
     test = _null_test(judged, residual.residual, len(fit.values), limits)
     is_flagged = any(window.is_flagged for window in test.windows)
     evaluation = own.evaluate(x, is_flagged, guesses)
+    if not evaluation.ok:
+        return NO_EVENTS, None
     smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
     (pushed, others), share = found.split_force_from_other_events(), 1 - _MIN_FORCE_EVENT_GAP_FRACTION

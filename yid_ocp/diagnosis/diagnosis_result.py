@@ -384,7 +384,8 @@ def _named(effect: EffectBase, fit: RefitStatistics) -> str:
     for name, r in fit.effect_parameters_as_reported(effect).items():
         known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
-    for low, high in map(effect.prior_ranges.__getitem__, fit.amplitudes_beyond_prior_range(effect)):
+    for name in fit.amplitudes_beyond_prior_range(effect):
+        low, high = effect.prior_ranges[name]
         odd = f" (outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
     return f"{effect.label} with {', '.join(values)}{odd}"
 

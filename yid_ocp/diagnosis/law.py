@@ -186,7 +186,7 @@ def _refitted_families(
     found = []
     for family in _ranked_families(composed, before, laws):
         fit = None if only and family.law.quantities != tuple(only) else _refitted(composed, before, family, search)
-        if fit is not None:
+        if fit is not None and np.isfinite(fit.held_out_loss.total_chi2):
             loss = replace(fit.held_out_loss, baseline_chi2=before.held_out_loss.baseline_chi2)
             found.append(_RefittedLaw(family.law, fit, loss))
     return before, found

@@ -283,6 +283,8 @@ def _evaluated(
 
 def restore_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
     """A refit with its problem and evaluation in the step of all candidates; its estimates and predictions are kept."""
+    if fit.problem.step is problem.problem.step:
+        return fit
     own, finish = _evaluated(problem, fit.effects, fit.values)
     return replace(fit, problem=own, evaluation=finish, cost=finish.cost) if finish.ok else fit
 

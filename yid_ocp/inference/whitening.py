@@ -235,8 +235,12 @@ def _filter_steps(
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
     """Constant torque errors (nu,) [N m] of the driven joints, estimated from the prediction `result` of an episode."""
+    return _innovations_and_bias(episode, result, whitening)[1][:, 0]
+
+
+def _innovations_and_bias(episode: Episode, result: EpisodePrediction, by: ProcessNoiseWhitener) -> tuple[Array, Array]:
     rows, push = _plain(episode, result)[:, None], result.feedback_torque_and_sensitivity
-    return whitening.whiten_and_estimate_torque_bias(rows, push)[1][:, 0]
+    return by.whiten_and_estimate_torque_bias(rows, push)
 
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:
@@ -461,8 +465,7 @@ def _settled(
         result = predictor.predict_episode(own, theta, start, False)
         if isinstance(result, str):
             break
-        push = result.feedback_torque_and_sensitivity
-        innovations, bias = trial.whiten_and_estimate_torque_bias(_plain(own, result)[:, None], push)
+        innovations, bias = _innovations_and_bias(own, result, trial)
         cost = float(np.sum(innovations[:, 0] ** 2))
         if cost < least:
             least, made, offset = cost, trial, bias[:, 0]

@@ -36,8 +36,7 @@ def lowest_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -
     What a filter of twice the cutoff keeps beyond this one is compared with white noise of the angles' own size. A
     lower cutoff removes motion, and the prediction of efforts lacks the torques that this motion needs.
     """
-    every = (recording.joints for recording in recordings)
-    groups = [group for group in every if group is not None and len(group.t) > 1]
+    groups = [own.joints for own in recordings if own.joints is not None and len(own.joints.t) > 1]
     most = min((_MAX_CUTOFF_OVER_RATE / median_sample_period(group.t) for group in groups), default=math.inf)
     cutoff, most = min(_MIN_PATH_CUTOFF, most), float(f"{most:.3g}")
     channels = [(g.t, g.position[:, [g.names.index(name)]]) for g in groups for name in joints if name in g.names]
