@@ -34,7 +34,7 @@ from yid_ocp.model.objects.cable import (
     CableBranchRigidityAndDensity,
     CableOptions,
     clamped_cable_system,
-    edge_length_parameter_values,
+    parameters_from_edge_lengths,
     read_vertex_positions_by_name,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -87,7 +87,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
 def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
     known = {
-        r.name: edge_length_parameter_values(cable, typical_point_pair_distances(cable.edge_vertex_names, [r], 2))
+        r.name: parameters_from_edge_lengths(cable, typical_point_pair_distances(cable.edge_vertex_names, [r], 2))
         for r in recordings
     }
     names = [name for name in identifiable_cable_parameter_names(cable, options) if name.endswith(".rest")]
@@ -116,7 +116,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
     """
     errors, found = {}, problem.predict_held_out(x)
     for i, episode in enumerate(problem.episodes):
-        own = problem.theta_and_initial_state_deviation(x, i)
+        own = problem.unpack_unknown_vector(x, i)
         found.append((episode, problem.predictor.predict_episode(episode, *own, False)))
     for episode, result in found:
         if isinstance(result, str):
@@ -157,7 +157,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)
     seconds["starts"] = time.perf_counter() - clock
     episode = problem.episodes[0]
-    (theta, offset) = problem.theta_and_initial_state_deviation(problem.initial_unknowns, 0)
+    (theta, offset) = problem.unpack_unknown_vector(problem.initial_unknowns, 0)
     clock = time.perf_counter()
     problem.predictor.predict_episode(episode, theta, offset, False)
     seconds["rollout"] = time.perf_counter() - clock

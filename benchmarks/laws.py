@@ -26,11 +26,11 @@ import numpy as np
 from make_recordings import TRAVEL, TRUTH
 
 from yid_ocp.arrays import Array
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
-from yid_ocp.effects.base import elastic_joints_within_segment
+from yid_ocp.effects.base import elastic_joints_of_segment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
@@ -114,7 +114,7 @@ class Injected:
     """The torque of a case as `InjectedSimulatorTerms`."""
 
     def __init__(self, case: Case, system: Any) -> None:
-        springs = elastic_joints_within_segment(system, case.location)
+        springs = elastic_joints_of_segment(system, case.location)
         self.joints = [s.joint_name for s in springs if s.deformation == "bend"] or [case.location]
         self.torque, self.has_begun = case.torque, False
 
@@ -129,7 +129,7 @@ class Injected:
 
 
 def record(case: Case, motion_seed: int, noise_seed: int, noisy: bool) -> Recording:
-    system = build_system(load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME))
+    system = build_system(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
     posture = grasping_joint_angles(system, TRUTH)
     excitation = MultisineOptions(gripper_travel=TRAVEL[1])
     motion = random_multisine_motion(
@@ -169,7 +169,7 @@ def run(name: str, candidates: Any) -> dict[str, Any]:
     case = ALL_CASES[name]
     noisy = case.withheld is None and list(CASES).index(name) % 2 == 1
     estimate, held_out = (record(case, *pair, noisy) for pair in zip(MOTION_SEEDS, NOISE_SEEDS, strict=True))
-    nominal = build_problem(load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME))
+    nominal = build_problem(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
     problem = EstimationProblem(nominal.step, [estimate], nominal.free, nominal.options)
     if case.withheld is not None:
         library = make_candidate_effects(problem.system, [estimate], candidates)

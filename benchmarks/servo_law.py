@@ -46,7 +46,7 @@ def visited(problem: EstimationProblem, solution: Solution, quantity: str) -> di
     """Values of a quantity in the fit's rollout of every recording."""
     found = {}
     for i, (episode, result) in enumerate(zip(problem.episodes, solution.evaluation.episode_predictions, strict=True)):
-        deviated, _ = problem.theta_and_initial_state_deviation(solution.x, i)
+        deviated, _ = problem.unpack_unknown_vector(solution.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, deviated)
         own = result.rollout
         nodes = {"state": own.state, "torque": own.torque, "multipliers": own.multipliers}

@@ -87,7 +87,7 @@ def pytest_collection_finish():
 @pytest.fixture(scope="session", autouse=True)
 def _unchanged_files_are_tried_once():
     """A file that could be read, and did not change since, is not tried in a fork again by the same process."""
-    check, known = recording_hdf5.check_readable_in_fork, set()
+    check, known = recording_hdf5.check_readable_in_child_process, set()
 
     def once(path, complaint, noun):
         state = os.stat(path) if os.path.exists(path) else None
@@ -97,7 +97,7 @@ def _unchanged_files_are_tried_once():
             known.add((path, complaint, state))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recording_hdf5, "check_readable_in_fork", once)
+        patch.setattr(recording_hdf5, "check_readable_in_child_process", once)
         yield
 
 

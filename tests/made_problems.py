@@ -106,7 +106,7 @@ class MadeUp:
     def residual_rows(self) -> ResidualVectorLayout:
         return ResidualVectorLayout.from_episodes(self.episodes, self._stated, self._weak)
 
-    def theta_and_initial_state_deviation(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    def unpack_unknown_vector(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         theta = self.theta.copy()
         theta[len(theta) - len(x) :] = x[::-1]
         return theta, np.zeros(0)

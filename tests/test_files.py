@@ -125,7 +125,7 @@ OPENERS = {"open", "read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "
 OPENERS |= {"parse", "iterparse", "from_xml_path", "File", "ParquetFile", "read_table", "c3d", "AnyReader", "Reader"}
 OPENERS |= {"imread", "read_image", "read_point_cloud", "read_triangle_mesh"}
 """Functions that open a file: Python's own, and those of the libraries that the package uses."""
-GUARDS = {"check_input_file", "check_readable_in_fork", "read_input_text"}
+GUARDS = {"check_input_file", "check_readable_in_child_process", "read_input_text"}
 OPENED_ELSEWHERE = {
     "files.limit_process_memory": "/proc",
     "files.atomic_write": "what was written",
@@ -149,7 +149,7 @@ OPENED_ELSEWHERE = {
     "solvers.nonlinear_program.available_memory_bytes": "/proc",
     **{f"vision.frame_folder._read_{suffix}": "`_read_cloud` has looked" for suffix in ("npz", "xyz", "pcd", "ply")},
     "vision.frame_folder.write_frame_folder": "writes",
-    "virtual.mjcf.format_elements": "a table that comes with the package",
+    "virtual.mjcf.model_aspect_table": "a table that comes with the package",
     "workflow.run_folder.atomic_run_folder": "writes",
     "workflow.run_inputs.load_plugins": "a package that the user installed",
 }

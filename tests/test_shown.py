@@ -10,14 +10,14 @@ from small_problems import joints, pendulum_step, recording, seen, taken
 
 import yid_ocp as yid
 from yid_ocp.analysis.step_symbols import NamedStepEquations
-from yid_ocp.display import _MAX_TABLE_ROWS, ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import _MAX_TABLE_ROWS, ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.model import FlexibleSegment, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 
 class Thing(ReprMixin):
     def __init__(self, line, rows=()):
-        self.said = ReprLineAndTableRows(line, rows)
+        self.said = ReprTexts(line, rows)
 
     def _summary(self):
         return self.said

@@ -15,7 +15,7 @@ _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows
 
 
 @dataclass(frozen=True)
-class ReprLineAndTableRows:
+class ReprTexts:
     """Texts that represent an object: one line without the class name, and rows of a notebook table, header first."""
 
     one_line: str
@@ -25,7 +25,7 @@ class ReprLineAndTableRows:
 class ReprMixin:
     """Mixin that makes `__repr__` and a notebook table from `_summary`. A dataclass with it needs `repr=False`."""
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         raise NotImplementedError
 
     def __repr__(self) -> str:

@@ -24,7 +24,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, record_simulation
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, recording_from_simulation
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
@@ -100,7 +100,7 @@ def _two_arm_foam(torques: foam.Torques, seed: int, folder: Path) -> Trial:
         )
         for k in range(2)
     ]
-    recordings = [record_simulation(system, foam.TRUTH, s, run) for s, run in zip(settings, runs, strict=True)]
+    recordings = [recording_from_simulation(system, foam.TRUTH, s, run) for s, run in zip(settings, runs, strict=True)]
     start = dict.fromkeys(foam.TRUTH, 3.0)
     return Trial(
         "foam_noise" if torques is foam.ROUGH else "foam",
@@ -213,7 +213,7 @@ def _with_noise(
     system: System, truth: Mapping[str, float], noise: ArmSensorNoise, seed: int, runs: list[SimulationResult]
 ) -> tuple[Recording, ...]:
     made = (VirtualExperimentSettings(arm_noise=noise, camera=None, seed=1000 * seed + k) for k in range(len(runs)))
-    return tuple(record_simulation(system, truth, entry, run) for entry, run in zip(made, runs, strict=True))
+    return tuple(recording_from_simulation(system, truth, entry, run) for entry, run in zip(made, runs, strict=True))
 
 
 def _springs(seed: int, folder: Path) -> Trial:

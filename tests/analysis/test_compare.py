@@ -349,7 +349,7 @@ class Means:
         start = None if speed is None else SimpleNamespace(fitted_parameters={INITIAL_RMS_SPEED_PARAMETER: speed})
         return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
 
-    def theta_and_initial_state_deviation(self, x, i):
+    def unpack_unknown_vector(self, x, i):
         return float(x[0]) + (0.0 if "a.memory" in self.unknown_names else self.off), None
 
     def evaluate(self, x, equilibrium_guesses=None):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.analysis.discretisation import min_grasp_gaps_at_posture, step_map_natural_frequencies
+from yid_ocp.analysis.discretisation import min_gap_by_grasp_at_robot_posture, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
     linearise_step_equations,
     parameter_equations_and_responses,
@@ -284,7 +284,7 @@ def reaching(urdf_folder):
 )
 def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
     system = reaching(x)
-    found = min_grasp_gaps_at_posture(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
+    found = min_gap_by_grasp_at_robot_posture(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
     assert set(found) == {"hand"}
     assert found["hand"] == pytest.approx(gap, abs=2e-3)
 
@@ -292,8 +292,8 @@ def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
 def test_each_grasp_has_its_gap_and_no_grasp_none(reaching):
     """Tip at 0.3 m and elbow at 0.7 m above the ground, of a rod of 0.6 m whose middle link ends at 0.4 m."""
     system = reaching(grasps=2)
-    found = min_grasp_gaps_at_posture(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    found = min_gap_by_grasp_at_robot_posture(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05
     system = reaching(grasps=0)
-    assert min_grasp_gaps_at_posture(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
+    assert min_gap_by_grasp_at_robot_posture(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}

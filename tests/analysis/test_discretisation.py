@@ -21,9 +21,9 @@ from yid_ocp.analysis.discretisation import (
     _FinerDiscretisationProblem,
     _gauss_newton_step_in_finer_model,
     _half_step_error,
+    alternating_error_growth_of_worst_recording,
     estimate_shifts_by_discretisation,
     estimates_with_discretisation_error,
-    largest_alternating_error_growth,
     longest_accurate_time_step,
     predicted_refit_residual_at_finer_step,
 )
@@ -369,8 +369,8 @@ def test_what_is_said(decades, stable):
 
 def test_a_recording_is_judged_by_its_name(pendulum):
     problem = pendulum()
-    assert largest_alternating_error_growth(problem, problem.initial_unknowns).keeps_errors_below_resolution
-    assert largest_alternating_error_growth(problem, problem.initial_unknowns).recording_name == "twin"
+    assert alternating_error_growth_of_worst_recording(problem, problem.initial_unknowns).keeps_errors_below_resolution
+    assert alternating_error_growth_of_worst_recording(problem, problem.initial_unknowns).recording_name == "twin"
 
 
 NODE = ("symmetric", "node")
@@ -461,7 +461,9 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
 def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch, before, start, estimate, after):
     decades = {0.0: start, 1.0: estimate}
     grown = {x: AlternatingErrorGrowth("run", size, 1.3, 0.1, H) for x, size in decades.items()}
-    monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
+    monkeypatch.setattr(
+        discretisation, "alternating_error_growth_of_worst_recording", lambda problem, x: grown[float(x[0])]
+    )
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
     problem = SimpleNamespace(initial_unknowns=np.zeros(1))
     judged, said = _checked_solution_and_step_stability(problem, problem, found)
@@ -471,6 +473,6 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
-    monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: None)
+    monkeypatch.setattr(discretisation, "alternating_error_growth_of_worst_recording", lambda problem, x: None)
     unchecked = _checked_solution_and_step_stability(problem, problem, found)
     assert unchecked == (found, {"start": None, "estimate": None})

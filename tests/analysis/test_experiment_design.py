@@ -219,7 +219,7 @@ def built(problem, *setup_changes, heard=None, **settings):
     made = ExperimentVariantSensitivityBuilder(
         UnchangedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
     )
-    found = made.sensitivities_of_variant(frozenset(setup_changes))
+    found = made.position_sensitivities_of_variant(frozenset(setup_changes))
     assert not isinstance(found, str), found
     return made, found
 
@@ -251,7 +251,9 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     problem = swung()
     x = np.array([np.nan, 0.1])
-    found = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, x)).sensitivities_of_variant(frozenset())
+    found = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, x)).position_sensitivities_of_variant(
+        frozenset()
+    )
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
@@ -263,7 +265,7 @@ def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung
     stated = built(swung(effort_std=0.05), "torque")[1].fisher_information_with_prior([[]])
     np.testing.assert_allclose(stated, 4 * blind, rtol=1e-9)
     assert made.problem.system.prescribed == ("shoulder",)
-    assert builder.sensitivities_of_variant(frozenset({"torque"})) is made
+    assert builder.position_sensitivities_of_variant(frozenset({"torque"})) is made
     assert heard.stages == ["working out joint torques as a measurement, the arms' motion as known"]
 
 
@@ -283,10 +285,10 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
 
 def test_welds_keep_the_orientation_at_the_start(held_tube):
     builder, made = built(held_tube, "weld")
-    (grasp,), free = made.problem.system.grasps, builder.sensitivities_of_variant(frozenset())
+    (grasp,), free = made.problem.system.grasps, builder.position_sensitivities_of_variant(frozenset())
     assert grasp.kind == "weld"
     start = free.problem.initial_state_of_episode(
-        free.problem.episodes[0], *free.problem.theta_and_initial_state_deviation(free.x, 0)
+        free.problem.episodes[0], *free.problem.unpack_unknown_vector(free.x, 0)
     )
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
     tree = system.numeric_mechanism()
@@ -377,13 +379,13 @@ def drawn_motion(monkeypatch):
             row[:, feedback.state_indices] -= s.state_by_torque @ gain
         return [(np.stack(rows), None)]
 
-    monkeypatch.setattr(propagation, "step_derivatives_along_rollout", maps)
+    monkeypatch.setattr(propagation, "next_state_derivatives", maps)
     monkeypatch.setattr(
         propagation, "applied_torque_derivative_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    functions = SimpleNamespace(step=None, effect_momentum_shift=shift)
+    functions = SimpleNamespace(step=None, reference_momentum_correction=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
@@ -500,7 +502,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
     builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(noisy, noisy.initial_unknowns))
-    made = builder.sensitivities_of_variant(frozenset({"motion"}))
+    made = builder.position_sensitivities_of_variant(frozenset({"motion"}))
     assert not isinstance(made, str), made
     own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors
     for name in ("torque_std", "torque_bias_std", "angle_std"):
@@ -529,14 +531,12 @@ def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_fo
     )
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), options)
     x, [episode] = problem.initial_unknowns, problem.episodes
-    slopes, _ = propagation.sensitivities_and_information_with_input_errors(
-        problem, problem.evaluate(x), x, 0, {tip.name: 1e-6}
-    )
+    slopes, _ = propagation.sensitivities_with_input_errors(problem, problem.evaluate(x), x, 0, {tip.name: 1e-6})
     [found] = (own[:, :, len(x) :].reshape(-1, own.shape[2] - len(x)) for own in slopes.values())
 
     def seen(change):
         moved = replace(episode, torque=episode.torque + change[:, None], input_errors=None)
-        result = problem.predictor.predict_episode(moved, *problem.theta_and_initial_state_deviation(x, 0), False)
+        result = problem.predictor.predict_episode(moved, *problem.unpack_unknown_vector(x, 0), False)
         return result.predicted_outputs[0].ravel()
 
     count, size = len(episode.torque), 1e-4

@@ -15,7 +15,7 @@ from yid_ocp.analysis.identifiability import (
     free_starts_and_grasps,
     identifiability,
     system_with_grasp_offset_effects,
-    unknowns_from_solution,
+    unknown_vector_from_solution,
 )
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError
@@ -369,10 +369,10 @@ def test_a_narrow_minimum_near_zero_beside_which_the_usual_size_is_as_likely_is_
 
 def test_a_point_is_a_solution_an_array_or_the_start():
     problem = Formula(two(), START)
-    np.testing.assert_array_equal(unknowns_from_solution(problem, None), [2.0, 50.0])
-    np.testing.assert_array_equal(unknowns_from_solution(problem, [3, 4]), [3.0, 4.0])
+    np.testing.assert_array_equal(unknown_vector_from_solution(problem, None), [2.0, 50.0])
+    np.testing.assert_array_equal(unknown_vector_from_solution(problem, [3, 4]), [3.0, 4.0])
     found = solution(b=estimate(70.0), other=estimate(9.0))
-    np.testing.assert_array_equal(unknowns_from_solution(problem, found), [2.0, 70.0])
+    np.testing.assert_array_equal(unknown_vector_from_solution(problem, found), [2.0, 70.0])
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from yid_ocp.analysis.clock_checks import (
     _by_clock,
     _clock_error,
     clock_drift_and_overstated_noise_issues,
-    point_clock_offset_and_drift,
+    clock_offset_drift_and_rms_distance,
 )
 from yid_ocp.analysis.estimation import _baselines
 from yid_ocp.analysis.joint_checks import (
@@ -484,8 +484,9 @@ def test_a_search_without_drifts_finds_a_lateness_alone():
         return np.sin(np.multiply.outer(at, rates))
 
     seen = path(t - 0.2 - 0.02 * (t - 5.0))
-    assert point_clock_offset_and_drift(path, (0.0, 10.0), t, seen)[:2] == (pytest.approx(0.2, abs=5e-3), 0.0)
-    both = point_clock_offset_and_drift(path, (0.0, 10.0), t, seen, drifts=True)
+    offset, drift, _ = clock_offset_drift_and_rms_distance(path, (0.0, 10.0), t, seen)
+    assert (offset, drift) == (pytest.approx(0.2, abs=5e-3), 0.0)
+    both = clock_offset_drift_and_rms_distance(path, (0.0, 10.0), t, seen, drifts=True)
     assert both == pytest.approx((0.2, 0.02, 0.0), abs=1e-4)
 
 

@@ -206,7 +206,7 @@ def missing(*arguments, **settings):
 def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
     builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(short_run, short_run.initial_unknowns))
-    other = builder.sensitivities_of_variant(frozenset({"motion"}))
+    other = builder.position_sensitivities_of_variant(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_driven_angles[:20]
     np.testing.assert_allclose(other.problem.episodes[0].measured_driven_angles[:20], held_out, atol=1e-12)
@@ -254,9 +254,9 @@ def test_one_arm_needs_another_arm_and_welds(exact):
 def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     """Two arms with welds and no camera, MuJoCo's motion and noise, from a start of 3 N m/rad each."""
     made = exact("dual_arm_no_vision")
-    layout = ExperimentVariantSensitivityBuilder(UnchangedExperiment(made, at_truth(made))).sensitivities_of_variant(
-        frozenset({"weld"})
-    )
+    layout = ExperimentVariantSensitivityBuilder(
+        UnchangedExperiment(made, at_truth(made))
+    ).position_sensitivities_of_variant(frozenset({"weld"}))
     assert not isinstance(layout, str), layout
     system = layout.problem.system
     posture = dict(zip(system.driven, map(float, made.episodes[0].measured_driven_angles[0]), strict=True))

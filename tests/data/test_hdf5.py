@@ -328,7 +328,7 @@ def test_the_trial_has_a_limit_on_its_memory(plain_file):
         return f"took {len(bytearray(4 << 30))} bytes"
 
     with pytest.raises(DataError, match="ends the HDF5 library") as caught:
-        recording_hdf5.check_readable_in_fork(plain_file, greedy, "HDF5")
+        recording_hdf5.check_readable_in_child_process(plain_file, greedy, "HDF5")
     assert "took" not in caught.value.what
 
 

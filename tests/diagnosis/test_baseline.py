@@ -52,7 +52,7 @@ def swing(folder, name, seed, effects="[]"):
     problem = build_problem(run)
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
     values = problem.named_values(problem.unknown_vector({**TRUTH, **start}))
-    theta, offset = problem.theta_and_initial_state_deviation(problem.unknown_vector(values), 0)
+    theta, offset = problem.unpack_unknown_vector(problem.unknown_vector(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
     made = recording_from_prediction(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)
@@ -132,7 +132,7 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
     both = refit_with_effects(AllCandidatesProblem(add_baseline_prior(problem, known), (), False), (), {})
     baseline = DiagnosisBaseline.from_run_estimates([known], ())
-    [shift] = baseline.compare_with_baseline(both, Thresholds()).parameter_shifts
+    [shift] = baseline.parameter_shifts_of_fit(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:
         assert shift.z_score is None  # the recording says nothing beside such a baseline

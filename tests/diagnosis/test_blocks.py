@@ -11,7 +11,7 @@ from small_problems import swinging_pendulum
 
 from yid_ocp.diagnosis import hypotheses
 from yid_ocp.diagnosis.diagnose import diagnose
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedHeldOutRecording
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, HeldOutTruncation
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 
@@ -75,7 +75,7 @@ def followed(monkeypatch):
     ).truncate_failing_held_out_recordings({}, margin)
 
 
-WHOLE, NOTHING_OF_IT = Held("a", 500), TruncatedHeldOutRecording("b", 0.0, 5.0)
+WHOLE, NOTHING_OF_IT = Held("a", 500), HeldOutTruncation("b", 0.0, 5.0)
 
 
 @cases(
@@ -99,6 +99,6 @@ def test_what_is_lost_on_the_way_is_compared_until_shortly_before(followed):
     assert kept == WHOLE
     # found to a sixty-fourth of 500 steps, less a tenth
     assert 0.9 * (300 - 8) - 1 <= cut_short.steps <= 0.9 * 300
-    assert cut == TruncatedHeldOutRecording("b", cut_short.steps * 0.01, 5.0)
+    assert cut == HeldOutTruncation("b", cut_short.steps * 0.01, 5.0)
     barely, _ = followed(WHOLE, Held("b", 500, until=130))
     assert len(barely.problem.held_out) == 2

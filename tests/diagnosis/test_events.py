@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.events import (
     find_force_and_fault_events,
     problem_corrected_for_events,
 )
-from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceHistory
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import times_since_recording_start
 from yid_ocp.inference.smoother import select_and_smooth_unknowns
@@ -206,7 +206,7 @@ def test_the_same_push_in_another_recording_is_another_event(twin):
     surer = replace(pulse, p_value=1e-12)
     problem = SimpleNamespace(system=SimpleNamespace(prescribed=()))
     t = 0.1 * np.arange(30)
-    force = ForceEstimate("run_0", "elbow", "elbow", "N m", t, 0 * t, np.eye(30), 0 * t, 0 * t)
+    force = ForceHistory("run_0", "elbow", "elbow", "N m", t, 0 * t, np.eye(30), 0 * t, 0 * t)
     other, rival = replace(force, recording="run_1"), replace(force, location="shoulder", coordinate="shoulder")
     found = _one_each([(force, pulse), (other, surer), (rival, surer)], problem)
     assert sorted((e.recording, e.channel) for e in found) == [("run_0", "shoulder"), ("run_1", "elbow")]

@@ -21,7 +21,7 @@ from yid_ocp.diagnosis.blind import (
     CaseGroundTruth,
     PlannedBlindCase,
     SyntheticRecordingConditions,
-    assign_blind_case_categories,
+    plan_blind_cases,
     scale_parameters_to_more_links,
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
@@ -204,10 +204,10 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
 
 
 def test_what_is_detectable_survives_as_plain_data(drawn):
-    told = json.loads(json.dumps(drawn().candidate_sensitivities_to_plain_data()))
+    told = json.loads(json.dumps(drawn().candidate_sensitivities_to_json()))
     other = drawn(seed=5)
-    other.set_candidate_sensitivities_from_plain_data(told)
-    assert other.candidate_sensitivities_to_plain_data() == told
+    other.set_candidate_sensitivities_from_json(told)
+    assert other.candidate_sensitivities_to_json() == told
     assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
     assert other._inside(np.random.default_rng(1), 3.0) == drawn()._inside(np.random.default_rng(1), 3.0)
 
@@ -221,7 +221,7 @@ def counted(plan, key):
 
 
 def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
-    plan = assign_blind_case_categories(300, 3, WEIGHTS, WHOLE)
+    plan = plan_blind_cases(300, 3, WEIGHTS, WHOLE)
     assert [entry.number for entry in plan] == list(range(300))
     assert counted(plan, lambda e: e.category) == {
         "null": 60, "single": 144, "pair": 30, "outside": 30, "left_out": 18, "finer_chain": 18
@@ -236,16 +236,16 @@ def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
         assert all(abs(own[name] / total - part / 0.7) < 0.1 for name, part in WEIGHTS.items())
     assert {entry.experiment for entry in plan if entry.category == "finer_chain"} == WHOLE
     assert [entry.category for entry in plan] != sorted(entry.category for entry in plan)
-    assert plan == assign_blind_case_categories(300, 3, WEIGHTS, WHOLE)
-    assert plan != assign_blind_case_categories(300, 4, WEIGHTS, WHOLE)
-    assert plan != assign_blind_case_categories(300, 3, WEIGHTS, WHOLE, "calibration")
+    assert plan == plan_blind_cases(300, 3, WEIGHTS, WHOLE)
+    assert plan != plan_blind_cases(300, 4, WEIGHTS, WHOLE)
+    assert plan != plan_blind_cases(300, 3, WEIGHTS, WHOLE, "calibration")
 
 
 def test_one_clean_case_in_three_is_brisk():
-    plan = assign_blind_case_categories(300, 3, WEIGHTS, WHOLE)
+    plan = plan_blind_cases(300, 3, WEIGHTS, WHOLE)
     assert counted([e for e in plan if e.is_brisk], lambda e: e.category) == {"null": 20}
     assert len({e.experiment for e in plan if e.is_brisk}) == len(WEIGHTS)
-    assert [e.is_brisk for e in plan] == [e.is_brisk for e in assign_blind_case_categories(300, 3, WEIGHTS, WHOLE)]
+    assert [e.is_brisk for e in plan] == [e.is_brisk for e in plan_blind_cases(300, 3, WEIGHTS, WHOLE)]
 
 
 def test_a_brisk_motion_has_three_times_the_acceleration(drawn):
@@ -291,7 +291,7 @@ def test_parameters_with_priors_are_drawn_in_their_order_so_that_a_seed_draws_th
 
 
 def test_what_a_plan_cannot_divide_goes_to_the_largest_remainders():
-    found = counted(assign_blind_case_categories(7, 1, WEIGHTS, WHOLE), lambda e: e.category)
+    found = counted(plan_blind_cases(7, 1, WEIGHTS, WHOLE), lambda e: e.category)
     assert found == {"null": 1, "single": 3, "pair": 1, "outside": 1, "left_out": 1}
 
 
@@ -304,7 +304,7 @@ def test_recordings_are_seen_by_a_camera_where_the_real_ones_are(drawn):
 
 
 def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
-    found = counted(assign_blind_case_categories(100, 1, {"bare": 1.0}), lambda e: e.category)
+    found = counted(plan_blind_cases(100, 1, {"bare": 1.0}), lambda e: e.category)
     assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
 
 

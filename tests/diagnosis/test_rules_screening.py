@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.effects import make_effect
 from yid_ocp.inference import null_test
-from yid_ocp.inference.null_test import channels_with_residual_indices, encoder_noise_residual_factor
+from yid_ocp.inference.null_test import channels_with_residual_indices, encoder_noise_residual_covariance_factor
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
@@ -79,7 +79,7 @@ def test_scores_scatter_with_the_encoders_noise_that_moves_an_arm(urdf_folder, h
     step = pendulum_step(urdf_folder, **how)
     recording = taken(step, 3, camera=False, steps=80)
     problem = EstimationProblem(step, [recording], ("elbow.damping",), ProblemOptions(path_cutoff=10.0))
-    found = encoder_noise_residual_factor(problem, x := problem.initial_unknowns)
+    found = encoder_noise_residual_covariance_factor(problem, x := problem.initial_unknowns)
     channels = channels_with_residual_indices(problem)
     rows = np.concatenate([c.residual_indices for c in channels if c.group == "points_arm"])
     assert not np.delete(found, rows, axis=0).any()

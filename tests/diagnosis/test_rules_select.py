@@ -13,7 +13,7 @@ from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext
-from yid_ocp.diagnosis.screening import NO_CANDIDATES, ScreeningResult, _make_joint_score_model
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult, _make_joint_score_model
 from yid_ocp.diagnosis.select import (
     _is_needed,
     _is_plausible,
@@ -284,7 +284,7 @@ class Rounds:
 
     def screen(self, base, values, name):
         if not values and self.before is None:
-            return NO_CANDIDATES  # it snaps
+            return EMPTY_SCREENING_RESULT  # it snaps
         self.screens.append(([of.kind for of in base], values.get("k"), name))
         return self.screened(base)
 

@@ -38,14 +38,14 @@ from hypothesis import strategies as st
 from sound_findings import assert_nothing_impossible_is_said
 
 from yid_ocp.diagnosis.baseline import (
-    EffectRemovalAndAdditionErrors,
+    ErrorsWithEffectsRemovedAndAdded,
     ParameterShiftsSinceBaseline,
     _ParameterShift,
     _PredictionErrors,
 )
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
-from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
+from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 FILE = Path(__file__).with_name("sentences.json")
@@ -157,9 +157,9 @@ def unknown():
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):
-        yield f"followed for {kept} s", finding(truncated_recordings=(TruncatedHeldOutRecording("other", kept, 5.0),))
+        yield f"followed for {kept} s", finding(truncated_recordings=(HeldOutTruncation("other", kept, 5.0),))
     yield "a finer step", finding("no_gap", stated_and_used_time_step=(0.01, 0.005))
-    lost = (TruncatedHeldOutRecording("other", 0.0, 5.0),)
+    lost = (HeldOutTruncation("other", 0.0, 5.0),)
     yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True)
 
 
@@ -175,14 +175,14 @@ def compared():
     better = _PredictionErrors(("bare (without)",), *errors)
     for name, other in {"worse": _PredictionErrors(("a", "b", "c"), *reversed(errors)),
                         "failed": _PredictionErrors(("a",), {}, {}, "it diverges")}.items():  # fmt: skip
-        yield f"{name} with effects", finding(counterfactual=EffectRemovalAndAdditionErrors(better, other))
+        yield f"{name} with effects", finding(counterfactual=ErrorsWithEffectsRemovedAndAdded(better, other))
 
 
 def separating(rivals: Mapping[str, str]) -> str:
     """The experiment that separates effects, given by label with what they depend on."""
     alike = [SimpleNamespace(location=k.partition("@")[2], required_excitation=v) for k, v in rivals.items()]
     chosen = (SimpleNamespace(equivalent_effects=alike),)
-    return recommended_experiment_text(SimpleNamespace(accepted_selections=chosen))
+    return recommended_experiment_text(SimpleNamespace(accepted_selected_effects=chosen))
 
 
 def said() -> dict[str, str]:

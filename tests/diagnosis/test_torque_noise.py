@@ -25,12 +25,12 @@ from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, r
 from yid_ocp.inference.uncertainty import noise_only_covariance_factor
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
-    problem_with_relinearized_held_out_whitening,
+    problem_with_reestimated_held_out_torque_biases,
     problem_with_sensor_noise_only,
     problem_with_whitening_at,
     problem_without_input_errors,
 )
-from yid_ocp.integrator.step import Step, compile_step, dynamic_observable_state_mask, simulate
+from yid_ocp.integrator.step import Step, compile_step, reachable_and_observable_state_mask, simulate
 from yid_ocp.model import System
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -111,7 +111,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     wide = made.with_nominal_and_effects_free(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.unknown_vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
-    moved = problem_with_relinearized_held_out_whitening(
+    moved = problem_with_reestimated_held_out_torque_biases(
         problem_relinearized_at_torque_bias(wide, x, frozen), x, frozen
     )
     for group in ("whitening_filters", "held_out_whitening_filters"):
@@ -164,8 +164,8 @@ def test_states_that_no_error_reaches_are_left_out_of_a_filter():
     joints = np.array(["@" not in name for name in mounted.system.mechanism.joint_names])
     own, theta = np.tile(joints, 2), mounted.system.parameters.vector()
     swept = simulate(mounted, theta, np.where(own, 0.01, 0.0), 20)
-    assert dynamic_observable_state_mask(mounted, theta, swept).all()
-    assert dynamic_observable_state_mask(mounted, theta, swept, disturbed=own).tolist() == own.tolist()
+    assert reachable_and_observable_state_mask(mounted, theta, swept).all()
+    assert reachable_and_observable_state_mask(mounted, theta, swept, disturbed=own).tolist() == own.tolist()
     assert not own.all()
 
 
@@ -294,7 +294,7 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
     episode = problem_with_whitening_at(problem, at, rounds=3).episodes[0]
     errors = episode.input_errors
-    [theta, later] = [problem.theta_and_initial_state_deviation(x, 0)[0] for x in (at, near)]
+    [theta, later] = [problem.unpack_unknown_vector(x, 0)[0] for x in (at, near)]
     assert np.max(np.abs(errors.torque_noise)) > WHITE
     acting, more = (problem.predictor.corrected_inputs(episode, own, ()).torque for own in (theta, later))
     np.testing.assert_allclose(acting, inverse * episode.torque - errors.recorded_minus_true_torque, atol=1e-12)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
-from yid_ocp.effects.base import arm_link_end_frame_names, effort_limit_ratio_to_baxter, one_frame_name_per_arm_link
+from yid_ocp.effects.base import effort_limit_ratio_to_baxter, frame_names_at_arm_link_ends, one_frame_name_per_arm_link
 from yid_ocp.effects.bodies import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
@@ -169,7 +169,7 @@ def test_places_for_a_mass() -> None:
     frames = one_frame_name_per_arm_link(one)
     assert len(frames) == 7
     assert frames[-1] == "left_gripper"
-    ends = arm_link_end_frame_names(one)
+    ends = frame_names_at_arm_link_ends(one)
     # what the hand holds is where the branch ends, and the first link's frame turns about its own origin
     assert "left_gripper" not in ends
     assert "left_upper_shoulder" not in ends
@@ -180,7 +180,7 @@ def test_places_for_a_mass() -> None:
     bare = System.build(robot, prescribed=names)
     assert one_frame_name_per_arm_link(bare)[-1] == "panda_link8"
     # joints 1 and 2 meet where nothing moves, 5 and 6 in one place
-    assert sorted(arm_link_end_frame_names(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]
+    assert sorted(frame_names_at_arm_link_ends(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]
     whole = read_urdf("package:panda")
     fingers = [j.name for j in whole.joints if j.kind == "prismatic"]
     held = System.build(whole, prescribed=whole.joint_names)

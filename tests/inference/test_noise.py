@@ -55,7 +55,7 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
         feedback = replace(feedback, reference=feedback.reference + reference)
     torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
     changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
-    result = problem.predictor.predict_episode(changed, *problem.theta_and_initial_state_deviation(x, 0), False)
+    result = problem.predictor.predict_episode(changed, *problem.unpack_unknown_vector(x, 0), False)
     return _sensor_whitened_residual(changed.measurements, result).residual
 
 
@@ -119,7 +119,7 @@ def test_a_step_without_a_measurement_adds_no_likelihood_and_lets_the_state_go_o
     assert log_determinant == 0.0
     whole = np.vstack([map_, [0.0, 0.5]])
     np.testing.assert_allclose(after, whole @ covariance @ whole.T)
-    white, mean = step.normalized_innovations_and_next_mean(np.array([[1.0], [2.0]]), np.zeros((0, 1)))
+    white, mean = step.normalized_innovations_and_final_mean(np.array([[1.0], [2.0]]), np.zeros((0, 1)))
     assert white.shape == (0, 1)
     np.testing.assert_allclose(mean[:, 0], whole @ [1.0, 2.0])
 
@@ -175,7 +175,7 @@ def small_gap(problem, size=1.0):
     truth = replace(episode, torque=episode.torque + 0.3 * size * TORQUE * rng.standard_normal(episode.torque.shape))
     truth = replace(truth, tracking_feedback=None)
     result = problem.predictor.predict_episode(
-        truth, *problem.theta_and_initial_state_deviation(problem.initial_unknowns, 0), False
+        truth, *problem.unpack_unknown_vector(problem.initial_unknowns, 0), False
     )
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     samples = tuple(replace(s, value=y + s.std * rng.standard_normal(y.shape)) for s, y in pairs)
@@ -229,7 +229,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     other = replace(again, input_errors=episode.input_errors)
     found = []
     for each in (episode, other):
-        result = weighted.predictor.predict_episode(each, *problem.theta_and_initial_state_deviation(x, 0), False)
+        result = weighted.predictor.predict_episode(each, *problem.unpack_unknown_vector(x, 0), False)
         found.append(estimate_episode_torque_bias(each, result, whitening)[0])
     seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05

@@ -43,7 +43,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.problem.signal_filters import effort_low_pass_filter
+from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 
@@ -406,7 +406,7 @@ def test_numbers_of_a_result():
     found = uncertainty.covariance_to_dict(("a", "b", "c", "d"), matrix, (1.0, 3.0, 5.0, math.inf))
     assert (found["names"], np.ravel(found["matrix"])) == (["a", "b"], pytest.approx([1.0, 1.5, 1.5, 9.0]))
     lost, fixed = replace(known, verdict="not_identifiable"), replace(known, free=False, verdict="fixed")
-    marked = uncertainty.free_estimates_marked_not_trusted({"a": known, "b": lost, "c": fixed})
+    marked = uncertainty.mark_free_estimates_not_trusted({"a": known, "b": lost, "c": fixed})
     assert marked == {"a": replace(known, verdict="not_trusted"), "b": lost, "c": fixed}
     parts = {0.1234: "12", 0.994: "99", 0.996: "100", 12.34: "1234", 123.4: "1.2e+04"}
     assert [uncertainty.percent_number_text(part) for part in parts] == list(parts.values())
@@ -468,7 +468,7 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
 def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_folder):
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
     problem = EstimationProblem(step, [taken(step, 1, steps=90)], ("elbow.mass",), ProblemOptions(path_cutoff=15.0))
-    low_pass, own = effort_low_pass_filter(15.0), channels_with_residual_indices(problem)
+    low_pass, own = zero_phase_effort_filter(15.0), channels_with_residual_indices(problem)
     found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
     noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
     lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)

@@ -29,7 +29,7 @@ from yid_ocp.model import (
 )
 from yid_ocp.model.kinematics import motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import ForceWithDerivativeFactors, six_joint_floating_mechanism
+from yid_ocp.model.system import ForceWithFactoredDerivatives, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
@@ -177,7 +177,7 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
             force[j] = ca.dot(screws[j], wrench)
             by_rate[:, j] = slope @ screws[j]
             by_turn[:, j] = slope @ added + motion_cross_force_product(screws[j], wrench)
-        closed = ForceWithDerivativeFactors(force, by_rate, by_turn)
+        closed = ForceWithFactoredDerivatives(force, by_rate, by_turn)
         return EffectStepTerms(dissipative_force=-b * v, force_with_derivatives=closed)
 
     return Added("air", joint, parameters, change=change, add=add)

@@ -102,7 +102,7 @@ def test_driven_arms_tell_about_what_the_innovations_say(driven_experiment):
         searched = driven_experiment.sensitivities_to_unknowns(w)
         judged = driven_experiment.planned_recording_sensitivities(w)
         for criterion in (DOptimalityCriterion((i,), (0, 1)) for i in (0, 1)):  # logarithms of standard deviations
-            told, true = (criterion.value_and_gradient_by_sensitivities(rows, False)[0] for rows in (searched, judged))
+            told, true = (criterion.value_and_gradient_wrt_sensitivities(rows, False)[0] for rows in (searched, judged))
             assert told == pytest.approx(true, abs=0.5)
 
 
@@ -118,8 +118,8 @@ CRITERIA = {
 @pytest.mark.parametrize("name", CRITERIA)
 def test_criteria_know_their_derivatives(name):
     criterion, way, e = CRITERIA[name], np.random.default_rng(5).normal(size=ROWS.shape), 1e-6
-    _, slope = criterion.value_and_gradient_by_sensitivities(ROWS)
-    after, before = (criterion.value_and_gradient_by_sensitivities(ROWS + sign * e * way)[0] for sign in (1, -1))
+    _, slope = criterion.value_and_gradient_wrt_sensitivities(ROWS)
+    after, before = (criterion.value_and_gradient_wrt_sensitivities(ROWS + sign * e * way)[0] for sign in (1, -1))
     assert float(np.sum(slope * way)) == pytest.approx((after - before) / (2 * e), rel=1e-6)
 
 
@@ -127,11 +127,11 @@ def test_precision_is_that_of_the_marginal_standard_deviation():
     wide = np.vstack([1e3 * ROWS, np.eye(7)[3:]])
     covariance = np.linalg.inv(wide.T @ wide)
     criteria = (DOptimalityCriterion(chosen, (0, 1, 2)) for chosen in ((1,), (0, 1)))
-    one, both = (criterion.value_and_gradient_by_sensitivities(wide)[0] for criterion in criteria)
+    one, both = (criterion.value_and_gradient_wrt_sensitivities(wide)[0] for criterion in criteria)
     assert one == pytest.approx(-0.5 * np.log(covariance[1, 1]), abs=1e-5)
     assert both == pytest.approx(-0.5 * np.log(np.linalg.det(covariance[:2, :2])), abs=1e-5)
     # with no data a parameter is known to within 400 %
-    assert CRITERIA["one"].value_and_gradient_by_sensitivities(np.zeros((1, 7)))[0] == pytest.approx(-np.log(4.0))
+    assert CRITERIA["one"].value_and_gradient_wrt_sensitivities(np.zeros((1, 7)))[0] == pytest.approx(-np.log(4.0))
 
 
 def test_distances_are_what_others_cannot_explain():

@@ -16,8 +16,8 @@ from yid_ocp.planning.joint_paths import (
     PlanOptions,
     RestToRestSplineBasis,
 )
-from yid_ocp.planning.motion_plan import EstimatedParameterCovariance, plan_motion_to_target
-from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionSearch
+from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, plan_motion_to_target
+from yid_ocp.planning.motion_search import MotionToTargetSearch, PlanResidualAndLimitFunctions
 
 START, GOAL = 0.2, 0.7
 
@@ -78,7 +78,7 @@ def test_slopes_are_derivatives(moved, wanted, more):
     simple = mover.path.straight_line_coefficients([0.4])
     inside = frames if options.box else None
     rows = PlanResidualAndLimitFunctions(mover, options, frames, np.array(options.target_position), simple, inside)
-    shooting = TargetMotionSearch([rows], simple.shape)
+    shooting = MotionToTargetSearch([rows], simple.shape)
     rng, x, e = np.random.default_rng(5), simple.ravel() + 0.1, 1e-5
     way = rng.normal(size=x.size)
     before, after, here = (shooting._residual_and_limit_values(y) for y in (x - e * way, x + e * way, x))
@@ -197,7 +197,7 @@ def test_the_shortest_duration_is_shorter_and_arrives(moved, wanted):
 
 
 def test_spread_is_the_derivative_times_the_uncertainty(moved, wanted):
-    known = EstimatedParameterCovariance(("elbow.stiffness",), np.array([[0.3**2]]))
+    known = ParameterCovarianceBeforePlan(("elbow.stiffness",), np.array([[0.3**2]]))
     told = plan_motion_to_target(moved, wanted, known=known)
     movers = (elsewhere(told, -1e-4), elsewhere(told, 1e-4))
     below, above = (places(m, m.simulate_path(told.spline_coefficients).state[-1:])[0] for m in movers)
@@ -205,7 +205,7 @@ def test_spread_is_the_derivative_times_the_uncertainty(moved, wanted):
 
 
 def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_another(moved, wanted):
-    known = EstimatedParameterCovariance(("elbow.stiffness",), np.array([[0.6**2]]))
+    known = ParameterCovarianceBeforePlan(("elbow.stiffness",), np.array([[0.6**2]]))
     options, worst = replace(wanted, n_spline_coefficients=8, duration=1.0, hold_duration=0.15), []
     for spread in (False, True):
         done = plan_motion_to_target(moved, replace(options, minimize_parameter_sensitivity=spread), known=known)

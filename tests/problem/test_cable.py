@@ -16,7 +16,7 @@ from yid_ocp.model.objects.cable import (
     CableBranchRigidityAndDensity,
     CableOptions,
     clamped_cable_system,
-    edge_length_parameter_values,
+    parameters_from_edge_lengths,
     read_vertex_positions_by_name,
 )
 from yid_ocp.problem import EstimationProblem, SensorOptions
@@ -209,7 +209,7 @@ def test_edges_are_as_long_as_measured(cable):
     lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
     assert lengths["c1", "c2"] == pytest.approx(expected)
-    values = edge_length_parameter_values(cable, typical_point_pair_distances(cable.edge_vertex_names, [recording], 2))
+    values = parameters_from_edge_lengths(cable, typical_point_pair_distances(cable.edge_vertex_names, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
     assert set(values) <= set(
         clamped_cable_system(typical_point_pair_distances(cable.edge_vertex_names, [recording]), cable).parameters.names

@@ -20,7 +20,7 @@ from yid_ocp.problem.recorded_inputs import (
     prescribed_coordinates_at_nodes,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_low_pass_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, zero_phase_effort_filter
 
 PLAIN = LowPassFilter(math.inf)
 
@@ -314,7 +314,7 @@ def test_at_some_nodes_it_is_the_same_filter(low_pass):
 
 def test_two_passes_are_one_after_the_other():
     t, values = 0.01 * np.arange(301), np.random.default_rng(1).standard_normal((301, 2))
-    once, twice = LowPassFilter(5.0), effort_low_pass_filter(5.0)
+    once, twice = LowPassFilter(5.0), zero_phase_effort_filter(5.0)
     np.testing.assert_allclose(twice(t, values)[80:-80], once(t, once(t, values))[80:-80], atol=1e-3)
     assert (once.end_distortion_duration, twice.end_distortion_duration) == pytest.approx((0.574, 0.768), abs=1e-3)
     assert (twice.cutoff, twice.passes) == (5.0, 2)

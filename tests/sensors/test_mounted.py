@@ -114,7 +114,7 @@ def recorded(urdf: Path) -> Recording:
     mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install 'yid-ocp[blind]'")
     from yid_ocp.virtual.joint_motion import MultisineMotion
     from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml
-    from yid_ocp.virtual.mujoco_simulation import MujocoModelAndState, TrackingController, settle_to_equilibrium
+    from yid_ocp.virtual.mujoco_simulation import MujocoModelAndState, TrackingController, settled_holding_torques
 
     system, step = holding(urdf, driven=ARM), 2e-4
     own = "".join(f"<{kind} name='{site}{kind}' site='{site}'/>" for site in ("lower", "w_T1") for kind in KINDS)
@@ -125,7 +125,7 @@ def recorded(urdf: Path) -> Recording:
     scene.data.qpos[[model.joint(name).id for name in ARM]] = list(START.values())
     waves = (np.array([[0.05], [0.06]]), np.array([[1.1], [1.7]]), np.zeros((2, 1)), 0.3)
     controller = TrackingController(
-        scene, MultisineMotion(ARM, *waves), settle_to_equilibrium(scene, model.dof_damping.copy())
+        scene, MultisineMotion(ARM, *waves), settled_holding_torques(scene, model.dof_damping.copy())
     )
     q, read = [], {site + kind: list[Array]() for site in ("lower", "w_T1") for kind in KINDS}
     for tick in range(6001):

@@ -413,7 +413,7 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
     def known(ok):
         found = SimpleNamespace(ok=ok, episode_predictions=("plain a", "plain b") if ok else ())
         how = {
-            "theta_and_initial_state_deviation": lambda x, i: (f"theta {'ab'[i]}", "offset"),
+            "unpack_unknown_vector": lambda x, i: (f"theta {'ab'[i]}", "offset"),
             "evaluate": lambda x, derivatives, warm: found,
         }
         plain = SimpleNamespace(episodes=("a", "b"), predictor=SimpleNamespace(predict_episode=run), **how)

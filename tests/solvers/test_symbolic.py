@@ -113,7 +113,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
     w, _ = rolled_out(problem, program, x)
     gradient, jacobian = values_at(program, w, program.grad_f, program.jac_g)
     own = [program.variables["theta"].index.ravel()] if problem.shared_parameters else []
-    rows = list(problem.predictor.estimated_initial_state_indices)
+    rows = list(problem.predictor.estimated_initial_state_entries)
     for episode in problem.episodes:
         if problem.local_parameters:
             own.append(program.variables[f"local[{episode.name}]"].index.ravel())
@@ -131,9 +131,9 @@ def test_its_reduced_gradient_is_the_problems(problem):
         # the program holds the first state where the problem holds its offset from rest, which moves with theta
         count = len(problem.shared_parameters)
         for i, episode in enumerate(problem.episodes):
-            by = problem.initial_state_of_episode(
-                episode, problem.theta_and_initial_state_deviation(x, i)[0]
-            ).state_sensitivity[rows]
+            by = problem.initial_state_of_episode(episode, problem.unpack_unknown_vector(x, i)[0]).state_sensitivity[
+                rows
+            ]
             at = problem.unknowns.unknown_indices_affecting_recording(i)[len(problem.unknowns.free_parameter_names) :]
             expected[:count] -= by[:, :count].T @ expected[at]
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())

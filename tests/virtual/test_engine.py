@@ -26,7 +26,7 @@ from yid_ocp.virtual.experiment import (
     PointCamera,
     VirtualExperimentSettings,
     baxter_foam_y_system,
-    record_simulation,
+    recording_from_simulation,
     run_virtual_experiment,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -35,7 +35,7 @@ from yid_ocp.virtual.mujoco_simulation import (
     MujocoModelAndState,
     SimulationOptions,
     SimulationResult,
-    settle_to_equilibrium,
+    settled_holding_torques,
     simulate_in_mujoco,
 )
 
@@ -178,7 +178,7 @@ def test_grippers_beside_what_they_hold_close_at_a_short_step_too(tmp_path: Path
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log where it is
     system = SYSTEMS[2]
     scene = grippers_beside(system, TRUTH, 5e-5, system)
-    balance = settle_to_equilibrium(scene, np.array(scene.model.dof_damping))
+    balance = settled_holding_torques(scene, np.array(scene.model.dof_damping))
     scene.data.qfrc_applied[scene.moved_joint_ids] = balance
     mujoco.mj_forward(scene.model, scene.data)
     for grasp in system.grasps:
@@ -240,7 +240,7 @@ def recorded(run: SimulationResult, seed: int, noise: ArmSensorNoise, camera: Po
     """What sensors with some noise make of a simulation of one arm."""
     simulation = SimulationOptions(time_step=1e-3, effort_kind="sample")
     experiment = VirtualExperimentSettings(None, None, simulation, noise, camera, seed=seed)
-    return record_simulation(SYSTEMS[1], TRUTH, experiment, run)
+    return recording_from_simulation(SYSTEMS[1], TRUTH, experiment, run)
 
 
 def test_sensors_have_their_own_noise(runs: Runs) -> None:

@@ -51,7 +51,7 @@ def main() -> None:
     shape = ShapeFitter(system)
     truth = {
         "points": system.point_frames,
-        "position": [np.round(shape.points_at_configuration(q), 5).tolist() for q in true],
+        "position": [np.round(shape.point_frame_positions(q), 5).tolist() for q in true],
     }
     (FOLDER / "truth.json").write_text(json.dumps(truth) + "\n")
 

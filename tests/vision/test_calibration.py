@@ -246,7 +246,7 @@ def test_frames_stamped_late_do_not_pull(robot):
     for by, expected in ((0.0, False), (0.15, True)):
         stamp = 2.6 + found.camera_state.clock_offset + by
         points = found.camera_state.measured_to_world_points(cloud)
-        own = calibration.frame_stamp_delay(
+        own = calibration.stamp_delay_beyond_clock_offset(
             arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance
         )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, StoredFit
 from yid_ocp.display import Progress
@@ -142,7 +142,7 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
-    embedded = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
+    embedded = load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
     for settings, command in ((changed, "yid-ocp diagnose 'runs/a b/config.yaml'"), (embedded, "yid-ocp diagnose")):
         with atomic_run_folder(settings, tmp_path / "runs" / "a b") as folder:
             folder.record_run_start(settings, "diagnose")

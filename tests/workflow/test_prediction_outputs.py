@@ -111,9 +111,7 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
     bare = replace(options, arm_tracking_feedback="none", arm_tracking_feedback_gains=None)
     made = EstimationProblem(step, [first], ("elbow.stiffness",), bare)
     episode = made.episodes[0]
-    swept = made.predictor.predict_episode(
-        episode, *made.theta_and_initial_state_deviation(made.initial_unknowns, 0), False
-    )
+    swept = made.predictor.predict_episode(episode, *made.unpack_unknown_vector(made.initial_unknowns, 0), False)
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
     recordings = [replace(first, joints=joints, name=name) for name in ("first", "second")]
     apart = recordings[1:] if held_out else ()
@@ -155,7 +153,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
 def simulated(problem, seeds):
     episode = problem.episodes[0]
     outcome = problem.predictor.predict_episode(
-        episode, *problem.theta_and_initial_state_deviation(problem.initial_unknowns, 0), False
+        episode, *problem.unpack_unknown_vector(problem.initial_unknowns, 0), False
     )
     known = (problem.predictor, episode, outcome, problem.theta)
     return [recording_from_prediction(*known, seed).joints for seed in seeds]
@@ -285,7 +283,7 @@ def test_a_spring_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder)
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(robot, springs={"elbow": RobotJointSpring(3.0, 0.2)})
     theta = system.parameters.vector({"elbow.stiffness": 4.0})
-    problem = SimpleNamespace(system=system, theta_and_initial_state_deviation=lambda x, i: (theta, None))
+    problem = SimpleNamespace(system=system, unpack_unknown_vector=lambda x, i: (theta, None))
     found = {"elbow.stiffness": ParameterEstimate(4.0, 0.1, "N m/rad", 3.0, 0.0, np.inf, True, "identifiable")}
     told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
     [line] = told["mjcf"]
@@ -301,7 +299,7 @@ def test_a_spring_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder)
 def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     system = build_system(load_config(None))
     theta = system.parameters.vector({"T1.bend": 22.0})
-    problem = SimpleNamespace(system=system, theta_and_initial_state_deviation=lambda x, i: (theta, None))
+    problem = SimpleNamespace(system=system, unpack_unknown_vector=lambda x, i: (theta, None))
 
     def estimate(value, verdict):
         return ParameterEstimate(value, 0.5, "N m/rad", 3.0, 0.0, np.inf, True, verdict)

@@ -176,7 +176,7 @@ def timestamp_correction_advice(late: float, drift: float, middle: float) -> str
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
-def point_clock_offset_and_drift(
+def clock_offset_drift_and_rms_distance(
     path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float, float]:
     """Find the clock offset [s] and relative drift at which points are nearest to a known path, and how near [m] (rms).
@@ -302,13 +302,13 @@ def _by_lateness(
     problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction
 ) -> Array:
     """Whitened prediction minus measurement per second of lateness of the stamps, shape (M, k)."""
-    shared, _ = problem.theta_and_initial_state_deviation(x, i)
+    shared, _ = problem.unpack_unknown_vector(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     state = result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameter_names)))
     steps = np.ones(samples.value.shape[1])
     ahead, behind = (
-        problem.predictor.readings_along_trajectory(samples.shifted_earlier_by_steps(s * steps), state, none, theta)[0]
+        problem.predictor.readings_and_sensitivities(samples.shifted_earlier_by_steps(s * steps), state, none, theta)[0]
         for s in (-1.0, 1.0)
     )
     return np.asarray(samples.weight * (ahead - behind) / (2 * problem.step.time_step))

@@ -18,7 +18,7 @@ from yid_ocp.inference.uncertainty import (
     VERDICT_SENTENCE_TEXTS,
     VERDICT_TABLE_TEXTS,
     ParameterEstimate,
-    free_estimates_marked_not_trusted,
+    mark_free_estimates_not_trusted,
 )
 from yid_ocp.inference.whitening import problem_without_input_errors
 from yid_ocp.problem import EstimationProblem
@@ -107,7 +107,7 @@ def compare_methods(
             told = listener(solver.name, max(deadline - time.perf_counter(), 0.0) / (len(solvers) - i))
             solution = solve(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
         if whole.has_process_noise:
-            solution = replace(solution, parameters=free_estimates_marked_not_trusted(solution.parameters))
+            solution = replace(solution, parameters=mark_free_estimates_not_trusted(solution.parameters))
         taken = time.perf_counter() - wall, time.process_time() - cpu, memory.peak
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(_MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), *taken))

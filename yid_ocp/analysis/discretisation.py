@@ -414,7 +414,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def min_grasp_gaps_at_posture(
+def min_gap_by_grasp_at_robot_posture(
     system: System, configuration: Mapping[str, float], theta: Array, near: Array | None = None
 ) -> dict[str, float]:
     """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
@@ -526,19 +526,19 @@ def _alternating_mode_magnitude(
     return float(np.max(np.abs(values[values.real < 0]), initial=0.0))
 
 
-def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
+def alternating_error_growth_of_worst_recording(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
     """Largest alternating error growth of all recordings at x, up to a failed step. None if no rollout can start."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)
     for i, episode in enumerate(problem.episodes):
-        shared, offset = problem.theta_and_initial_state_deviation(x, i)
+        shared, offset = problem.unpack_unknown_vector(x, i)
         theta = predictor.theta_with_episode_values(episode, shared)
         begin = predictor.initial_state_of_episode(episode, theta, offset, ())
         if begin.failure_message:
             continue
         inputs = predictor.corrected_inputs_with_effect_momentum(episode, theta, (), begin.state)
-        feedback = inputs.feedback_with_corrected_reference(
+        feedback = inputs.tracking_feedback_with_corrected_reference(
             episode.tracking_feedback, system.actuated_coordinate_indices, episode.measured_driven_angles
         )
         driven_by = inputs.torque, inputs.prescribed_path, feedback

@@ -20,7 +20,7 @@ from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     EstimateChecksBeyondFit,
-    free_estimates_marked_not_trusted,
+    mark_free_estimates_not_trusted,
     typical_parameter_magnitudes,
 )
 from yid_ocp.model.objects.base import CableTopology
@@ -140,7 +140,7 @@ def _checked_solution_and_issues(
     found += _worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
-        marked = free_estimates_marked_not_trusted(solution.parameters)
+        marked = mark_free_estimates_not_trusted(solution.parameters)
         solution = replace(solution, goodness_of_fit=believed, parameters=marked)
     return solution, (*problem.options.data_issues, *found)
 
@@ -152,7 +152,7 @@ def _checked_solution_and_step_stability(
 
     The start is examined only if the search failed.
     """
-    growth = discretisation.largest_alternating_error_growth
+    growth = discretisation.alternating_error_growth_of_worst_recording
     begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
     end = growth(problem, solution.x)
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
@@ -242,7 +242,7 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
         own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.residual_rows.measurements[i]])
         kept = np.setdiff1d(np.arange(len(fitted.residual)), own)
         step = size_limited_damped_step(problem, solution.x, fitted.jacobian[kept], fitted.residual[kept], 1e-10)
-        parts = problem.theta_and_initial_state_deviation(np.clip(solution.x + step, *problem.bounds), i)
+        parts = problem.unpack_unknown_vector(np.clip(solution.x + step, *problem.bounds), i)
         found = problem.predictor.predict_episode(problem.episodes[i], *parts, False)
         if isinstance(found, str):
             return np.inf

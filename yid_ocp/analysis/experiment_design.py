@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, free_starts_and_grasps, transfer_unknowns_by_name
-from yid_ocp.analysis.torque_error_propagation import sensitivities_and_information_with_input_errors
+from yid_ocp.analysis.torque_error_propagation import sensitivities_with_input_errors
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -71,7 +71,7 @@ class UnchangedExperiment:
     @property
     def parameter_values(self) -> dict[str, float]:
         """Values of all model parameters at `x`."""
-        theta, _ = self.problem.theta_and_initial_state_deviation(self.x, 0)
+        theta, _ = self.problem.unpack_unknown_vector(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
@@ -179,7 +179,7 @@ class VariantPositionSensitivities:
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
     with respect to the nx unknowns and to the episode's q torque-error unknowns (see
-    `sensitivities_and_information_with_input_errors`).
+    `sensitivities_with_input_errors`).
     """
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
@@ -236,7 +236,7 @@ class ExperimentVariantSensitivityBuilder:
         self._progress = progress
         self._layouts: dict[frozenset[str], VariantPositionSensitivities | str] = {}
 
-    def sensitivities_of_variant(self, setup_changes: frozenset[str]) -> VariantPositionSensitivities | str:
+    def position_sensitivities_of_variant(self, setup_changes: frozenset[str]) -> VariantPositionSensitivities | str:
         """Compute the sensitivities of the variant with the changes `setup_changes`, or return why that fails."""
         if setup_changes not in self._layouts:
             if setup_changes:
@@ -282,9 +282,7 @@ class ExperimentVariantSensitivityBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = sensitivities_and_information_with_input_errors(
-                problem, evaluation, x, i, finest, encoders
-            )
+            points, by_joints[i] = sensitivities_with_input_errors(problem, evaluation, x, i, finest, encoders)
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
@@ -374,11 +372,11 @@ class ExperimentVariantSensitivityBuilder:
         return recording.time_slice(-math.inf, float(episode.grid.node_times[-1]) + 1e-6)
 
     def _welded(self, system: System, others: frozenset[str]) -> System:
-        layout = self.sensitivities_of_variant(others)
+        layout = self.position_sensitivities_of_variant(others)
         if isinstance(layout, str):
             raise failed_rollout_error(layout)
         problem, n = layout.problem, system.n_coordinates
-        theta, offset = problem.theta_and_initial_state_deviation(layout.x, 0)
+        theta, offset = problem.unpack_unknown_vector(layout.x, 0)
         start = problem.initial_state_of_episode(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise failed_rollout_error(start.failure_message)

@@ -145,7 +145,7 @@ def measured_and_predicted_friction_torques(
         assert joints is not None
         low_pass = LowPassFilter(problem.options.path_cutoff)
         path = smoothed_joint_angles_at_nodes(joints, driven, episode.grid, episode.name, low_pass)
-        theta, _ = problem.theta_and_initial_state_deviation(solution.x, i)
+        theta, _ = problem.unpack_unknown_vector(solution.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, theta)
         inputs = problem.predictor.corrected_inputs(episode, theta, ())
         shift = inputs.driven_angles - episode.measured_driven_angles

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from yid_ocp.analysis.profile import (
     ParameterProfileLikelihood,
     compute_profile_likelihood_interval,
-    map_over_parameters_at_optimum,
+    evaluate_for_each_parameter_at_optimum,
     mark_unidentifiable_near_zero_estimate,
 )
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, Progress, ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, failed_rollout_error, unknown_name_error_arguments
 from yid_ocp.inference import uncertainty
@@ -94,13 +94,13 @@ class IdentifiabilityResult(ReprMixin):
     chi2_per_dof: float  # if above one, its root scales standard deviations at a fit
     profiles: Mapping[str, ParameterProfileLikelihood] = field(default_factory=dict)
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         rows = [("parameter", "value", "unit", "")]
         for name, entry in self.parameters.items():
             value = uncertainty.value_and_uncertainty_text(entry.value, uncertainty.finite_or_none(entry.std), None)
             rows.append((name, value, entry.unit, uncertainty.VERDICT_TABLE_TEXTS[entry.verdict]))
         found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
-        return ReprLineAndTableRows(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
+        return ReprTexts(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
 
     @property
     def unidentifiable_directions(self) -> tuple[_ParameterDirection, ...]:
@@ -146,7 +146,7 @@ def identifiability(
     for name in (own for own in wanted if own not in names):
         said = unknown_name_error_arguments(name, names)
         raise ConfigError(f"'{name}' is not a free parameter", where="intervals", **said)
-    given = unknowns_from_solution(problem, solution)
+    given = unknown_vector_from_solution(problem, solution)
     wide = free_starts_and_grasps(problem, start, grasp_std)
     x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
     # the matrices are small: threads of the linear algebra library cost more than they gain
@@ -196,7 +196,7 @@ def _profiles(
         return found, said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    pairs = map_over_parameters_at_optimum(one, problem, view.x, wanted, progress)
+    pairs = evaluate_for_each_parameter_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
 
@@ -208,7 +208,7 @@ def system_with_grasp_offset_effects(system: System) -> System:
     return system.with_effects([make_effect(_GRASP_OFFSET_KIND, place, system) for place in places])
 
 
-def unknowns_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
+def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
     """Return a problem's unknown vector from a solution, an array or (default) its initial values.
 
     Raises `SolverError` for a wrong shape or a value that is not finite.

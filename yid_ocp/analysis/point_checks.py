@@ -150,13 +150,13 @@ def _changed_times(
 ) -> Iterator[_Change]:
     """Corrections for points recorded earlier or later than the angles, or by a faster or slower clock."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
-    late, _, error = clock_checks.point_clock_offset_and_drift(path, knots, t, seen)
+    late, _, error = clock_checks.clock_offset_drift_and_rms_distance(path, knots, t, seen)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
         return
-    late, drift, error = clock_checks.point_clock_offset_and_drift(path, knots, t, seen, drifts=True)
+    late, drift, error = clock_checks.clock_offset_drift_and_rms_distance(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words = f"taken {late:+.3g} s from the joints, by a clock that runs {1e3 * drift:+.3g} parts per thousand fast,"
         yield _Change("clock_drift", words, clock_checks.timestamp_correction_advice(late, drift, middle), error)

@@ -124,11 +124,11 @@ def solution_with_profile_intervals(
 
     # each parameter takes about one and a half times as long as the solution
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood", 7.5 * len(asked), 5.2)
-    found = map_over_parameters_at_optimum(judged, problem, solution.x, tuple(asked), progress)
+    found = evaluate_for_each_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def map_over_parameters_at_optimum(
+def evaluate_for_each_parameter_at_optimum(
     judged: Callable[[str, Array, Evaluation], _Found],
     problem: EstimationProblem,
     x: Array,

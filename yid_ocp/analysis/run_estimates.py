@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.inference.null_test import chi2_p_value
 
 _MIN_CORRELATION_EIGENVALUE = 1e-12  # smaller eigenvalues result from rounding
@@ -35,12 +35,12 @@ class RunEstimates(ReprMixin):
     is_fit_adequate: bool = True
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # parameters by label `kind@location`
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         rows = [("parameter", "value", "unit")]
         known = zip(self.parameter_names, self.values, self.std, strict=True)
         rows += [(name, f"{value:.4g} ± {std:.2g}", self.units.get(name, "")) for name, value, std in known]
         count = count_with_noun(len(self.parameter_names), "parameter")
-        return ReprLineAndTableRows(f"{count} of the run '{self.run_name}'", rows)
+        return ReprTexts(f"{count} of the run '{self.run_name}'", rows)
 
     @property
     def std(self) -> Array:

@@ -50,7 +50,7 @@ _RESPONSE_STEPS = 100
 
 
 @dataclass(frozen=True)
-class ParameterInfluence:
+class ParameterEquationsAndResponses:
     """Step equations that contain one parameter, and the sensors' response to the parameter."""
 
     parameter: str
@@ -71,7 +71,7 @@ def parameter_equations_and_responses(
     state: Array,
     theta: Array,
     stages: StepResidualsAndJacobians,
-) -> tuple[ParameterInfluence, ...]:
+) -> tuple[ParameterEquationsAndResponses, ...]:
     """Find for each parameter the step equations that contain it, and which sensors respond to it.
 
     For the response, one unit is added to one equation of a step that starts at `state`. The later steps are linear, x'
@@ -86,7 +86,7 @@ def parameter_equations_and_responses(
             entered[column - at.start].append(row)
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
     if episode is None:
-        return tuple(ParameterInfluence(*entry, None, "", (), None, 0.0) for entry in known)
+        return tuple(ParameterEquationsAndResponses(*entry, None, "", (), None, 0.0) for entry in known)
     gain = np.zeros((step.sizes["nu"], step.sizes["nx"]))
     if episode.tracking_feedback is not None:
         gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
@@ -102,7 +102,7 @@ def parameter_equations_and_responses(
         best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
         seen, read = tuple(names[r] for r in answered), tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
         moved = float(np.max(by_theta[:, i], initial=0.0))
-        found.append(ParameterInfluence(*entry, seen, best, read, moved, span))
+        found.append(ParameterEquationsAndResponses(*entry, seen, best, read, moved, span))
     return tuple(found)
 
 

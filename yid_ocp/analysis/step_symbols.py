@@ -10,7 +10,7 @@ from functools import cached_property
 import casadi as ca
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_question
 from yid_ocp.integrator.discrete import DiscreteEquations
 
@@ -196,11 +196,11 @@ class NamedStepEquations(ReprMixin):
     row_blocks: tuple[_SymbolBlock, ...]
     column_blocks: tuple[_SymbolBlock, ...]
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         blocks = (*self.row_blocks, *self.column_blocks)
         rows = [("block", "entries", "meaning"), *((b.name, str(len(b.full_names)), b.meaning) for b in blocks)]
         count = count_with_noun(sum(len(block.full_names) for block in self.row_blocks), "equation")
-        return ReprLineAndTableRows(f"{count} of a step of {self.equations.system.mechanism.name}", rows)
+        return ReprTexts(f"{count} of a step of {self.equations.system.mechanism.name}", rows)
 
     @staticmethod
     def from_equations(equations: DiscreteEquations) -> NamedStepEquations:

@@ -17,7 +17,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
-from yid_ocp.integrator.step import step_derivatives_along_rollout
+from yid_ocp.integrator.step import next_state_derivatives
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
@@ -29,7 +29,7 @@ _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a read
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
-def sensitivities_and_information_with_input_errors(
+def sensitivities_with_input_errors(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -60,7 +60,7 @@ def sensitivities_and_information_with_input_errors(
             shown.append((samples.sensor, block.reshape(len(samples.value), -1, len(x))))
         else:
             told.append(block)
-    theta, _ = problem.theta_and_initial_state_deviation(x, i)
+    theta, _ = problem.unpack_unknown_vector(x, i)
     course = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
     units = [finest[sensor.group_name] for sensor, block in shown for _ in range(block.shape[1])]
     by_state = []
@@ -136,7 +136,8 @@ class _Motion:
 
     def __init__(self, course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        momentum = course.model_functions.effect_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
+        correction = course.model_functions.reference_momentum_correction
+        momentum = correction.momentum_derivative_by_previous_torque(course.theta)
         self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
         nu, count = len(errors.torque_std), len(errors.sample_of_step)
         known, pulled = np.tile(np.eye(nu), (count, 1, 1)), np.zeros((count, nu, nu))
@@ -144,7 +145,7 @@ class _Motion:
             known = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
             pulled = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         inputs = np.concatenate([known, pulled], axis=2)
-        for state, _ in step_derivatives_along_rollout(step, course.theta, course.rollout, inputs, feedback):
+        for state, _ in next_state_derivatives(step, course.theta, course.rollout, inputs, feedback):
             self.by_state += [*state[:, :, : -2 * nu]]
             self.by_torque += [*state[:, :, -2 * nu : -nu]]
             self.by_angles += [*state[:, :, -nu:]]

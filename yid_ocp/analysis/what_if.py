@@ -21,9 +21,9 @@ from yid_ocp.analysis.experiment_design import (
     measurable_points,
     uniform_sample_times,
 )
-from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
+from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknown_vector_from_solution
 from yid_ocp.arrays import Array
-from yid_ocp.display import NULL_PROGRESS, Progress, ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, Progress, ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 from yid_ocp.model.system import System
@@ -86,16 +86,16 @@ class ExperimentChangesByIdentifiableCount(ReprMixin):
     smallest_sufficient_sets: tuple[ChangedExperimentResult, ...]
     n_evaluated_sets: int
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         shown = (self.unchanged_experiment, *self.single_changes)
         rows = [("change", "parameters found", "gain [nat]")]
         rows += [(entry.description, str(entry.identifiable), f"{entry.gain:.3g}") for entry in shown]
         count = count_with_noun(len(self.single_changes), "change")
-        return ReprLineAndTableRows(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
+        return ReprTexts(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 
 
 # From sets of changes and a factor on the stated variances to the predicted results, one for each set.
-ChangeSetEvaluationFunction = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
+ChangeSetsEvaluationFunction = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
 
 
 def what_if(
@@ -107,7 +107,7 @@ def what_if(
     two_arm_system: System | None = None,
     considered_changes: Collection[str] | None = None,
     progress: Progress = NULL_PROGRESS,
-    evaluate_changes: ChangeSetEvaluationFunction | None = None,
+    evaluate_changes: ChangeSetsEvaluationFunction | None = None,
 ) -> ExperimentChangesByIdentifiableCount:
     """Rank changes of an experiment by the number of parameters that they make identifiable, without new measurements.
 
@@ -128,7 +128,7 @@ def what_if(
     evaluate_changes : callable, optional
         Replacement for `evaluate_experiment_change_sets`, for example in other processes.
     """
-    x, inflation = unknowns_from_solution(problem, solution), 1.0
+    x, inflation = unknown_vector_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)
     setting = UnchangedExperiment(problem, x, start, grasp_std, two_arm_system)
@@ -184,7 +184,7 @@ class _Outcomes:
         setting: UnchangedExperiment,
         inflation: float,
         progress: Progress = NULL_PROGRESS,
-        judge: ChangeSetEvaluationFunction | None = None,
+        judge: ChangeSetsEvaluationFunction | None = None,
     ) -> None:
         self.setting, self.inflation, self.progress = setting, inflation, progress
         self.builder = ExperimentVariantSensitivityBuilder(setting, progress)
@@ -234,7 +234,7 @@ class _Outcomes:
     def _outcome(self, changes: Sequence[ExperimentChange]) -> ChangedExperimentResult:
         names, words = tuple(change.name for change in changes), _words(changes)
         setup_changes = frozenset(change.setup_change for change in changes if change.setup_change)
-        layout = self.builder.sensitivities_of_variant(setup_changes)
+        layout = self.builder.position_sensitivities_of_variant(setup_changes)
         if isinstance(layout, str):
             return ChangedExperimentResult(names, words, {}, {}, 0, -math.inf, layout)
         views = [self._views(episode, changes, layout) for episode in self.setting.problem.episodes]

@@ -29,7 +29,7 @@ from yid_ocp.files import read_input_text
 
 _KeyPath = tuple[str | int, ...]
 DEFAULT_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
-DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
+EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
 _ALIAS_COST = 40  # in entries: merging an alias compares its mapping with all others

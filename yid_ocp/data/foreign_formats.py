@@ -32,7 +32,7 @@ _CHANNEL_WORDS: Mapping[str, str] = {
 _CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
 _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
-UNIT_WORDS = {
+UNIT_BY_WORD = {
     **dict.fromkeys(("s", "sec", "secs", "seconds", "second"), "s"),
     **{word: word for word in ("ms", "us", "ns", "m", "cm", "mm", "rad", "deg", "rev", "rpm", "rad/s", "deg/s")},
     **{"degrees": "deg", "radians": "rad", "deg/sec": "deg/s", "rad_s": "rad/s", "deg_s": "deg/s", "rad/sec": "rad/s"},
@@ -43,7 +43,7 @@ UNIT_WORDS = {
 """Units in the spellings of headers, in lower case."""
 _NO_POINT = re.compile(r"(.*_)?(force|torque|moment|velocity|acceleration|orientation|rotation|quaternion)", re.I)
 _BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
-_SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_WORDS), key=len, reverse=True))})", re.I)
+_SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_BY_WORD), key=len, reverse=True))})", re.I)
 
 
 def column_meanings(
@@ -73,13 +73,13 @@ def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str
     If the unit is unknown, the name is empty as well.
     """
     if (bracketed := _BRACKETED_UNIT.fullmatch(column)) and not bracketed[2].isdecimal():
-        name, unit = bracketed[1], UNIT_WORDS.get(bracketed[2].lower(), "")
+        name, unit = bracketed[1], UNIT_BY_WORD.get(bracketed[2].lower(), "")
         if unit or _exact_meaning(name, sensor_components) or _spelled_meaning(name):
             return name if unit else "", unit
     if _exact_meaning(column, sensor_components) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
         name = suffixed[1]
         if _exact_meaning(name, sensor_components) or _spelled_meaning(name):
-            return name, UNIT_WORDS[suffixed[2].lower()]
+            return name, UNIT_BY_WORD[suffixed[2].lower()]
     return column, ""
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.sensors.base import EffortSamplingKind, additional_sensor_channel_kinds
 
@@ -109,10 +109,10 @@ class JointGroup(ReprMixin):
         """Meaning of effort samples (`effort_kind`). The default is `sample`, which is what robot drivers publish."""
         return self.effort_kind or "sample"
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         count = count_with_noun(len(self.names), "joint")
         rows = [("joint",), *((name,) for name in self.names)]
-        return ReprLineAndTableRows(f"{count}, {_sampled(self.t)}: {', '.join(self.values_by_channel)}", rows)
+        return ReprTexts(f"{count}, {_sampled(self.t)}: {', '.join(self.values_by_channel)}", rows)
 
     def _rows(self, rows: BoolArray) -> JointGroup:
         changes: dict[str, Any] = {name: value[rows] for name, value in self.values_by_channel.items()}
@@ -161,11 +161,11 @@ class PointGroup(ReprMixin):
             object.__setattr__(self, "std", np.full(self.position.shape, float(self.std)))
             _freeze_arrays(self, ("std",))
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         seen = np.isfinite(self.position).all(axis=2).sum(axis=0)
         rows = [("point", "seen"), *((name, str(count)) for name, count in zip(self.names, seen, strict=True))]
         count = count_with_noun(len(self.names), "point")
-        return ReprLineAndTableRows(f"{self.name}, {count}, {_sampled(self.t)}, in {self.frame}", rows)
+        return ReprTexts(f"{self.name}, {count}, {_sampled(self.t)}, in {self.frame}", rows)
 
     def _rows(self, rows: BoolArray) -> PointGroup:
         std = None if self.std is None else self.std[rows]
@@ -208,9 +208,9 @@ class SensorChannelGroup(ReprMixin):
         object.__setattr__(self, "values_by_quantity", values)
         object.__setattr__(self, "noise_and_bias_stds_by_attribute", stds)
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         quantities = ", ".join(self.values_by_quantity)
-        return ReprLineAndTableRows(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
+        return ReprTexts(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
 
     def _rows(self, rows: BoolArray) -> SensorChannelGroup:
         values = {key: value[rows] for key, value in self.values_by_quantity.items()}
@@ -255,7 +255,7 @@ class Recording(ReprMixin):
         if self.marker_reference_pose is not None:
             object.__setattr__(self, "marker_reference_pose", read_only_copy(self.marker_reference_pose, "straight"))
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         names = {"joint": self.joint_names, "point": self.point_names}
         counts = " and ".join(count_with_noun(len(own), noun) for noun, own in names.items())
         rows = [("group", "names", "samples", "channels")]
@@ -264,7 +264,7 @@ class Recording(ReprMixin):
             channels = g.values_by_channel if isinstance(g, JointGroup) else quantities
             rows.append((g.name, ", ".join(g.names), _sampled(g.t), ", ".join(channels)))
         span = f", {self.duration:.4g} s" if self.all_groups else ""
-        return ReprLineAndTableRows(f"'{self.name}', {counts}{span}", rows)
+        return ReprTexts(f"'{self.name}', {counts}{span}", rows)
 
     @property
     def joint_and_point_groups(self) -> tuple[JointGroup | PointGroup, ...]:

@@ -221,7 +221,7 @@ _READ_TIMEOUT = 10.0  # for reading a whole file [s]
 _MAX_GROUP_DEPTH = 10
 
 
-def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
+def check_readable_in_child_process(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
     """Check in a forked process that a file can be read. A crash of the library then cannot end this process.
 
     `complaint` reads the file in the fork and returns a description of the error, empty on success. Raises `DataError`
@@ -286,7 +286,7 @@ def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.Fi
     Raises `DataError` if the file is damaged, contains more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers
     to other files, which its hash does not cover. Errors of the library within the block are raised as `DataError` too.
     """
-    check_readable_in_fork(Path(path), _complaint, "HDF5")
+    check_readable_in_child_process(Path(path), _complaint, "HDF5")
     try:
         with h5py.File(path, "r") as file:
             yield file

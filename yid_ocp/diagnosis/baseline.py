@@ -117,7 +117,7 @@ class DiagnosisBaseline:
         known, chi2, degrees = pool_estimates_and_chi2(runs)
         return DiagnosisBaseline(known, chi2_p_value(chi2, degrees), without)
 
-    def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> ParameterShiftsSinceBaseline | None:
+    def parameter_shifts_of_fit(self, fit: RefittedModel, limits: Thresholds) -> ParameterShiftsSinceBaseline | None:
         """Compute the shifts of a fit's parameters from its baseline prior. None if there are no runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
@@ -143,12 +143,12 @@ class DiagnosisBaseline:
 
     def fit_parameters_differ_significantly(self, fit: RefittedModel, limits: Thresholds) -> bool:
         """Whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
-        found = self.compare_with_baseline(fit, limits)
+        found = self.parameter_shifts_of_fit(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
     def prediction_errors_with_and_without_effects(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> EffectRemovalAndAdditionErrors | None:
+    ) -> ErrorsWithEffectsRemovedAndAdded | None:
         """Test found effects on recordings made with and without them, such as before and after a repair.
 
         Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
@@ -169,8 +169,8 @@ class DiagnosisBaseline:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return EffectRemovalAndAdditionErrors(removed, _nothing(present, error.what))
-        return EffectRemovalAndAdditionErrors(removed, _predicted(last, present, then, {**then, **effects}))
+            return ErrorsWithEffectsRemovedAndAdded(removed, _nothing(present, error.what))
+        return ErrorsWithEffectsRemovedAndAdded(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
@@ -220,7 +220,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class EffectRemovalAndAdditionErrors:
+class ErrorsWithEffectsRemovedAndAdded:
     """Prediction errors on reference recordings without the effects, and on diagnosed recordings with the effects."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model

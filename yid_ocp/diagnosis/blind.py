@@ -21,11 +21,11 @@ from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, ProjectedCandidatesLinearization, linearize_candidates
 from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.effects.base import EffectBase, elastic_joints_within_segment
+from yid_ocp.effects.base import EffectBase, elastic_joints_of_segment
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.recorded_inputs import lowest_path_cutoff
+from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import (
     INJECTABLE_EFFECT_KINDS,
@@ -63,7 +63,7 @@ class PlannedBlindCase:
     is_brisk: bool = False  # whether it moves with three times the acceleration
 
 
-def assign_blind_case_categories(
+def plan_blind_cases(
     count: int,
     seed: int,
     weights: Mapping[str, float],
@@ -313,15 +313,15 @@ class BlindCaseGenerator:
             for s in self._linearize_clean_recordings().signatures
         )
 
-    def candidate_sensitivities_to_plain_data(self) -> list[dict[str, Any]]:
+    def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
         """Compute JSON-compatible sensitivities of all candidates, which define their detectable sizes."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
-    def set_candidate_sensitivities_from_plain_data(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Set the candidates' sensitivities to those of another generator's `candidate_sensitivities_to_plain_data`."""
+    def set_candidate_sensitivities_from_json(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+        """Set the candidates' sensitivities to those of another generator's `candidate_sensitivities_to_json`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -332,7 +332,7 @@ class BlindCaseGenerator:
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         # motions differ between cases, and a filter for the first one could remove those of others
-        cutoff = max(nominal.options.path_cutoff, lowest_path_cutoff(recordings, nominal.system.prescribed))
+        cutoff = max(nominal.options.path_cutoff, select_path_cutoff(recordings, nominal.system.prescribed))
         options = replace(nominal.options, path_cutoff=cutoff)
         return EstimationProblem(nominal.step, list(recordings), nominal.free, options, values)
 
@@ -424,7 +424,7 @@ class BlindCaseGenerator:
             size *= self._largest_torque(location)
         elif part_of == "stiffness":
             start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
-            bends = any(spring.deformation == "bend" for spring in elastic_joints_within_segment(system, location))
+            bends = any(spring.deformation == "bend" for spring in elastic_joints_of_segment(system, location))
             size *= float(start.get(f"{location}.bend", 10.0)) if bends else 10.0
         return InjectedEffect(kind, location, {"size": size})
 

@@ -568,7 +568,7 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     except _UnrecordedRefitError:
         judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0)
     where = case.located_gap
-    if judged.accepted_selections:
+    if judged.accepted_selected_effects:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
-        where = gap_locations_from_effects_and_smoother(where, judged.closure_by_location, rest, ())
+        where = gap_locations_from_effects_and_smoother(where, judged.closure_by_effect_location, rest, ())
     return judgement_to_dict(judged, case.evidence, where)

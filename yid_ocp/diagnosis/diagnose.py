@@ -30,7 +30,7 @@ from yid_ocp.diagnosis.hypotheses import (
     FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP,
     AllCandidatesProblem,
     CandidateNamesOrAll,
-    TruncatedHeldOutRecording,
+    HeldOutTruncation,
     exclude_candidates,
     make_candidate_effects,
 )
@@ -41,8 +41,8 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     RefitStore,
     RefittedModel,
+    evaluate_in_all_candidates_step,
     refit_with_effects,
-    restore_in_all_candidates_step,
 )
 from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -127,7 +127,7 @@ class _Examined:
 
     search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefittedModel
-    truncated: tuple[TruncatedHeldOutRecording, ...]
+    truncated: tuple[HeldOutTruncation, ...]
     whole: EstimationProblem  # the problem with all samples
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all its recordings, if it was run
@@ -138,7 +138,7 @@ class _Examined:
 def _examined(
     search: RefitContext,
     nominal: RefittedModel,
-    known: tuple[TruncatedHeldOutRecording, ...] = (),
+    known: tuple[HeldOutTruncation, ...] = (),
     is_corrected_for_links: bool = False,
 ) -> _Examined:
     """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
@@ -206,8 +206,8 @@ def _without_error_of_links(
 
 
 def _followed(
-    search: RefitContext, nominal: RefittedModel, known: tuple[TruncatedHeldOutRecording, ...]
-) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
+    search: RefitContext, nominal: RefittedModel, known: tuple[HeldOutTruncation, ...]
+) -> tuple[RefitContext, RefittedModel, tuple[HeldOutTruncation, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = {cut.recording: cut for cut in known}
     for fraction in FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP:
@@ -312,9 +312,9 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     end_stage("localisation")
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
-    if accepted := judged.accepted_selections:
+    if accepted := judged.accepted_selected_effects:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
-        final = restore_in_all_candidates_step(search.problem, accepted[-1].refitted_model)
+        final = evaluate_in_all_candidates_step(search.problem, accepted[-1].refitted_model)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
         remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
         # a disturbance that a better model explains was no event
@@ -341,7 +341,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         truncated_recordings=seen.truncated,
         stage_seconds={name: ends[name] - ends[last] for last, name in itertools.pairwise(ends)},
         events=events,
-        baseline_comparison=earlier.compare_with_baseline(final, limits),
+        baseline_comparison=earlier.parameter_shifts_of_fit(final, limits),
         counterfactual=earlier.prediction_errors_with_and_without_effects(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_used_time_step=steps,
@@ -393,7 +393,7 @@ def _after(
     if null_test.residuals_exceed_noise(tests, limits.null_test_limits):
         rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits))
     windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
-    where = smoother.gap_locations_from_effects_and_smoother(where, judged.closure_by_location, rest, windows)
+    where = smoother.gap_locations_from_effects_and_smoother(where, judged.closure_by_effect_location, rest, windows)
     return tests[1], where, rest
 
 
@@ -427,7 +427,7 @@ def _null_test(problem: EstimationProblem, residual: Array, fitted: float, limit
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
-    spread = null_test.encoder_noise_residual_factor(fit.problem, fit.problem.unknown_vector(fit.values))
+    spread = null_test.encoder_noise_residual_covariance_factor(fit.problem, fit.problem.unknown_vector(fit.values))
     residual = null_test.whiten_with_extra_errors(fit.evaluation.residual, spread)
     return _null_test(fit.problem, residual, effective_parameter_count(fit.problem, fit.evaluation), limits)
 
@@ -457,7 +457,7 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
     residual = np.concatenate([part.residual for part in found])
     slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
     by_parameters = slopes @ noise_only_covariance_factor(problem, fit.evaluation)[:shared]
-    by_path = null_test.encoder_noise_residual_factor(own, x, residual_of)[: len(residual)]
+    by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
     residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
     return _null_test(own, residual, 0, limits)
 

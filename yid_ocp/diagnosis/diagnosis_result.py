@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.diagnosis.baseline import EffectRemovalAndAdditionErrors, ParameterShiftsSinceBaseline
+from yid_ocp.diagnosis.baseline import ErrorsWithEffectsRemovedAndAdded, ParameterShiftsSinceBaseline
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
-from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
+from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import EffectSearchResults, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
@@ -24,7 +24,7 @@ from yid_ocp.diagnosis.select import (
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, abbreviated_names_text
+from yid_ocp.display import ReprMixin, ReprTexts, abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference import null_test
@@ -62,10 +62,10 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
     baseline_comparison: ParameterShiftsSinceBaseline | None = None
-    counterfactual: EffectRemovalAndAdditionErrors | None = None
+    counterfactual: ErrorsWithEffectsRemovedAndAdded | None = None
     next_experiment: str = ""
     summary: str = ""
-    truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
+    truncated_recordings: tuple[HeldOutTruncation, ...] = ()
     located_gap: tuple[GapLocation, ...] = ()  # of the nominal model, by the smoother
     record: EffectSearchResults = field(default_factory=EffectSearchResults)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
@@ -76,8 +76,8 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
-    def _summary(self) -> ReprLineAndTableRows:
-        closed = total_gap_closure(self.accepted_selections)
+    def _summary(self) -> ReprTexts:
+        closed = total_gap_closure(self.accepted_selected_effects)
         said = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects), closed.text]
         rows = [("candidate", "parameters", "closure alone", "p")]
         for entry in _ranked_candidates(self, self)[:8]:
@@ -85,17 +85,17 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             known = ", ".join(f"{name} = {value:.3g} {unit}" for name, value, unit in values if value is not None)
             alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
             rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
-        return ReprLineAndTableRows(", ".join(filter(None, said)), rows)
+        return ReprTexts(", ".join(filter(None, said)), rows)
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
         """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
-        return tuple(entry.effect for entry in self.accepted_selections)
+        return tuple(entry.effect for entry in self.accepted_selected_effects)
 
     @property
     def final_model(self) -> RefittedModel:
         """The model with all accepted effects, or the nominal model if there are none."""
-        last = [self.nominal_model, *(entry.refitted_model for entry in self.accepted_selections)][-1]
+        last = [self.nominal_model, *(entry.refitted_model for entry in self.accepted_selected_effects)][-1]
         assert isinstance(last, RefittedModel)
         return last
 
@@ -140,14 +140,14 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         return dict(to_json_types(found))
 
 
-def _part_to_dict(part: ParameterShiftsSinceBaseline | EffectRemovalAndAdditionErrors | GapLaw | None) -> Any:
+def _part_to_dict(part: ParameterShiftsSinceBaseline | ErrorsWithEffectsRemovedAndAdded | GapLaw | None) -> Any:
     """An optional part as a dictionary, or None."""
     return part and part.to_dict()
 
 
 def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
     """Convert the rule-based, scored part of a diagnosis to a JSON-compatible dictionary."""
-    added = judged.accepted_selections
+    added = judged.accepted_selected_effects
     before = _errors(seen.nominal_model) | attributes_to_dict(seen.nominal_held_out_test, "chi2_per_dof p_value")
     rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
     found = {
@@ -165,7 +165,7 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
 def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     """Statistics that are compared with `Thresholds`, as a JSON-compatible dictionary; None if they are not known."""
     tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
-    differences = (entry.estimate_difference_and_std for entry in result.transfer_checks)
+    differences = (entry.absolute_difference_and_std for entry in result.transfer_checks)
     smoothed = None if result.nominal_model.has_process_noise else result.smoother_result
     found = {
         "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
@@ -195,7 +195,8 @@ def _errors(fit: RefitStatistics) -> dict[str, Any]:
 
 def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list[dict[str, Any]]:
     """All candidates: accepted effects, then other refits by held-out loss, then the rest by score."""
-    added, alone, before = judged.accepted_selections, judged.single_effect_models, seen.nominal_model.held_out_loss
+    added, alone = judged.accepted_selected_effects, judged.single_effect_models
+    before = seen.nominal_model.held_out_loss
     closures = {fit.effects[0].label: held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
     probabilities = judged.candidate_probabilities
@@ -220,7 +221,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
 
 def recommended_experiment_text(result: DiagnosisResult) -> str:
     """Recommend the next recording in a sentence, from verdict, gap location and confusable effects."""
-    for rivals in (entry.equivalent_effects for entry in result.accepted_selections):
+    for rivals in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
         advice = (
@@ -270,7 +271,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
 
 
-def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
+def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Sentence on how far the nominal model follows a truncated held-out recording."""
     used, whole = cut.kept_duration, cut.full_duration
     return f"The nominal model follows {cut.recording} for {used:.3g} of {whole:.3g} s only; the rest is ignored."
@@ -335,7 +336,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
             interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
             part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
         text.append(f"{names} {verb} {part}.")
-    for own, *others in (entry.equivalent_effects for entry in result.accepted_selections):
+    for own, *others in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
     explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]

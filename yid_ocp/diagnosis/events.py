@@ -22,9 +22,9 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import mask_out_samples
 from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
+    CompiledInverseDynamics,
     DetectedForcePulse,
-    ForceEstimate,
-    InverseDynamicsTerms,
+    ForceHistory,
     detect_force_pulses,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -44,7 +44,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.signal_filters import effort_low_pass_filter
+from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 from yid_ocp.sensors.joints import quantization_step
 
@@ -105,7 +105,7 @@ class EventSet:
 
     disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
-    force_estimates: tuple[ForceEstimate, ...] = ()
+    force_estimates: tuple[ForceHistory, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.disturbances or self.overspeeds)
@@ -147,13 +147,13 @@ def find_force_and_fault_events(
     searched only where the smoother found unknown forces.
     """
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
-    told = [(e, result, problem.theta_and_initial_state_deviation(x, i)[0]) for i, (e, result) in enumerate(fitted)]
-    shared = problem.theta_and_initial_state_deviation(x, 0)[0]
+    told = [(e, result, problem.unpack_unknown_vector(x, i)[0]) for i, (e, result) in enumerate(fitted)]
+    shared = problem.unpack_unknown_vector(x, 0)[0]
     told += [(e, found, shared) for e, found in problem.predict_held_out(x) if not isinstance(found, str)]
     runs = [(e, result, problem.predictor.theta_with_episode_values(e, theta)) for e, result, theta in told]
     ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
     wrong = [e for run in runs for e in _wrong_samples(problem, run) if e.end_time < ends._end_of(e.recording)]
-    torques = InverseDynamicsTerms(problem.step)
+    torques = CompiledInverseDynamics(problem.step)
     histories = [history for run in runs for history in _read_forces(problem, run, torques, limits)]
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques)
@@ -186,14 +186,14 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
         yield _Overspeed(episode.name, names[places[int(speed[at].argmax())]], float(at * h))
 
 
-def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
+def _before_overspeed(history: ForceHistory, ends: EventSet) -> ForceHistory | None:
     """A history up to the recording's overspeed, without the ends distorted by a filter; None if too short."""
-    until = ends._end_of(history.recording) - effort_low_pass_filter(history.filter_cutoff).end_distortion_duration
+    until = ends._end_of(history.recording) - zero_phase_effort_filter(history.filter_cutoff).end_distortion_duration
     keep = np.flatnonzero(history.t <= until)
     return None if len(keep) < 10 else history.subset_at_indices(keep)
 
 
-def _allowed(torques: InverseDynamicsTerms, run: _RecordingRollout, nodes: IntArray) -> tuple[Array, Array]:
+def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: IntArray) -> tuple[Array, Array]:
     """Assumed model error of every coordinate's torque, and the torque that friction can hold, (M, n)."""
     episode, result, theta = run
     terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
@@ -205,8 +205,8 @@ def _allowed(torques: InverseDynamicsTerms, run: _RecordingRollout, nodes: IntAr
 
 
 def _read_forces(
-    problem: EstimationProblem, run: _RecordingRollout, torques: InverseDynamicsTerms, limits: Thresholds
-) -> Iterator[ForceEstimate]:
+    problem: EstimationProblem, run: _RecordingRollout, torques: CompiledInverseDynamics, limits: Thresholds
+) -> Iterator[ForceHistory]:
     """Force estimates of prescribed joints with compared efforts, from required and measured torque."""
     episode, result, _ = run
     unbiased = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
@@ -228,10 +228,10 @@ def _read_forces(
             score, information = together @ (square * value[:, column]), np.diag(together @ square)
             what = (episode.name, joint, joint, generalised_force_unit(problem.system, joint))
             allowed = (mean @ error[:, at], mean @ held[:, at], problem.options.path_cutoff)
-            yield from _spans(ForceEstimate(*what, mean @ times, score, information, *allowed), limits)
+            yield from _spans(ForceHistory(*what, mean @ times, score, information, *allowed), limits)
 
 
-def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
+def _spans(whole: ForceHistory, limits: Thresholds) -> Iterator[ForceHistory]:
     """Overlapping parts (twice the longest pulse) of a long history; cost grows with the cube of their points."""
     overlap = math.ceil(2 * limits.max_event_duration / whole.time_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
@@ -245,11 +245,11 @@ def _driving_forces(
     evaluation: Evaluation,
     runs: Sequence[_RecordingRollout],
     smoothed: SmoothedUnknownsResult,
-    torques: InverseDynamicsTerms,
-) -> list[ForceEstimate]:
+    torques: CompiledInverseDynamics,
+) -> list[ForceHistory]:
     """Force estimates of coordinates moved by unknown forces, if the smoother found some for a part of the time."""
     sought = {trace.recording: _short(smoothed, i) for i, trace in enumerate(smoothed.smoothed_unknowns)}
-    found: list[ForceEstimate] = []
+    found: list[ForceHistory] = []
     if not any(sought.values()):
         return found
     with threadpoolctl.threadpool_limits(1):
@@ -268,7 +268,7 @@ def _driving_forces(
                 score, information = force_log_likelihood_coefficients(model, variance, index)
                 what = (model.recording, source.location, name, unit, middle[full])
                 known = (score[full] / size, information[full, full] / size**2)
-                found.append(ForceEstimate(*what, *known, error[full, at], held[full, at]))
+                found.append(ForceHistory(*what, *known, error[full, at], held[full, at]))
     return found
 
 
@@ -284,7 +284,7 @@ def _short(smoothed: SmoothedUnknownsResult, recording: int) -> list[str]:
 
 
 def _one_each(
-    found: Sequence[tuple[ForceEstimate, DetectedForcePulse]], problem: EstimationProblem
+    found: Sequence[tuple[ForceHistory, DetectedForcePulse]], problem: EstimationProblem
 ) -> list[ForceOrFaultEvent]:
     """Force events; a push that moves the model is assigned to the coordinate that explains most of it."""
     prescribed = set(problem.system.prescribed)
@@ -351,7 +351,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         for column, channel in enumerate(samples.channel_name_per_output):
             location = channel.rpartition(".")[2]
             if sensor.outputs_per_channel > 1:
-                location = sensor_bias_location_name(problem.system, sensor, sensor.output_frame_names[column])
+                location = sensor_bias_location_name(problem.system, sensor, sensor.measurement_frame_names[column])
             seen, about = samples.positive_weight_mask[:, column], (location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
             yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)
@@ -470,7 +470,7 @@ def _counting(
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(end) and is_effort:
-        hidden |= t > end - effort_low_pass_filter(cutoff).end_distortion_duration
+        hidden |= t > end - zero_phase_effort_filter(cutoff).end_distortion_duration
     smear = 1 / cutoff if is_effort else 0.0
     for event in own:
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)

@@ -17,7 +17,7 @@ from yid_ocp.inference.whitening import (
     WhiteningFilter,
     problem_relinearized_at_torque_bias,
     problem_with_held_out_kalman_whitening,
-    problem_with_relinearized_held_out_whitening,
+    problem_with_reestimated_held_out_torque_biases,
     problem_with_whitening_at,
 )
 from yid_ocp.integrator.step import compile_step_like
@@ -104,7 +104,7 @@ def join_effect_labels(effects: Sequence[EffectBase]) -> str:
 
 
 @dataclass(frozen=True)
-class TruncatedHeldOutRecording:
+class HeldOutTruncation:
     """A held-out recording truncated where the nominal model stops following it: name and durations."""
 
     recording: str
@@ -182,7 +182,7 @@ class AllCandidatesProblem:
 
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], kept_fraction: float
-    ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
+    ) -> tuple[AllCandidatesProblem, tuple[HeldOutTruncation, ...]]:
         """Truncate held-out recordings where the nominal model's rollout fails. Also returns these recordings.
 
         They keep `kept_fraction` of the duration that the model follows. If too little of every recording remains,
@@ -198,7 +198,7 @@ class AllCandidatesProblem:
                 continue
             steps = round(kept_fraction * steps)
             usable = steps * h >= _MIN_PREDICTED_DURATION
-            cuts.append(TruncatedHeldOutRecording(episode.name, steps * h if usable else 0.0, whole * h))
+            cuts.append(HeldOutTruncation(episode.name, steps * h if usable else 0.0, whole * h))
             kept += [truncate_episode(episode, steps)] if usable else []
         if not cuts:
             return self, ()
@@ -239,7 +239,7 @@ class AllCandidatesProblem:
         """Relinearise held-out filters at the fitted values. `own`: from `with_effects_and_relinearized_filters`."""
         if not own.has_process_noise:
             return own
-        return problem_with_relinearized_held_out_whitening(own, *_beside(own, effects, at))
+        return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))
 
 
 def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFunctions) -> EstimationProblem | None:

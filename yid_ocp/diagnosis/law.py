@@ -234,7 +234,7 @@ def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
     """Values of a quantity in all estimation recordings, (samples,)."""
     problem, x, found = model.problem, model.problem.unknown_vector(model.values), []
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
-        theta = problem.predictor.theta_with_episode_values(episode, problem.theta_and_initial_state_deviation(x, i)[0])
+        theta = problem.predictor.theta_with_episode_values(episode, problem.unpack_unknown_vector(x, i)[0])
         nodes = _along(result, episode.grid.time_step)
         found.append(torque_law_quantity_values_along_rollout(problem.system, place, quantity, theta, nodes).ravel())
     values = np.concatenate(found)

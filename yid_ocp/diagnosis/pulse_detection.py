@@ -31,7 +31,7 @@ from yid_ocp.integrator.step import Step, input_or_servo_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.system import MidpointStateSymbols, System
-from yid_ocp.problem.signal_filters import effort_low_pass_filter
+from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 
 _STANDSTILL_SPEED = 0.1  # speed below which friction can stick [rad/s or m/s]
 
@@ -47,7 +47,7 @@ class _TorqueTermSizes:
     static_friction_limit: Array  # limit of static friction, zero above `_STANDSTILL_SPEED` [N m or N]
 
 
-class InverseDynamicsTerms:
+class CompiledInverseDynamics:
     """Inverse dynamics of a step's system, M(q) a + c(q, v) + g(q) = tau, compiled once for all recordings."""
 
     def __init__(self, step: Step) -> None:
@@ -125,7 +125,7 @@ _MAX_PULSE_RANGE_RATIO = 1.5  # largest ratio of a pulse to the range of the his
 
 
 @dataclass(frozen=True)
-class ForceEstimate:
+class ForceHistory:
     """Estimate of an unknown force f over time at one location, by its log likelihood g'f - f'L f / 2."""
 
     recording: str
@@ -145,7 +145,7 @@ class ForceEstimate:
         """Median time between neighbouring points [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def subset_at_indices(self, keep: IntArray) -> ForceEstimate:
+    def subset_at_indices(self, keep: IntArray) -> ForceHistory:
         """Estimate restricted to the time points with the indices `keep`."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
@@ -157,7 +157,7 @@ class ForceEstimate:
         return np.hypot(self.model_error_std, self.friction_limit)
 
     @property
-    def max_likelihood_forces(self) -> Array:
+    def max_likelihood_force(self) -> Array:
         """Maximum-likelihood force (M,) at every time point, in `unit`."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
         return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
@@ -223,7 +223,7 @@ class _Filter:
         delay = np.asarray(0.1 / cutoff * np.arange(-length, length + 1), float)
         impulse = np.zeros((len(delay), 1))
         impulse[length] = 1.0
-        weight = effort_low_pass_filter(cutoff)(delay, impulse)[:, 0]
+        weight = zero_phase_effort_filter(cutoff)(delay, impulse)[:, 0]
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:
@@ -253,7 +253,7 @@ class _Rest:
     lost: Array
 
     @staticmethod
-    def of(history: ForceEstimate, error: float, floor: float, slow: float) -> _Rest:
+    def of(history: ForceHistory, error: float, floor: float, slow: float) -> _Rest:
         apart = np.abs(history.t[:, None] - history.t)
         quick = np.sqrt((error * history.model_error_std) ** 2 + floor**2 + history.friction_limit**2 / 3)
         covariance = np.outer(quick, quick) * (np.eye(len(apart)) + np.exp(-apart / _MODEL_ERROR_TIME)) / 2
@@ -304,7 +304,7 @@ class _Rest:
 
 
 def detect_force_pulses(
-    history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS
+    history: ForceHistory, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[list[DetectedForcePulse], float]:
     """Detect force pulses in one force estimate, largest evidence first. Also returns the number of windows searched.
 
@@ -366,8 +366,8 @@ def _both_shapes(begin: Array, end: Array) -> _Windows:
     return _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
 
 
-def _rests(history: ForceEstimate) -> list[_Rest]:
-    values = history.max_likelihood_forces
+def _rests(history: ForceHistory) -> list[_Rest]:
+    values = history.max_likelihood_force
     least = 1e-9 + float(np.median(history.model_error_std))
     spread = max(1.4826 * float(np.median(np.abs(values - np.median(values)))), least)
     slowest = max(float(np.sqrt(np.mean(values**2))), spread)
@@ -375,7 +375,7 @@ def _rests(history: ForceEstimate) -> list[_Rest]:
     return [_Rest.of(history, error, floor * spread, slow * slowest) for error, floor, slow in grid]
 
 
-def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
+def _refined(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
     """A window with start, end and shape moved to the largest evidence."""
     spacing = history.time_spacing
     first, last, shortest = history.t[0] + spacing, history.t[-1] - spacing, _MIN_PULSE_POINTS * spacing
@@ -394,7 +394,7 @@ def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filte
     return window
 
 
-def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
+def _other(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
     """A step or biphasic profile (M,) that explains as much as the pulse, which is then not accepted."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, gain = end - begin, float(rest.gains(seen(window, t))[0])
@@ -410,7 +410,7 @@ def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter)
 
 
 def _stands_out(
-    history: ForceEstimate, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
+    history: ForceHistory, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
 ) -> bool:
     """Whether a pulse is short enough, larger than the rest of the history, and measured."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
@@ -419,7 +419,7 @@ def _stands_out(
     if not 1.02 * _MIN_PULSE_POINTS * history.time_spacing < length < 0.98 * longest:
         return False
     size = abs(float(rest.sizes(own)[0]))
-    near = history.max_likelihood_forces[(t > begin - length) & (t < end + length)]
+    near = history.max_likelihood_force[(t > begin - length) & (t < end + length)]
     if size * float(np.abs(own).max()) > _MAX_PULSE_RANGE_RATIO * float(np.ptp(near)):
         return False
     begins = np.arange(float(t[0]), float(t[-1]) - length, history.time_spacing)
@@ -428,7 +428,7 @@ def _stands_out(
 
 
 def _sized(
-    history: ForceEstimate, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
+    history: ForceHistory, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
 ) -> list[DetectedForcePulse]:
     """The pulses with their sizes, estimated together on the background with the largest evidence."""
     if not found:

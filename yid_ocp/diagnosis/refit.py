@@ -18,7 +18,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
-from yid_ocp.diagnosis.screening import NO_CANDIDATES, ScoredCandidatePair, ScreeningResult, screen_candidates
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
@@ -210,7 +210,7 @@ class RefitContext:
         def screened() -> ScreeningResult:
             with contextlib.suppress(SolverError):
                 return screen_candidates(self.problem, base, values)
-            return NO_CANDIDATES
+            return EMPTY_SCREENING_RESULT
 
         return self._answer(self.record.screenings, name, screened)
 
@@ -281,7 +281,7 @@ def _evaluated(
     return problem.relinearize_held_out_filters(own, effects, values), finish
 
 
-def restore_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
+def evaluate_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
     """A refit with its problem and evaluation in the step of all candidates; its estimates and predictions are kept."""
     if fit.problem.step is problem.problem.step:
         return fit

@@ -33,7 +33,7 @@ from yid_ocp.inference.null_test import (
     ChannelResidualIndices,
     channels_with_residual_indices,
     chi2_p_value,
-    encoder_noise_residual_factor,
+    encoder_noise_residual_covariance_factor,
     episodes_with_path_noise_redrawn,
 )
 from yid_ocp.problem import EstimationProblem
@@ -103,7 +103,7 @@ def linearize_candidates(
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
     placed = problem.with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
-    scatter = encoder_noise_residual_factor(placed, placed.unknown_vector(values))[rows.data]
+    scatter = encoder_noise_residual_covariance_factor(placed, placed.unknown_vector(values))[rows.data]
     is_in_scatter = np.any(scatter, axis=1)
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
@@ -358,7 +358,7 @@ class ScreeningResult:
     joint_score_model: AllCandidatesScoreModel
 
 
-NO_CANDIDATES = ScreeningResult(
+EMPTY_SCREENING_RESULT = ScreeningResult(
     (), (), ConfusabilityMatrix((), np.zeros((0, 0))), AllCandidatesScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
 )
 """Screening where the model cannot be simulated: no candidate is known there."""

@@ -49,14 +49,14 @@ class EffectAmplitudeTransferCheck:
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
-    def estimate_difference_and_std(self) -> tuple[float, float]:
+    def absolute_difference_and_std(self) -> tuple[float, float]:
         """Absolute difference between the two estimates, and its standard deviation."""
         return abs(self.estimation_value - self.held_out_value), math.hypot(self.estimation_std, self.held_out_std)
 
     @property
-    def disagreement_std(self) -> float:
+    def std_of_significant_disagreement(self) -> float:
         """Difference of the estimates over sqrt(2) if it is significant, else 0."""
-        apart, spread = self.estimate_difference_and_std
+        apart, spread = self.absolute_difference_and_std
         return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
@@ -112,12 +112,12 @@ class Judgement:
         return total_gap_closure(self.selected_effects)
 
     @property
-    def accepted_selections(self) -> tuple[SelectedEffect, ...]:
+    def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
         """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     @property
-    def independent_effect_count(self) -> int:
+    def _independent_effect_count(self) -> int:
         """Number of independent effects selected: one per local effect and one per other kind."""
         effects = (entry.effect for entry in self.selected_effects)
         return len({effect.label if effect.is_local else effect.kind for effect in effects})
@@ -128,11 +128,11 @@ class Judgement:
         return tuple(entry for entry in self.transfer_checks if not entry.is_consistent)
 
     @property
-    def closure_by_location(self) -> dict[str, float]:
+    def closure_by_effect_location(self) -> dict[str, float]:
         """Fraction of the gap that the accepted effects at each location close beyond those added before."""
         closed: dict[str, float] = {}
         most = 0.0
-        for entry in self.accepted_selections:
+        for entry in self.accepted_selected_effects:
             place, part = entry.effect.location, entry.cumulative_closure.fraction
             closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
             most = max(part, most)
@@ -148,7 +148,7 @@ class Judgement:
         }
 
     @property
-    def fitted_or_held_out_explained_fraction(self) -> float:
+    def _largest_explained_fraction(self) -> float:
         """Explained fraction of the gap: fitted, or if larger the 95 % lower limit of the held-out closure."""
         return max(self.explained_fraction, self.gap_closure.ci_low)
 
@@ -158,7 +158,7 @@ class Judgement:
         For k independent effects it is 1 - (1 - `min_explained_fraction`)^k: each must explain that part of the
         remainder.
         """
-        return 1.0 - (1.0 - limits.min_explained_fraction) ** self.independent_effect_count
+        return 1.0 - (1.0 - limits.min_explained_fraction) ** self._independent_effect_count
 
 
 def _verdict_and_reason(
@@ -168,7 +168,7 @@ def _verdict_and_reason(
 
     A gap that is seen only along a candidate's signature counts only with an accepted effect.
     """
-    explained, rivals = said.fitted_or_held_out_explained_fraction, said.selected_effects[:1]
+    explained, rivals = said._largest_explained_fraction, said.selected_effects[:1]
     reasons: tuple[tuple[bool, UnknownVerdictReason], ...] = (
         (not said.selected_effects, "none"),
         (explained < said.required_total_explained_fraction(limits), "little"),
@@ -223,7 +223,7 @@ def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> fl
     """
     if not said.selected_effects:
         return 0.0
-    explained = 0.0 if said.failed_transfer_checks else said.fitted_or_held_out_explained_fraction
+    explained = 0.0 if said.failed_transfer_checks else said._largest_explained_fraction
     unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
     margin = math.log((1.0 - said.required_total_explained_fraction(limits)) / unexplained)
     fit = said.selected_effects[-1].refitted_model
@@ -265,10 +265,10 @@ def _compare(
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
-        apart, spread = entry.estimate_difference_and_std
+        apart, spread = entry.absolute_difference_and_std
         allowed = max(limits.always_allowed_transfer_z * spread, limits.transfer_rtol * size * width[name])
         # recordings that disagree by as much as the effect differs from neutral do not determine it
-        moved |= abs(entry.estimation_value - neutral[name]) > _DISAGREEMENT_Z * entry.disagreement_std
+        moved |= abs(entry.estimation_value - neutral[name]) > _DISAGREEMENT_Z * entry.std_of_significant_disagreement
         # an unknown standard deviation is no evidence against transfer
         found.append(replace(entry, is_consistent=not apart > allowed))
     return [replace(entry, is_consistent=entry.is_consistent and moved) for entry in found]
@@ -278,5 +278,5 @@ def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
     """The fit with stds of at least |difference|/sqrt(2) for amplitudes that disagree between recordings."""
-    std = {f"{e.effect_label}.{e.parameter}": max(e.estimation_std, e.disagreement_std) for e in entries}
+    std = {f"{e.effect_label}.{e.parameter}": max(e.estimation_std, e.std_of_significant_disagreement) for e in entries}
     return replace(fit, std={**fit.std, **std})

@@ -38,7 +38,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
         said = {"allowed": "no location of this model", "hint": "leave the effect out"}
         said = unknown_name_error_arguments(location, places) if places else said
         raise ModelError(f"the effect {kind} is not possible at '{location}'", where=f"{kind}@{location}", **said)
-    return base.effect_at_checked_location(kind, location, system, values or {})
+    return base.make_effect_unchecked(kind, location, system, values or {})
 
 
 def signal_kinds_required_by_any_effect() -> frozenset[str]:

@@ -174,7 +174,7 @@ class EffectBase(Effect):
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
-def effect_at_checked_location(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
+def make_effect_unchecked(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
     """Build an effect of a registered kind at a location that `make_effect` has checked."""
     cls, label = EFFECTS[kind], f"{kind}@{location}"
     definitions = cls.parameter_definitions(location, system)
@@ -273,7 +273,7 @@ def effort_limit_ratio_to_baxter(system: System, joint: str) -> float:
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
 
 
-def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
+def frame_names_at_arm_link_ends(system: System) -> tuple[str, ...]:
     """Names of frames at the ends of the arms' links, without fixed or coincident points."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
@@ -334,7 +334,7 @@ def segment_name_of_frame(system: System, frame: str) -> str | None:
     return next((s.name for s in system.segment_layouts if any(name in link for link in s.link_joints)), None)
 
 
-def elastic_joints_within_segment(system: System, segment: str) -> tuple[ElasticJoint, ...]:
+def elastic_joints_of_segment(system: System, segment: str) -> tuple[ElasticJoint, ...]:
     """The elastic joints of one segment."""
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 

@@ -15,7 +15,7 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, Repor
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Inertia, merge_bodies, symbolic_rotation_from_rpy
 from yid_ocp.model.parameters import Parameter
-from yid_ocp.model.system import EffectStepTerms, ForceWithDerivativeFactors, MidpointStateSymbols, System
+from yid_ocp.model.system import EffectStepTerms, ForceWithFactoredDerivatives, MidpointStateSymbols, System
 
 _MAX_PAYLOAD_DISTANCE = 0.5  # distance of a payload's centre from its frame [m]
 _MAX_COM_SHIFT = 0.05  # shift of a link's centre of mass without added mass [m]
@@ -107,7 +107,7 @@ def _moving_frames(system: System) -> tuple[str, ...]:
 def _tips_and_link_ends(system: System) -> tuple[str, ...]:
     """Names of segment tips, junctions and ends of arm links."""
     ends = (f"{prefix}_{s.name}" for s in system.segment_layouts for prefix in ("w", "junction"))
-    return (*(name for name in ends if name in system.mechanism.frames), *base.arm_link_end_frame_names(system))
+    return (*(name for name in ends if name in system.mechanism.frames), *base.frame_names_at_arm_link_ends(system))
 
 
 @EFFECTS.register("point_mass")
@@ -366,14 +366,14 @@ def _velocities(kinematics: Kinematics, v: ca.SX) -> list[ca.SX]:
 
 def _on_bodies(
     kinematics: Kinematics, velocity: list[ca.SX], wrenches: dict[int, ca.SX], slopes: dict[int, ca.SX]
-) -> ForceWithDerivativeFactors:
+) -> ForceWithFactoredDerivatives:
     """Generalized force of wrenches that depend only on their body's motion, with its derivatives.
 
     `wrenches` (6, 1), by joint index, are about the world origin and must rotate with the body and its velocity.
     `slopes` (6, 6) are their symmetric derivatives by the spatial velocity. W_j and K_j are the sums of both over all
     bodies that joint j moves. S_j is its screw, D_j = V_parent(j) x S_j and F_j = S_j . W_j. The columns of
-    `ForceWithDerivativeFactors` are A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because a rotation of joint i rotates
-    body and wrench together, except for the velocity D_i that it adds.
+    `ForceWithFactoredDerivatives` are A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because a rotation of joint i
+    rotates body and wrench together, except for the velocity D_i that it adds.
     """
     tree = kinematics.mechanism
     n, screws = len(tree.joints), kinematics.joint_screws
@@ -390,4 +390,4 @@ def _on_bodies(
         along[j] = slopes[j] @ screws[j]
         added = motion_cross_motion_product(velocity[parent], screws[j]) if parent >= 0 else zero
         turned[j] = slopes[j] @ added + motion_cross_force_product(screws[j], wrenches[j])
-    return ForceWithDerivativeFactors(ca.densify(force), ca.horzcat(*along), ca.horzcat(*turned))
+    return ForceWithFactoredDerivatives(ca.densify(force), ca.horzcat(*along), ca.horzcat(*turned))

@@ -126,7 +126,7 @@ def _coordinate_indices(system: System, location: str) -> list[int]:
     """Indices of the coordinates on which a law at a location acts."""
     index = system.mechanism.joint_index
     if location in base.flexible_segment_names(system):
-        springs = base.elastic_joints_within_segment(system, location)
+        springs = base.elastic_joints_of_segment(system, location)
         bends = [spring for spring in springs if spring.deformation == "bend"]
         return [index(spring.joint_name) for spring in bends or springs]
     return [index(location)]

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.effects import base
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elastic_joints_within_segment
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, elastic_joints_of_segment
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.system import EffectStepTerms, MidpointStateSymbols, System
 
@@ -20,7 +20,7 @@ _MIN_LARGEST_ANGLE = 0.02  # minimum of that angle [rad]
 
 def _bending_stiffness(system: System, segment: str) -> float:
     """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
-    springs = elastic_joints_within_segment(system, segment)
+    springs = elastic_joints_of_segment(system, segment)
     chosen = [s.stiffness for s in springs if s.deformation == "bend"] or [s.stiffness for s in springs]
     if not chosen:
         return 1.0
@@ -35,9 +35,7 @@ class _SegmentEffect(EffectBase):
 
     def _springs(self, state: MidpointStateSymbols) -> list[tuple[ElasticJoint, int]]:
         index = state.system.mechanism.joint_index
-        return [
-            (spring, index(spring.joint_name)) for spring in elastic_joints_within_segment(state.system, self.location)
-        ]
+        return [(spring, index(spring.joint_name)) for spring in elastic_joints_of_segment(state.system, self.location)]
 
 
 class _SegmentMemory(_SegmentEffect):
@@ -47,7 +45,7 @@ class _SegmentMemory(_SegmentEffect):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        return tuple(spring.joint_name for spring in elastic_joints_within_segment(system, location))
+        return tuple(spring.joint_name for spring in elastic_joints_of_segment(system, location))
 
 
 class _SpringChange(_SegmentEffect):
@@ -174,7 +172,7 @@ class _RestCurvature(_SpringChange):
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of qx and qy [rad], which add to the rest angles of bends about x and y."""
-        axes = {spring.axis for spring in elastic_joints_within_segment(system, location)}
+        axes = {spring.axis for spring in elastic_joints_of_segment(system, location)}
         text = "rest angle of every joint about"
         return tuple(
             ParameterDefinition(f"q{axis}", "rad", 0.0, -1.0, 1.0, (-0.3, 0.3), f"{text} {axis}")

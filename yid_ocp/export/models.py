@@ -134,7 +134,7 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
-    known = mjcf.format_elements()[aspect]
+    known = mjcf.model_aspect_table()[aspect]
     if aspect == "reading":
         return _READING
     if form not in known:
@@ -143,7 +143,7 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 
 
 _READING = FeatureExportSupport(
-    "not representable", f"{mjcf.format_elements()['reading']['is']}: correct the readings instead"
+    "not representable", f"{mjcf.model_aspect_table()['reading']['is']}: correct the readings instead"
 )
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
 _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")

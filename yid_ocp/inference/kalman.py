@@ -68,7 +68,7 @@ class KalmanStepMatrices:
     projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
     transition: FilterStateTransition
 
-    def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
+    def normalized_innovations_and_final_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
         """Normalized innovations of `measured` (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
@@ -152,7 +152,7 @@ class KalmanSteps:
             found.append((span, step))
         return found
 
-    def normalized_innovations_and_next_mean(
+    def normalized_innovations_and_final_mean(
         self, mean: Array, measured: Array, shift: Array, push: Array | None = None, keep_means: bool = False
     ) -> tuple[Array, Array, Array | None]:
         """Filter all steps: normalized innovations (r, c) and final means (nx, c).
@@ -169,7 +169,7 @@ class KalmanSteps:
         for span, step in self._single_steps():
             k = len(before)
             before.append(mean)
-            white[span], mean = step.normalized_innovations_and_next_mean(mean, measured[span])
+            white[span], mean = step.normalized_innovations_and_final_mean(mean, measured[span])
             if push is not None:
                 mean[:ns] += step.transition.state_rows[:, ns:] @ push[k]
             mean[ns:, 0] += shift[k]

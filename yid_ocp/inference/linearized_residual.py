@@ -112,9 +112,9 @@ class ResidualDerivativesByStateAndEffort:
             nodes = ((place, weight * (1 - fraction)), (np.minimum(place + 1, len(used) - 1), weight * fraction))
             by_state, by_effort = np.zeros((width, len(node), nx)), np.zeros((width, len(node), efforts.shape[2]))
             for shift, (k, share) in enumerate(nodes):
-                by_effort[shift + before] = samples.decorrelate(share[:, None] * efforts[k, column])
+                by_effort[shift + before] = samples.decorrelate_residual_rows(share[:, None] * efforts[k, column])
                 for there, slope in enumerate(slopes):
-                    by_state[shift + there] += samples.decorrelate(share[:, None] * slope[k, column])
+                    by_state[shift + there] += samples.decorrelate_residual_rows(share[:, None] * slope[k, column])
             found.append(np.minimum(node, len(trajectory.rollout.torque)) - before)
             parts.append((by_state, by_effort))
         arrays = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))

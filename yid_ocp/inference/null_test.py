@@ -21,7 +21,7 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_low_pass_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, zero_phase_effort_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
 from yid_ocp.sensors.mounted import MountedSensor
 
@@ -140,7 +140,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
 
 
-def encoder_noise_residual_factor(
+def encoder_noise_residual_covariance_factor(
     problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
 ) -> Array:
     """Factor F (nr, K) of the covariance F F' that encoder noise of prescribed arms adds to residuals.
@@ -256,7 +256,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
             is_smoothed = isinstance(samples.sensor, MountedSensor) and problem.system.prescribed
             if samples.sensor.effort_joints or is_smoothed:
                 cutoff, step = problem.options.path_cutoff, episode.grid.time_step
-                low_pass = LowPassFilter(cutoff) if is_smoothed else effort_low_pass_filter(cutoff)
+                low_pass = LowPassFilter(cutoff) if is_smoothed else zero_phase_effort_filter(cutoff)
                 stride = low_pass.decorrelation_stride(step)
                 autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.channel_name_per_output):

@@ -166,7 +166,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         step, later, own = kalman_matrices_and_next_covariance(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, begin, products, math.inf, ())
-        white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)
+        white, after = step.normalized_innovations_and_final_mean(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
         if keep:

@@ -30,9 +30,9 @@ from yid_ocp.inference.linearized_residual import (
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import (
-    dynamic_observable_state_mask,
     input_or_servo_torques_of_rollout,
-    step_derivatives_along_rollout,
+    next_state_derivatives,
+    reachable_and_observable_state_mask,
 )
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -119,7 +119,7 @@ def _smoother_unknowns(course: _LinearizedEpisode) -> _SmootherUnknowns:
         for column, name in enumerate(sensor.output_names):
             if not np.any(samples.positive_weight_mask[:, column]):
                 continue
-            frame = sensor.output_frame_names[column]
+            frame = sensor.measurement_frame_names[column]
             biased.append((k, column))
             names.append(name)
             sources.append(SmoothedUnknownGroup(sensor_bias_location_name(course.system, sensor, frame), "bias"))
@@ -252,7 +252,7 @@ def residual_models_with_smoother_unknowns(
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        theta, _ = problem.theta_and_initial_state_deviation(x, i)
+        theta, _ = problem.unpack_unknown_vector(x, i)
         nominal = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
         blocks = [samples.residual_and_jacobian(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
@@ -299,7 +299,7 @@ def _steps(
         # as that of this step)
         followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
         inputs = feedback.gain @ followed
-    for pair in step_derivatives_along_rollout(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
+    for pair in next_state_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
         push, done = pushes[done : done + len(pair[0])], done + len(pair[0])
         by_state = (one[:, :, moving] for one in pair)
         by_load = [one[:, :, nx : nx + width] + one[:, :, nx + width :] for one in pair]
@@ -323,7 +323,7 @@ def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, short
     pushes = pushes[:, unknowns.forced]
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
     about = course.problem.step, course.nominal.theta, course.nominal.rollout
-    moving = np.flatnonzero(dynamic_observable_state_mask(*about, loads))
+    moving = np.flatnonzero(reachable_and_observable_state_mask(*about, loads))
     slopes = ResidualDerivativesByStateAndEffort.from_nominal_trajectory(course.nominal, with_neighbours=True)
     slopes = slopes.select_states(moving)
     beyond = len(slopes.by_state) - 2  # steps that samples at an interval's end depend on
@@ -406,7 +406,7 @@ def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Arr
     for k, samples in enumerate(course.episode.measurements):
         sample, column = np.nonzero(samples.positive_weight_mask)
         own = reference * ((group == k) & (output == column[:, None]))
-        found.append(samples.decorrelate(samples.weight[sample, column][:, None] * own))
+        found.append(samples.decorrelate_residual_rows(samples.weight[sample, column][:, None] * own))
     return np.concatenate(found)
 
 

@@ -369,7 +369,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     def kind(name: str) -> str:
         return name.rpartition(".")[2]
 
-    (theta, _), entries = problem.theta_and_initial_state_deviation(x, 0), list(problem.system.parameters)
+    (theta, _), entries = problem.unpack_unknown_vector(x, 0), list(problem.system.parameters)
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
     scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
@@ -402,7 +402,7 @@ def parameter_estimates(
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else _std_from_covariance(covariance, x)
-    sizes, theta = typical_parameter_magnitudes(problem, x), problem.theta_and_initial_state_deviation(x, 0)[0]
+    sizes, theta = typical_parameter_magnitudes(problem, x), problem.unpack_unknown_vector(x, 0)[0]
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}
     free = {name: problem.unknown_names.index(name) for name in parameter_unknown_names(problem)}
@@ -435,7 +435,7 @@ def parameter_estimates(
     return result
 
 
-def free_estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+def mark_free_estimates_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
     """Copy estimates with the verdict not_trusted. Fixed and not_identifiable parameters keep their verdicts."""
     doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}

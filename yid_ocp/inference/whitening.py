@@ -43,7 +43,7 @@ from yid_ocp.inference.linearized_residual import (
     ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import dynamic_observable_state_mask, step_derivatives_along_rollout
+from yid_ocp.integrator.step import next_state_derivatives, reachable_and_observable_state_mask
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -151,7 +151,7 @@ class WhiteningFilter:
                 rows = slice(first, first + _ROWS_PER_BLOCK)
                 own[rows] -= np.einsum("ru,ruc->rc", part.by_torque[rows], push[part.step_of_row[rows]])
         shift = part.fresh_noise(-noise if white is None else white - noise)
-        return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known, white is not None)
+        return part.kalman.normalized_innovations_and_final_mean(mean, own, shift, known, white is not None)
 
 
 def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> WhiteningFilter:
@@ -160,7 +160,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErr
     slopes = ResidualDerivativesByStateAndEffort.from_nominal_trajectory(course)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     ends = {"seen": slopes.visible_state_mask, "disturbed": np.any(np.abs(start) > _MIN_START_SLOPE, axis=1)}
-    live = dynamic_observable_state_mask(step, course.theta, course.rollout, **ends)
+    live = reachable_and_observable_state_mask(step, course.theta, course.rollout, **ends)
     kept = np.flatnonzero(live)
     rows_of_node, slopes = slopes.residual_indices_by_first_node(count), slopes.select_states(kept)
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
@@ -196,7 +196,7 @@ def _filter_steps(
         feedback = None
     elif feedback is not None:
         # momenta that the filter follows contain torques of the previous step
-        shift = course.model_functions.effect_momentum_shift
+        shift = course.model_functions.reference_momentum_correction
         momentum = shift.momentum_derivative_by_previous_torque(course.theta)
         driving = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
         # only errors of the filter's reference angles count; those of momenta average out
@@ -212,7 +212,7 @@ def _filter_steps(
     moves, blocks = np.empty((count, ns, len(columns))), list[Array]()
     observe, by_torque, projected = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu)), np.empty((ends[-1], na))
     along = course.model_functions.step, course.theta, course.rollout
-    for state, effort in step_derivatives_along_rollout(*along, inputs, feedback):
+    for state, effort in next_state_derivatives(*along, inputs, feedback):
         span = slice(begun, begun + len(state))
         move = moves[span]
         move[:] = state if ns == nx else state[:, kept[:, None], columns]
@@ -293,7 +293,7 @@ def _about_smoothed(
     if errors.has_encoder_measurements and feedback is not None:
         inputs = predictor.corrected_inputs_with_effect_momentum(episode, own, (), result.rollout.state[0])
         driven = predictor.system.actuated_coordinate_indices
-        guided = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
+        guided = inputs.tracking_feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         assert guided is not None
         true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
         errors = replace(errors, smoothed_reference=true - (guided.reference - feedback.reference))
@@ -312,7 +312,7 @@ def _behind_effects(
         # a reading with almost no influence on the applied torque does not reveal its error
         seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
         read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
-    plain = errors.torque_bias_part
+    plain = errors.with_torque_bias_only
     both = (replace(episode, input_errors=own) for own in (plain, replace(plain, recorded_torque_noise=read)))
     none, without = (predictor.corrected_inputs(own, theta, ()).torque for own in both)
     return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=none - without)
@@ -339,7 +339,7 @@ def problem_with_whitening_at(
 
     def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
         before = _own_filter(problem.whitening_filters[i])
-        own = problem.theta_and_initial_state_deviation(x, i)
+        own = problem.unpack_unknown_vector(x, i)
         known = predictions[i] if predictions else None
         return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before, known, keep_weights)
 
@@ -377,13 +377,13 @@ def problem_with_held_out_kalman_whitening(
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
     """Relinearize the estimation recordings' whitening filters at the torque offsets of `x`. Weights are unchanged."""
-    parts = problem.theta_and_initial_state_deviation
+    parts = problem.unpack_unknown_vector
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
 
 
-def problem_with_relinearized_held_out_whitening(
+def problem_with_reestimated_held_out_torque_biases(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
     """Re-estimate the torque offsets in held-out whitening filters at the unknowns `x`; gains stay fixed."""
@@ -395,7 +395,7 @@ def problem_with_relinearized_held_out_whitening(
 
 def problem_with_sensor_noise_only(problem: EstimationProblem) -> EstimationProblem:
     """Whiten a problem by sensor noise, not by noise of the recorded inputs. Estimated torque offsets are kept."""
-    return _with_errors(problem, lambda errors: errors.torque_bias_part)
+    return _with_errors(problem, lambda errors: errors.with_torque_bias_only)
 
 
 def problem_without_input_errors(problem: EstimationProblem) -> EstimationProblem:
@@ -421,7 +421,7 @@ def torque_bias_estimates_by_recording(problem: EstimationProblem, x: ArrayLike)
     found: list[tuple[Array, Array] | None] = []
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
         whitening = _own_filter(own)
-        parts = problem.theta_and_initial_state_deviation(x, i)
+        parts = problem.unpack_unknown_vector(x, i)
         result = "" if whitening is None else problem.predictor.predict_episode(episode, *parts, False)
         if whitening is None or isinstance(result, str):
             found.append(None)

@@ -52,7 +52,7 @@ class StepFunctions:
         return self._function("linear")
 
     @property
-    def row_scale_and_time_step_function(self) -> ca.Function:
+    def row_scale_and_true_time_step_function(self) -> ca.Function:
         """Function that returns the scale of the momentum balance's rows and the clock-corrected time step [s]."""
         return self._function("scales")
 
@@ -78,8 +78,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
-    if e.closed_form_force_impulses is not None:
-        bodies = [part + push for part, push in zip(bodies, e.closed_form_force_impulses, strict=True)]
+    if e.force_with_derivatives_impulses is not None:
+        bodies = [part + push for part, push in zip(bodies, e.force_with_derivatives_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)

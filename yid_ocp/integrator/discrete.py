@@ -37,7 +37,7 @@ from yid_ocp.model.kinematics import (
 )
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
-from yid_ocp.model.system import ForceWithDerivativeFactors, Grasp, MidpointStateSymbols, System
+from yid_ocp.model.system import ForceWithFactoredDerivatives, Grasp, MidpointStateSymbols, System
 
 RIGID_HOLD_STIFFNESS = 1e5
 """Stiffness of a spring that holds a joint at its measured angle with less deflection than encoder noise [N m/rad]."""
@@ -107,7 +107,7 @@ class DiscreteEquations:
     balance_remainder: ca.SX
     p1_remainder: ca.SX
     # sum of those that effects give with their slopes, at the midpoint
-    force_with_derivatives: ForceWithDerivativeFactors | None
+    force_with_derivatives: ForceWithFactoredDerivatives | None
     force_with_derivatives_shares: tuple[float, float]  # parts of its impulse h F in `momentum_balance` and in `p1`
     constraint_impulses: _ConstraintImpulses
     row_scale: ca.SX  # factor on rows of the bodies' part and of `constraint_impulses`: 1, or a compliance, (n, 1)
@@ -124,7 +124,7 @@ class DiscreteEquations:
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
-    def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
+    def force_with_derivatives_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """Impulses of the closed-form force in `momentum_balance` and `p1`, each (n, 1) [N m s]; None without it."""
         if self.force_with_derivatives is None:
             return None
@@ -180,7 +180,7 @@ def discrete_equations(
     if closed is not None:
         balance += share * h * scale * closed.force
         p1 += (1 - share) * h * scale * closed.force
-        closed = ForceWithDerivativeFactors(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
+        closed = ForceWithFactoredDerivatives(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
     symbols = {name: getattr(at, name) for name in ("q0", "q1", "z0", "z1", "p0", "lam", "u", "time_step", "h")}
     rigid_at_midpoint = {name: at.placed(value) for name, value in vars(rigid).items()}
     return DiscreteEquations(
@@ -245,7 +245,7 @@ class _Symbols:
 
 def _summed_terms(
     system: System, at: _Symbols, kinematics: Kinematics
-) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithDerivativeFactors | None]:
+) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithFactoredDerivatives | None]:
     """Lagrangian, force, internal equations (moving, at rest) and closed force of springs, inputs and effects."""
     names = tuple(system.effect_internal_coordinate_symbols)
     rows_of = {name: i for i, name in enumerate(names)}
@@ -254,7 +254,7 @@ def _summed_terms(
     force, viscous = system.input_force(at.u, at.qm, at.vm), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}
     at_rest: dict[str, ca.SX] = {}
-    closed: list[ForceWithDerivativeFactors] = []
+    closed: list[ForceWithFactoredDerivatives] = []
     for effect in system.effects:
         terms = effect.step_terms(state)
         energy += terms.lagrangian
@@ -268,7 +268,7 @@ def _summed_terms(
         hint = "return it in `internal_equations` of the effect"
         raise ModelError(what, where="effects of the model", allowed="one equation per internal coordinate", hint=hint)
     parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
-    summed = ForceWithDerivativeFactors(*(sum(rest, first) for first, *rest in parts)) if closed else None
+    summed = ForceWithFactoredDerivatives(*(sum(rest, first) for first, *rest in parts)) if closed else None
     internal = [ca.vertcat(ca.SX(0, 1), *(rows[name] for name in names)) for rows in (equations, equations | at_rest)]
     return energy, force + viscous, (internal[0], internal[1]), summed
 
@@ -496,7 +496,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
         1: {"q0": bent, "q1": bent - pulls.midpoint_share * pulls.after_force_by_q},
     }
-    impulses = e.closed_form_force_impulses or (ca.SX(n, 1), ca.SX(n, 1))
+    impulses = e.force_with_derivatives_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
     apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
     for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin
+from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
@@ -23,7 +23,7 @@ from yid_ocp.integrator.step_model import (
     RolloutInputs,
     RolloutStatus,
     SensitivityDirections,
-    StepModel,
+    StepDefinition,
     TrackingFeedback,
     build_step_model,
     newton_correction_tolerance,
@@ -40,14 +40,14 @@ _ALL_STEPS = slice(None)
 class Step(ReprMixin):
     """Step map of a system over one time step, made by `compile_step`. It `is_compiled` if it runs generated C code."""
 
-    model: StepModel
+    model: StepDefinition
     kernel: CompiledKernel | InterpretedKernel
     is_compiled: bool
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         how = "compiled" if self.is_compiled else "interpreted"
         of_what = self.system._summary().one_line
-        return ReprLineAndTableRows(f"{self.time_step:g} s, {self.force_split}, {how}, of {of_what}")
+        return ReprTexts(f"{self.time_step:g} s, {self.force_split}, {how}, of {of_what}")
 
     @property
     def system(self) -> System:
@@ -62,7 +62,7 @@ class Step(ReprMixin):
     def clock_scaled_time_step(self, theta: Array) -> float:
         """Time step corrected for the recording's clock [s]: h times `System.recorded_time_scale` at `theta`."""
         none = [np.zeros(self.sizes[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
-        return float(self.functions.row_scale_and_time_step_function(*none, theta, self.time_step)[1])
+        return float(self.functions.row_scale_and_true_time_step_function(*none, theta, self.time_step)[1])
 
     @property
     def force_split(self) -> ForceSplit:
@@ -329,7 +329,7 @@ def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, t
     return np.array(ca.densify(rows)).T.reshape(np.shape(q))
 
 
-def dynamic_observable_state_mask(
+def reachable_and_observable_state_mask(
     step: Step,
     theta: Array,
     rollout: Rollout,
@@ -341,13 +341,13 @@ def dynamic_observable_state_mask(
 
     Prescribed coordinates and internal states of a neutral effect are excluded. Other coordinates and momenta count as
     measured. Only the first and the last step are examined. `loads` are extra excitations as in
-    `step_derivatives_along_rollout`. `seen` (nx,) marks states that sensors depend on directly. `disturbed` (nx,) marks
-    states with an initial error; if given, states are also excluded that neither these errors nor torque errors reach.
+    `next_state_derivatives`. `seen` (nx,) marks states that sensors depend on directly. `disturbed` (nx,)
+    marks those with an initial error; if given, states that neither these nor torque errors reach are excluded, too.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     given = (step, theta, rollout, np.repeat(inputs, count, 0), None, loads)
     first, last = slice(0, 1), slice(count - 1, count)
-    ends = [next(step_derivatives_along_rollout(*given, chosen)) for chosen in (first, last)]
+    ends = [next(next_state_derivatives(*given, chosen)) for chosen in (first, last)]
     by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
     by_state, moved = by_all[:, :nx], np.any(by_all > 0, axis=1)
     moved[list(step.system.prescribed_coordinate_indices)] = False
@@ -365,7 +365,7 @@ def dynamic_observable_state_mask(
     return moved & felt
 
 
-def step_derivatives_along_rollout(
+def next_state_derivatives(
     step: Step,
     theta: Array,
     rollout: Rollout,
@@ -390,4 +390,4 @@ def step_derivatives_along_rollout(
         span = slice(first, min(first + _STEPS_PER_CHUNK, end))
         nodes, own = rollout.state[first : span.stop + 1], feedback and replace(feedback, gain=feedback.gain[span])
         along = replace(rollout, state=nodes, multipliers=rollout.multipliers[span], torque=rollout.torque[span])
-        yield step.kernel.step_derivatives_along_rollout(theta, along, own, inputs[span], loads)
+        yield step.kernel.next_state_derivatives(theta, along, own, inputs[span], loads)

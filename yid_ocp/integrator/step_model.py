@@ -27,7 +27,7 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 
 
 @dataclass(frozen=True, eq=False)
-class StepModel:
+class StepDefinition:
     """Equations, functions and index tables of one time step, from which a kernel is built.
 
     `sizes` holds the numbers of coordinates (n), internal coordinates (nz), constraints (m), inputs (nu), prescribed
@@ -50,15 +50,15 @@ def build_step_model(
     force_split: ForceSplit,
     constraint_force_at: ConstraintForcePlacement,
     tolerance: float | None = None,
-) -> StepModel:
-    """Build the `StepModel` of a system. Arguments are as in `compile_step`."""
+) -> StepDefinition:
+    """Build the `StepDefinition` of a system. Arguments are as in `compile_step`."""
     e = discrete_equations(system, force_split, constraint_force_at)
     functions = codegen.step_functions(e)
     n, nz = system.n_coordinates, e.z0.numel()
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
     limit = newton_correction_tolerance(time_step) if tolerance is None else tolerance
-    return StepModel(system, e, functions, codegen.step_sparsity_tables(functions), sizes, float(time_step), limit)
+    return StepDefinition(system, e, functions, codegen.step_sparsity_tables(functions), sizes, float(time_step), limit)
 
 
 def newton_correction_tolerance(time_step: float) -> float:

@@ -135,7 +135,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 
 @dataclass(frozen=True)
-class JointMotionWithSensitivities:
+class JointMotionAndTorqueSensitivities:
     """Angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
 
     The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
@@ -216,8 +216,8 @@ class EffectMomentumShift:
 
     def effect_momentum_shifts_and_sensitivities(
         self,
-        recorded: JointMotionWithSensitivities,
-        true: JointMotionWithSensitivities,
+        recorded: JointMotionAndTorqueSensitivities,
+        true: JointMotionAndTorqueSensitivities,
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
@@ -252,7 +252,7 @@ class EffectMomentumShift:
         return (value - plain)[:, :, 0], total
 
     def _remembered(
-        self, motion: JointMotionWithSensitivities, theta: Array, wanted: _Wanted, width: int
+        self, motion: JointMotionAndTorqueSensitivities, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
         """Internal coordinates (N, nk) of joint effects at all nodes but the last, and derivatives (N, nk, d)."""
         steps = len(motion.torque)
@@ -308,7 +308,7 @@ class _Memory:
         compiled = step.is_compiled
         self._maps = CasadiLockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
-    def along(self, motion: JointMotionWithSensitivities, start: Array, theta: Array) -> Array:
+    def along(self, motion: JointMotionAndTorqueSensitivities, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""
         before, now = motion._before_and_after
         found = [start]
@@ -319,7 +319,7 @@ class _Memory:
 
     def slopes(
         self,
-        motion: JointMotionWithSensitivities,
+        motion: JointMotionAndTorqueSensitivities,
         values: Array,
         start: list[int],
         theta: Array,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import (
     ArcLengthChain,
@@ -110,10 +110,10 @@ class FlexibleObject(ReprMixin):
     elastic_joints: tuple[ElasticJoint, ...]
     segment_layouts: tuple[SegmentLayout, ...]
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         names, tree = ", ".join(segment.name for segment in self.segment_layouts), self.mechanism
         count = count_with_noun(len(tree.joints), "joint")
-        return ReprLineAndTableRows(f"{names}, {count}", tree.parameters._summary().table_rows)
+        return ReprTexts(f"{names}, {count}", tree.parameters._summary().table_rows)
 
 
 def flexible_object(

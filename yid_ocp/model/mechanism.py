@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, require_known_names, unknown_name_error_arguments
 from yid_ocp.model.parameters import Parameters
 
@@ -140,11 +140,11 @@ class Mechanism(ReprMixin):
     parameters: Parameters = field(default_factory=Parameters)
     link_chains: Mapping[str, ArcLengthChain] = field(default_factory=dict)
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         carriers = ("the world", *self.joint_names)
         rows = [("joint", "type", "moves with"), *((j.name, j.kind, carriers[j.parent_index + 1]) for j in self.joints)]
         joints, frames = count_with_noun(len(self.joints), "joint"), count_with_noun(len(self.frames), "frame")
-        return ReprLineAndTableRows(f"{self.name}, {joints} and {frames}", rows)
+        return ReprTexts(f"{self.name}, {joints} and {frames}", rows)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:

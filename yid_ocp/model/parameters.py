@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, require_known_names
 
 
@@ -52,10 +52,10 @@ class Parameters(ReprMixin):
             what, hint = f"two parameters are called {twice[0]}", "give each part of the model its own name"
             raise ConfigError(what, where="parameters of the model", allowed="unique names", hint=hint)
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         rows = [("parameter", "value", "unit", "lower", "upper")]
         rows += [(e.name, f"{e.value:.4g}", e.unit, f"{e.lower:g}", f"{e.upper:g}") for e in self]
-        return ReprLineAndTableRows(count_with_noun(len(self), "parameter"), rows)
+        return ReprTexts(count_with_noun(len(self), "parameter"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, require_known_names
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
@@ -132,7 +132,7 @@ class NodeStateSymbols:
 
 
 @dataclass(frozen=True)
-class ForceWithDerivativeFactors:
+class ForceWithFactoredDerivatives:
     """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives, (n, 1) [N m or N].
 
     S_j and D_j are as in `LagrangianFirstDerivatives`. A_j and T_j are the columns of A and T (6, n). For i an
@@ -158,7 +158,7 @@ class EffectStepTerms:
     internal_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     static_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     # a dissipative force on bodies with given derivatives, because automatic differentiation would be too expensive
-    force_with_derivatives: ForceWithDerivativeFactors | None = None
+    force_with_derivatives: ForceWithFactoredDerivatives | None = None
 
 
 @dataclass(frozen=True)
@@ -336,14 +336,14 @@ class System(ReprMixin):
             system = replace(system, effects=(*system.effects, effect))
         return system
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         kinds = {"driven": len(self.driven), "prescribed": len(self.prescribed)}
         kinds |= {"passive": self.n_coordinates - sum(kinds.values())}
         moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
         counts = f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})"
         parts = [self.mechanism.name, counts, count_with_noun(self.n_constraints, "constraint")]
         parts += [f"{effect.kind}@{effect.location}" for effect in self.effects]
-        return ReprLineAndTableRows(", ".join(parts), self.parameters._summary().table_rows)
+        return ReprTexts(", ".join(parts), self.parameters._summary().table_rows)
 
     @property
     def n_coordinates(self) -> int:

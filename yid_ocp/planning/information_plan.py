@@ -318,7 +318,7 @@ def _judged(
         rows = experiment.planned_recording_sensitivities(found.w)
     except SolverError:
         return -math.inf
-    return criterion.value_and_gradient_by_sensitivities(rows, False)[0]
+    return criterion.value_and_gradient_wrt_sensitivities(rows, False)[0]
 
 
 def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:

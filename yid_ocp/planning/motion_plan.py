@@ -27,7 +27,7 @@ from yid_ocp.planning.joint_paths import (
     solve_start_equilibrium,
     start_joint_positions_as_array,
 )
-from yid_ocp.planning.motion_search import PlanResidualAndLimitFunctions, TargetMotionCoefficients, TargetMotionSearch
+from yid_ocp.planning.motion_search import MotionToTargetResult, MotionToTargetSearch, PlanResidualAndLimitFunctions
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
 _MAX_STEP_HALVINGS = 3  # largest number of halvings of the time step
@@ -35,7 +35,7 @@ _CONVERGED_TOLERANCE_FRACTION = 0.1  # change after halving, as a fraction of th
 
 
 @dataclass(frozen=True)
-class EstimatedParameterCovariance:
+class ParameterCovarianceBeforePlan:
     """Covariance matrix of uncertain model parameters, in the order of `parameter_names`."""
 
     parameter_names: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ def plan_motion_to_target(
     step: Step,
     options: PlanOptions,
     theta: Array | None = None,
-    known: EstimatedParameterCovariance | None = None,
+    known: ParameterCovarianceBeforePlan | None = None,
     progress: Progress = NULL_PROGRESS,
 ) -> TargetMotionPlan:
     """Plan a motion of a step's prescribed joints that brings a point to a target.
@@ -81,7 +81,7 @@ def plan_motion_to_target(
     if system.driven or not system.prescribed:
         what, hint = "the model has no prescribed joint", "set model.robot, and model.arms.mode: prescribed"
         raise ConfigError(what, where="plan", allowed="a robot whose arms are prescribed", hint=hint)
-    known = EstimatedParameterCovariance() if known is None else known
+    known = ParameterCovarianceBeforePlan() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
     progress.begin_stage("finding where the motion begins and ends")
     start = solve_start_equilibrium(step, values, _posture(system, options, values))
@@ -169,13 +169,13 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
             raise ConfigError(what, where="plan.box", allowed=f"{low[row]:.4g} to {high[row]:.4g} m", hint=hint)
 
 
-def _attempt(rows: PlanResidualAndLimitFunctions, known: EstimatedParameterCovariance) -> TargetMotionPlan:
+def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBeforePlan) -> TargetMotionPlan:
     """Find the best motion of one duration, refined with shorter time steps to resolve residual motion."""
     options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
     lower, upper = mover.coefficient_bounds()
     for halved in range(_MAX_STEP_HALVINGS + 1):
         cases = [rows, *_scenarios(rows, known)] if options.minimize_parameter_sensitivity else [rows]
-        shot = TargetMotionSearch(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
+        shot = MotionToTargetSearch(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
         evaluations += shot.n_evaluations
         if not shot.is_converged or halved == _MAX_STEP_HALVINGS:
             break
@@ -205,7 +205,7 @@ def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array)
 
 
 def _scenarios(
-    rows: PlanResidualAndLimitFunctions, known: EstimatedParameterCovariance
+    rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBeforePlan
 ) -> list[PlanResidualAndLimitFunctions]:
     """The same motion with parameters off by one std, along the axes that move the point's equilibrium most."""
     mover, system = rows.simulator, rows.simulator.step.system
@@ -229,7 +229,7 @@ def _scenarios(
     return found
 
 
-def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: EstimatedParameterCovariance) -> Array:
+def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: ParameterCovarianceBeforePlan) -> Array:
     """Derivative of the point's final position, at each final node, by the uncertain parameters, (nodes, 3, count)."""
     mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.node_indices_after_motion
     rollout = mover.simulate_path(w, names=known.parameter_names)
@@ -239,7 +239,7 @@ def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: Estimate
 
 
 def _outcome(
-    rows: PlanResidualAndLimitFunctions, shot: TargetMotionCoefficients, known: EstimatedParameterCovariance
+    rows: PlanResidualAndLimitFunctions, shot: MotionToTargetResult, known: ParameterCovarianceBeforePlan
 ) -> TargetMotionPlan:
     mover = rows.simulator
     rollout, std = mover.simulate_path(shot.w), None

@@ -190,7 +190,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 
 @dataclass(frozen=True)
-class TargetMotionCoefficients:
+class MotionToTargetResult:
     """Coefficients w (K, nc) of a planned motion, and whether the search converged within the limits."""
 
     w: Array
@@ -199,7 +199,7 @@ class TargetMotionCoefficients:
     n_evaluations: int
 
 
-class TargetMotionSearch:
+class MotionToTargetSearch:
     """Shooting search for a motion to a target. Goal residuals cover several parameter cases, limits only the first."""
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
@@ -220,7 +220,7 @@ class TargetMotionSearch:
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
-    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> TargetMotionCoefficients:
+    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> MotionToTargetResult:
         """Optimise the spline coefficients of a motion, (K, nc): K coefficients for each of nc prescribed joints.
 
         The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
@@ -249,7 +249,7 @@ class TargetMotionSearch:
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
             message = f"the search was stopped after {iterations} evaluations; raise plan.max_iterations"
-        return TargetMotionCoefficients(x.reshape(self._shape), finished, message, self.evaluations)
+        return MotionToTargetResult(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
@@ -286,7 +286,7 @@ class DOptimalityCriterion:
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
 
-    def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+    def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
         """Criterion [nat] and, if `slope`, its gradient with respect to sensitivities `rows` (nr, columns)."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
@@ -320,7 +320,7 @@ class EffectDiscriminationCriterion:
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
-    def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+    def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
         """Compute the criterion [nat] and its gradient (nr, columns) by the sensitivity matrix `rows`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
@@ -397,7 +397,7 @@ class InformativeMotionSearch:
     def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
         """Criterion and sensitivities of a motion; the criterion is minus infinity if the rollout fails."""
         rows = self.experiment.sensitivities_to_unknowns(w)
-        return -np.inf if rows is None else self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows
+        return -np.inf if rows is None else self.criterion.value_and_gradient_wrt_sensitivities(rows, False)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
         """Maximise the criterion in at most `rounds` rounds, from feasible coefficients `start` (K, nc)."""
@@ -461,7 +461,7 @@ class InformativeMotionSearch:
         flat, normal = radius * slopes.reshape(len(slopes), -1), radius * normal
 
         def cost(x: Array) -> tuple[float, Array]:
-            found, by_rows = self.criterion.value_and_gradient_by_sensitivities(rows + (x @ flat).reshape(rows.shape))
+            found, by_rows = self.criterion.value_and_gradient_wrt_sensitivities(rows + (x @ flat).reshape(rows.shape))
             return -found, -(flat @ by_rows.ravel())
 
         low = np.maximum(-1.0, np.minimum(self.lower - w.ravel(), 0.0) / radius)

@@ -35,7 +35,7 @@ from yid_ocp.planning.joint_paths import (
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.problem.signal_filters import effort_low_pass_filter
+from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 
 _PLANNED_RECORDING_NAME = "planned"
@@ -245,7 +245,7 @@ class SplineMotionExperiment:
             joint = columns[samples.positive_weight_mask]
             for i, (name, size) in enumerate(std.items()):
                 own = np.where(joint == samples.sensor.effort_joints.index(name), size, 0.0)
-                found[rows, i] = samples.decorrelate(own * samples.weight[samples.positive_weight_mask])
+                found[rows, i] = samples.decorrelate_residual_rows(own * samples.weight[samples.positive_weight_mask])
         return np.vstack([found, np.eye(len(std))])
 
     def sensitivities_to_unknowns(self, w: Array) -> Array | None:
@@ -315,7 +315,7 @@ class SplineMotionExperiment:
 
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Raise `ConfigError` if the motion is too short for the low-pass filter of its efforts."""
-    joints, low_pass = problem.episodes[0].recording.joints, effort_low_pass_filter(problem.options.path_cutoff)
+    joints, low_pass = problem.episodes[0].recording.joints, zero_phase_effort_filter(problem.options.path_cutoff)
     step = problem.step.time_step
     least = 2.0 * low_pass.end_distortion_duration + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:

@@ -13,7 +13,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_rollouts
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
-from yid_ocp.integrator.tracking_feedback import JointMotionWithSensitivities
+from yid_ocp.integrator.tracking_feedback import JointMotionAndTorqueSensitivities
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialStateWithSensitivity
@@ -30,7 +30,7 @@ from yid_ocp.problem.model_functions import (
 )
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads, mean_step_input_delay_derivative, mean_step_inputs
-from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeSmoother
+from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeValueSmoother
 
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
 """Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""
@@ -73,7 +73,7 @@ class EpisodePredictor:
         return self.model_functions.step.system
 
     @property
-    def estimated_initial_state_indices(self) -> tuple[int, ...]:
+    def estimated_initial_state_entries(self) -> tuple[int, ...]:
         """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
         hidden, begin = list(self.system.effect_internal_coordinate_symbols), {"q": 0, "p": n, "z": 2 * n}
@@ -120,7 +120,7 @@ class EpisodePredictor:
         (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy).
         `inputs` are the corrected inputs of `theta` and `names`, if known.
         """
-        nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)
+        nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_entries)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0
         rest: Equilibrium | None = None
@@ -150,7 +150,7 @@ class EpisodePredictor:
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
         recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
-        if self._follows_momenta and self.model_functions.effect_momentum_shift.is_active(theta, wanted):
+        if self._follows_momenta and self.model_functions.reference_momentum_correction.is_active(theta, wanted):
             return False
         slopes += self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
@@ -180,9 +180,9 @@ class EpisodePredictor:
         if not self._follows_momenta:
             return inputs
         rows = slice(2 * self.system.n_coordinates, None)
-        recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
+        recorded = JointMotionAndTorqueSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
-        shift, measured = self.model_functions.effect_momentum_shift, episode.measured_driven_angles
+        shift, measured = self.model_functions.reference_momentum_correction, episode.measured_driven_angles
         return inputs.with_effect_momentum_in_reference(shift, recorded, measured, theta, names, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> CorrectedInputs:
@@ -239,7 +239,7 @@ class EpisodePredictor:
             pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 
-        width = len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices)
+        width = len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_entries)
         bytes_per_node = 8 * self.integrator_step.sizes["nx"] * (derivatives * width + 1)
         each = [(episode.grid.steps + 1) * bytes_per_node for episode, *_ in queries]
         found: list[EpisodePrediction | str] = []
@@ -268,7 +268,7 @@ class EpisodePredictor:
             by_torque = inputs.torque_sensitivity_with_feedback_reference(feedback, driven, width)
             by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
-        feedback = inputs.feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
+        feedback = inputs.tracking_feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         given = (start.state, episode.grid.steps, inputs.torque, inputs.prescribed_path)
         member = checked_rollout_inputs(self.integrator_step, theta, *given, feedback, directions)
         return _Prepared(episode, start, inputs, member, wanted, derivatives)
@@ -308,7 +308,7 @@ class EpisodePredictor:
         said = (rollout, start.equilibrium, tuple(predicted), slopes)
         return EpisodePrediction(*said, guess, correction, by_correction)
 
-    def readings_along_trajectory(
+    def readings_and_sensitivities(
         self, samples: SensorMeasurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
         """Predict readings (M, k) and their derivatives (M, k, d) along a trajectory `state` (N + 1, nx).
@@ -351,7 +351,7 @@ class EpisodePredictor:
             effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
-    def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeSmoother | None:
+    def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeValueSmoother | None:
         """Smoother of predicted efforts, equal to the filter of measured efforts. None if no efforts are compared."""
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:

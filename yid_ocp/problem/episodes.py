@@ -20,7 +20,7 @@ from yid_ocp.integrator.step import Step, float_array_with_checked_shape, genera
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import lqr_tracking_feedback, proportional_tracking_feedback
 from yid_ocp.model.system import System
-from yid_ocp.problem.initial_state_fit import PrecomputedInitialState
+from yid_ocp.problem.initial_state_fit import FixedInitialState
 from yid_ocp.problem.measurements import (
     SensorMeasurements,
     TimeGrid,
@@ -36,7 +36,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles_at_nodes,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_low_pass_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, zero_phase_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
@@ -118,7 +118,7 @@ class TorqueAndAngleErrorModel:
         return self.recorded_minus_true_torque - self.transmitted_torque_noise
 
     @property
-    def torque_bias_part(self) -> TorqueAndAngleErrorModel:
+    def with_torque_bias_only(self) -> TorqueAndAngleErrorModel:
         """The same error model with the constant torque offset only, without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
         return replace(
@@ -194,7 +194,7 @@ class Episode:
     tracking_feedback: TrackingFeedback | None = None  # for driven joints, with gains at the nominal parameters
     known_parameters: Mapping[str, float] = field(default_factory=dict)  # values that differ among recordings
     input_errors: TorqueAndAngleErrorModel | None = None  # errors of the torques and angles that drive the rollout
-    fixed_initial_state: PrecomputedInitialState | None = None  # given or fitted to points; else it is an equilibrium
+    fixed_initial_state: FixedInitialState | None = None  # given or fitted to points; else it is an equilibrium
     # index of the estimation episode whose initial state and local parameters this held-out part of it shares
     initial_state_shared_with: int | None = None
     equilibrium_guess: Array | None = None  # near the initial equilibrium, if that is not of least energy, (n,)
@@ -254,7 +254,7 @@ def prepare_episode(
     known_parameters = options.parameters_by_recording.get(recording.name, {})
     start = errors = None
     if (state := options.known_initial_states.get(recording.name)) is not None:
-        start = PrecomputedInitialState(float_array_with_checked_shape("known_start", state, (step.sizes["nx"],)))
+        start = FixedInitialState(float_array_with_checked_shape("known_start", state, (step.sizes["nx"],)))
     if options.weighting != "paper":
         errors = _recorded_input_errors(recording, system, grid, options.sensors, samples)
     inputs = (recording, grid, torque, path, np.concatenate([arm[0], path[0]]), arm)
@@ -270,7 +270,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if options.arm_tracking_feedback == "proportional":
         loop = proportional_tracking_feedback(step, episode.measured_driven_angles, options.arm_tracking_feedback_gains)
     else:
-        plain = functions.effect_momentum_shift.theta_without_effects(theta)
+        plain = functions.reference_momentum_correction.theta_without_effects(theta)
         known = episode.smoothed_driven_angles, episode.torque, plain
         loop = lqr_tracking_feedback(step, *known, functions.arms_only_integrator_step)
     return replace(episode, tracking_feedback=loop)
@@ -339,7 +339,7 @@ def _samples(
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.node_times,
         grid.time_step,
-        effort_low_pass_filter(options.path_cutoff),
+        zero_phase_effort_filter(options.path_cutoff),
         LowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
         has_uncertain_clocks,

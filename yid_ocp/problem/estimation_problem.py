@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
@@ -47,7 +47,7 @@ from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_res
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
-from yid_ocp.problem.recorded_inputs import lowest_path_cutoff
+from yid_ocp.problem.recorded_inputs import select_path_cutoff
 
 _HELD_OUT_START_WINDOW = 0.2
 """Duration of a sensor's first samples from which a held-out recording's initial state is estimated [s]."""
@@ -104,7 +104,7 @@ class EstimationProblem(ReprMixin):
     ) -> None:
         options = options or ProblemOptions()
         if not options.path_cutoff:
-            cutoff = lowest_path_cutoff([*recordings, *held_out], step.system.prescribed)
+            cutoff = select_path_cutoff([*recordings, *held_out], step.system.prescribed)
             options = replace(options, path_cutoff=cutoff)
         check_free_parameters(step.system, free, options)
         if not recordings:
@@ -163,7 +163,7 @@ class EstimationProblem(ReprMixin):
         made._set(**{**same, **changes})
         return made
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         free = f"{len(self.free)} of {count_with_noun(len(self.system.parameters), 'parameter')} free"
         seen = sum(samples.n_residuals for episode in self.episodes for samples in episode.measurements)
         used, held = (count_with_noun(len(entries), "recording") for entries in (self.episodes, self.held_out))
@@ -171,7 +171,7 @@ class EstimationProblem(ReprMixin):
         table = zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
         rows += [(name, *(f"{value:.4g}" for value in own)) for name, *own in table]
         line = f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out"
-        return ReprLineAndTableRows(line, rows)
+        return ReprTexts(line, rows)
 
     @property
     def initial_unknowns(self) -> Array:
@@ -232,9 +232,9 @@ class EstimationProblem(ReprMixin):
         neutral_and_fixed = self.predictor.are_input_corrections_neutral_and_fixed
         return all(neutral_and_fixed(episode, self.theta) for episode in self.episodes)
 
-    def theta_and_initial_state_deviation(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
+    def unpack_unknown_vector(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""
-        return self.unknowns.theta_and_initial_state_deviation(x, episode, self.theta, self.system)
+        return self.unknowns.unpack_unknown_vector(x, episode, self.theta, self.system)
 
     def unknown_vector(self, values: Mapping[str, float]) -> Array:
         """Copy (nx,) of the initial unknown vector, with the named `values` inserted and clipped to the bounds."""
@@ -255,7 +255,7 @@ class EstimationProblem(ReprMixin):
         """
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
-        asked = [(e, *self.theta_and_initial_state_deviation(x, i), guess) for i, (e, guess) in enumerate(pairs)]
+        asked = [(e, *self.unpack_unknown_vector(x, i), guess) for i, (e, guess) in enumerate(pairs)]
         results = self.predictor.predict_episodes(asked, derivatives)
         failures = [result for result in results if isinstance(result, str)]
         if failures:
@@ -304,7 +304,7 @@ class EstimationProblem(ReprMixin):
                 raw = samples.whitened_residual(result.predicted_outputs[k])
                 _, factor = huber_loss_and_residual_factors(raw, self.options.huber_threshold)
                 pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
-            theta, offset = self.theta_and_initial_state_deviation(x, i)
+            theta, offset = self.unpack_unknown_vector(x, i)
             own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, theta, offset, pulls)
             gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
         prior, prior_jacobian = self.prior_residual_and_jacobian(x)
@@ -347,7 +347,7 @@ class EstimationProblem(ReprMixin):
             theta, shared = self.held_out_theta(x, held), held.initial_state_shared_with
             if shared is not None:
                 episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
-                found.append((episode, theta, self.theta_and_initial_state_deviation(x, shared)[1]))
+                found.append((episode, theta, self.unpack_unknown_vector(x, shared)[1]))
                 continue
             episode = self.predictor.episode_with_fitted_initial_state(held, theta)
             std = self.initial_state_prior_std
@@ -360,7 +360,7 @@ class EstimationProblem(ReprMixin):
         Local parameters have the values in `x` if it is part of an estimation recording, else their initial values.
         """
         whole = held.initial_state_shared_with
-        theta, _ = self.theta_and_initial_state_deviation(x, whole or 0)
+        theta, _ = self.unpack_unknown_vector(x, whole or 0)
         for name in self.local_parameters if whole is None else ():
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return theta

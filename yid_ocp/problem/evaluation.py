@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model.system import System
@@ -86,10 +86,10 @@ class Evaluation(ReprMixin):
     message: str
     episode_predictions: tuple[EpisodePrediction, ...]
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         slopes = "" if self.jacobian is None else f", by {count_with_noun(self.jacobian.shape[1], 'unknown')}"
         said = f"cost {self.cost:.6g} of {count_with_noun(len(self.residual), 'residual')}{slopes}"
-        return ReprLineAndTableRows(said if self.ok else f"failed, {self.message}")
+        return ReprTexts(said if self.ok else f"failed, {self.message}")
 
     @property
     def equilibrium_guesses(self) -> EquilibriumGuesses:
@@ -181,9 +181,7 @@ class UnknownVectorLayout:
         wide[:, self.unknown_indices_affecting_recording(recording)] = block
         return wide
 
-    def theta_and_initial_state_deviation(
-        self, x: ArrayLike, recording: int, theta: Array, system: System
-    ) -> tuple[Array, Array]:
+    def unpack_unknown_vector(self, x: ArrayLike, recording: int, theta: Array, system: System) -> tuple[Array, Array]:
         """Copy of `theta` with one recording's values from `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
         result = theta.copy()

@@ -37,7 +37,7 @@ _TRIALS_PER_PARAMETER = 4
 
 
 @dataclass(frozen=True)
-class PrecomputedInitialState:
+class FixedInitialState:
     """Initial state that does not depend on the unknowns, given or fitted to the first measured points."""
 
     state: Array  # (q, p, z) at node 0, (nx,)
@@ -108,7 +108,7 @@ class InitialStateFitter:
         path: Array,
         *,
         roughly: bool = False,
-    ) -> PrecomputedInitialState:
+    ) -> FixedInitialState:
         """Fit the initial configuration and momentum to the points measured in the first `window` seconds.
 
         `configuration` (nk,) holds the driven, then the prescribed coordinates at node 0. Only points of `samples` are
@@ -165,7 +165,7 @@ class InitialStateFitter:
         own = dict(zip(self.fitted_parameters, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
         if INITIAL_RMS_SPEED_PARAMETER in system.parameters:
             own[INITIAL_RMS_SPEED_PARAMETER] = _speed(frames[first], frames[then], (then - first) * step.time_step)
-        return PrecomputedInitialState(state, own)
+        return FixedInitialState(state, own)
 
     def _reading_function(self, sensor: Sensor) -> ca.Function:
         """Function of a sensor's readings and their derivatives by the free coordinates and the fitted parameters."""

@@ -147,7 +147,7 @@ class SensorMeasurements:
         row, column = (np.broadcast_to(p, blocks.shape)[together] for p in (place[:, :, None], place[:, None, :]))
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.n_residuals, self.n_residuals))
 
-    def decorrelate(self, rows: Any) -> Any:
+    def decorrelate_residual_rows(self, rows: Any) -> Any:
         """Decorrelate rows (nr,) or (nr, d), dense or sparse, already divided by their standard deviations."""
         return rows if self.output_decorrelation_matrix is None else self.output_decorrelation_matrix @ rows
 
@@ -174,7 +174,7 @@ class SensorMeasurements:
         seen, jacobian = self.positive_weight_mask, None
         robust = factor[seen]
         if slopes is not None:
-            jacobian = robust[:, None] * self.decorrelate(self.weight[seen][:, None] * slopes[seen])
+            jacobian = robust[:, None] * self.decorrelate_residual_rows(self.weight[seen][:, None] * slopes[seen])
         return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
     def shifted_earlier_by_steps(self, steps: Array) -> SensorMeasurements:
@@ -300,7 +300,7 @@ def whitened_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements
     found = np.zeros((sum(s.n_residuals for s in samples), count))
     rows = 0
     for s, part in zip(samples, parts, strict=True):
-        own = s.decorrelate(part[s.positive_weight_mask])
+        own = s.decorrelate_residual_rows(part[s.positive_weight_mask])
         found[rows : rows + s.n_residuals, before : before + own.shape[1]] = own
         rows, before = rows + s.n_residuals, before + own.shape[1]
     return found

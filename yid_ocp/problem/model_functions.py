@@ -16,7 +16,7 @@ from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
     EffectMomentumShift,
-    JointMotionWithSensitivities,
+    JointMotionAndTorqueSensitivities,
     compile_driven_arms_only_step,
 )
 from yid_ocp.model.system import System
@@ -51,7 +51,7 @@ class CorrectedInputs:
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
 
-    def feedback_with_corrected_reference(
+    def tracking_feedback_with_corrected_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
         """Correct a feedback's reference from measured to true angles, and add the momentum due to effects."""
@@ -68,7 +68,7 @@ class CorrectedInputs:
     def with_effect_momentum_in_reference(
         self,
         shift: EffectMomentumShift,
-        recorded: JointMotionWithSensitivities,
+        recorded: JointMotionAndTorqueSensitivities,
         measured: Array,
         theta: Array,
         names: Sequence[str],
@@ -85,7 +85,7 @@ class CorrectedInputs:
             return self
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
-        true = JointMotionWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
+        true = JointMotionAndTorqueSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
         momentum, slope = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, names)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
@@ -350,7 +350,7 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def effect_momentum_shift(self) -> EffectMomentumShift:
+    def reference_momentum_correction(self) -> EffectMomentumShift:
         """Correction of the tracking feedback's reference momentum for the effects in the model."""
         return self._momentum(None)
 

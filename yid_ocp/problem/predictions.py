@@ -10,7 +10,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin
+from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.errors import DataError, failed_rollout_error, unknown_name_error_arguments
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
@@ -125,9 +125,9 @@ class ChannelPrediction(ReprMixin):
         """Interpolate the prediction linearly to other times `t` (K,) [s]. Returns shape (K, w)."""
         return np.stack([np.interp(t, self.t, column) for column in self.predicted.T], axis=1)
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         samples = f"{len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"
-        return ReprLineAndTableRows(f"{self.channel} of '{self.recording}', {samples}")
+        return ReprTexts(f"{self.channel} of '{self.recording}', {samples}")
 
 
 def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[ChannelPrediction, ...]:

@@ -30,7 +30,7 @@ _MIN_PATH_CUTOFF, _MAX_CUTOFF_OVER_RATE = 10.0, 0.2  # [Hz], and as a fraction o
 _NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion in a frequency band
 
 
-def lowest_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -> float:
+def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -> float:
     """Lowest cutoff [Hz], 10 Hz or octaves above it, above which angles are noise alone; at most a fifth of the rate.
 
     What a filter of twice the cutoff keeps beyond this one is compared with white noise of the angles' own size. A

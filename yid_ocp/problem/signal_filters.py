@@ -62,7 +62,7 @@ class LowPassFilter:
         second[1:-1] = (response[2:] - 2 * response[1:-1] + response[:-2]) / step**2
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 
-    def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeSmoother:
+    def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeValueSmoother:
         """Make a matrix filter that smooths values at `nodes` out of `count` nodes, `step` [s] apart.
 
         The filter does not use the value at node 0. The signal is constant before node 1 and after the last node.
@@ -74,7 +74,7 @@ class LowPassFilter:
         row = np.broadcast_to(np.arange(len(nodes))[:, None], column.shape)
         values = np.broadcast_to(weight, column.shape)
         entries = scipy.sparse.coo_array((values.ravel(), (row.ravel(), column.ravel())), (len(nodes), count))
-        return NodeSmoother(nodes, entries.tocsr())
+        return NodeValueSmoother(nodes, entries.tocsr())
 
     def _response(self, step: float) -> Array:
         """Response to an impulse in the middle of an odd number of samples."""
@@ -99,7 +99,7 @@ class LowPassFilter:
 
 
 @dataclass(frozen=True)
-class NodeSmoother:
+class NodeValueSmoother:
     """A smoothing filter as a matrix (M, N). It smooths values at M of N nodes and keeps the others."""
 
     nodes: IntArray
@@ -128,7 +128,7 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def effort_low_pass_filter(cutoff: float) -> LowPassFilter:
+def zero_phase_effort_filter(cutoff: float) -> LowPassFilter:
     """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
     return LowPassFilter(cutoff, 2)
 

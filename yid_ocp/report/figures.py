@@ -21,9 +21,9 @@ from yid_ocp.report.terminal import scale_and_unit_with_metres_as_mm
 
 # on a dark page, templates/dark.json maps each color; figures use no other colors
 _TEXT_COLOR, _GRID_COLOR, _BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
-LINE_COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
+LINE_PALETTE = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
 _LINE_DASHES, _SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "diamond", "square", "cross")
-BEFORE_COLOR, AFTER_COLOR, MEASURED_COLOR = LINE_COLORS[1], LINE_COLORS[0], "#8d99a4"
+BEFORE_COLOR, AFTER_COLOR, MEASURED_COLOR = LINE_PALETTE[1], LINE_PALETTE[0], "#8d99a4"
 _DIVERGING_COLORS = ("#2166ac", "#92c5de", _BACKGROUND_COLOR, "#f4a582", "#b2182b")
 _SEQUENTIAL_COLORSCALE = ((0.0, _BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
@@ -40,7 +40,7 @@ _LAYOUT: dict[str, Any] = {
     "font": {"family": "system-ui, sans-serif", "size": 13, "color": _TEXT_COLOR},
     "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
     "hovermode": "closest",
-    "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
+    "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_PALETTE[0]},
 }
 _MIN_CLOSURE_PERCENT = -50.0  # lower end of an axis of closures [%]
 _Curve = tuple[Sequence[float], Sequence[float]]
@@ -48,7 +48,7 @@ _Figure = dict[str, Any]
 
 
 def _line_color(i: int) -> str:
-    return LINE_COLORS[i % len(LINE_COLORS)]
+    return LINE_PALETTE[i % len(LINE_PALETTE)]
 
 
 def figure_html(figure: _Figure) -> str:
@@ -94,7 +94,7 @@ def _add_line(figure: _Figure, axis: str, value: float, **line: Any) -> None:
 def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]], later_dash: str = "solid") -> _Figure:
     """Add one line with markers per name and (x, y), each in its own color; `later_dash` once colors repeat."""
     for i, (name, (x, y)) in enumerate(curves):
-        line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_COLORS) else later_dash}
+        line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_PALETTE) else later_dash}
         if len(x):
             _add_trace(figure, x=list(x), y=list(y), mode="lines+markers", name=name, line=line)
     return figure
@@ -122,7 +122,7 @@ class TimePlotData:
     is_low_row: bool = False
 
 
-def prediction_and_residual_plots(
+def prediction_and_residual_plot_data(
     title: str,
     unit: str,
     t: Array,
@@ -151,7 +151,7 @@ def prediction_and_residual_plots(
 
 
 def time_plots_figure(
-    curves: Sequence[TimePlotData], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
+    curves: Sequence[TimePlotData], dots: str = LINE_PALETTE[1], lines: Mapping[str, str] | None = None
 ) -> _Figure:
     """Plot measured points and lines over time, one row per plot.
 
@@ -217,7 +217,7 @@ def lines_over_time_figure(curve: TimePlotData) -> _Figure:
     """Plot the lines of one plot, each in its own color."""
     figure = _styled_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
-        dash = _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]
+        dash = _LINE_DASHES[i // len(LINE_PALETTE) % len(_LINE_DASHES)]
         style = {"color": _line_color(i), "width": 1.5, "dash": dash}
         _add_trace(figure, **_thinned(t, value), mode="lines", name=name, line=style)
     if curve.band_half_height is not None:
@@ -313,7 +313,7 @@ def parameter_values_by_source_figure(
     spread = 0.6 / max(len(sources), 1)
     for i, source in enumerate(sources):
         own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
-        color, symbol = (colors or {}).get(source, _line_color(i)), _SYMBOLS[i // len(LINE_COLORS) % len(_SYMBOLS)]
+        color, symbol = (colors or {}).get(source, _line_color(i)), _SYMBOLS[i // len(LINE_PALETTE) % len(_SYMBOLS)]
         lengths = [2 * std if std is not None and np.isfinite(std) else 0.0 for *_, std in own]
         bars = {"type": "data", "array": lengths, "color": color, "thickness": 1.2} if any(lengths) else None
         places = [k + spread * (i - (len(sources) - 1) / 2) for k, *_ in own]
@@ -411,7 +411,7 @@ def gap_closure_and_screening_figure(
     rows = {"type": "category", "categoryarray": names, "categoryorder": "array", "automargin": True}
     _set_axis(figure, "yaxis", **rows, range=[-0.6, len(entries) - 0.4])
     bars = {"x": [decrease for _, decrease in entries.values()], "y": list(entries), "orientation": "h", "width": 0.55}
-    bars |= {"xaxis": f"x{last}", "yaxis": f"y{last}", "marker": {"color": LINE_COLORS[1]}}
+    bars |= {"xaxis": f"x{last}", "yaxis": f"y{last}", "marker": {"color": LINE_PALETTE[1]}}
     _add_trace(figure, "bar", **bars, showlegend=False)
     _set_axis(figure, "xaxis", rangemode="tozero")
     if done:
@@ -420,7 +420,7 @@ def gap_closure_and_screening_figure(
         layout["yaxis2"] = {**layout["yaxis"], "anchor": "x2", "matches": "y", "showticklabels": False}
         values, lows, highs = zip(*done.values(), strict=True)
         points = {"x": values, "y": list(done), "error_x": asymmetric_error_bars(values, lows, highs)}
-        marker = {"color": LINE_COLORS[0], "size": 11}
+        marker = {"color": LINE_PALETTE[0], "size": 11}
         _add_trace(figure, **points, mode="markers", marker=marker, showlegend=False, xaxis="x", yaxis="y")
         # a worse prediction has no lower limit of closure
         left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6

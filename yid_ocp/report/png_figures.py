@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.errors import OutputError
-from yid_ocp.report.figures import LINE_COLORS, asymmetric_error_bars
+from yid_ocp.report.figures import LINE_PALETTE, asymmetric_error_bars
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,7 +94,7 @@ def _save(figure: Figure, path: Path, dpi: int = 120) -> None:
         raise OutputError(what, where=str(path), hint=hint) from error
 
 
-_STRUCTURAL_COLOR, _NONZERO_COLOR, _BLOCK_EDGE_COLOR = "#a9cfe0", LINE_COLORS[0], LINE_COLORS[1]
+_STRUCTURAL_COLOR, _NONZERO_COLOR, _BLOCK_EDGE_COLOR = "#a9cfe0", LINE_PALETTE[0], LINE_PALETTE[1]
 _MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; beyond, one label per owner
 
 

@@ -228,7 +228,7 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
     return [f"{name} [{kinds[name]}]" for name in group.values_by_quantity]
 
 
-def third_party_file_summary_lines(contents: FilePreview) -> list[str]:
+def importable_file_summary_lines(contents: FilePreview) -> list[str]:
     """Describe the contents of another tool's file in text lines."""
     rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
     for source in contents.sources:

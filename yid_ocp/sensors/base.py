@@ -247,7 +247,7 @@ class Sensor(ABC):
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
-    def output_frame_names(self) -> tuple[str, ...]:
+    def measurement_frame_names(self) -> tuple[str, ...]:
         """Name of the frame at which each output is measured; empty for joints."""
         frames = self.frame_names or ("",) * len(self.channel_names)
         return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))

@@ -50,7 +50,7 @@ class JointSensor(Sensor):
     def channel_names(self) -> tuple[str, ...]:
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
-    def select_sensor_joint_rows(self, values: ca.SX, state: NodeStateSymbols) -> ca.SX:
+    def select_sensor_joint_entries(self, values: ca.SX, state: NodeStateSymbols) -> ca.SX:
         """Select the rows of the sensor's joints from a column for all joints, (n, 1) to (nj, 1)."""
         return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
@@ -64,7 +64,7 @@ class PositionSensor(JointSensor):
     group_name: str = JOINT_POSITION_GROUP_NAME
 
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
-        return self.select_sensor_joint_rows(state.q, state)
+        return self.select_sensor_joint_entries(state.q, state)
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class PrescribedJointEffortSensor(JointSensor):
         return self.joint_names
 
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
-        return self.select_sensor_joint_rows(state.load, state)
+        return self.select_sensor_joint_entries(state.load, state)
 
 
 def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
@@ -141,7 +141,7 @@ def filtered_effort_measurements(
     time. Raises `DataError` if the recording is too short for the filter.
     """
     # the mean of an interval belongs to its centre
-    kept, measured = nodes_and_decorrelated_values(inputs, t, values, "efforts", at_centres=not is_sample)
+    kept, measured = filter_and_thin_to_nodes(inputs, t, values, "efforts", at_centres=not is_sample)
     measured[_may_stick(inputs, sensor.joint_names, inputs.node_times[kept])] = np.nan
     times, last = inputs.node_times[kept], len(inputs.node_times) - 1
     unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
@@ -151,7 +151,7 @@ def filtered_effort_measurements(
     return SensorData(sensor, times, measured, total / np.abs(unit), (1, last - 1), bias, correlation)
 
 
-def nodes_and_decorrelated_values(
+def filter_and_thin_to_nodes(
     inputs: SensorDataInputs, t: Array, values: Array, noun: str, *, at_centres: bool = False, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).

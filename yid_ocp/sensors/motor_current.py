@@ -37,7 +37,7 @@ class _MotorCurrentSensor(JointSensor):
         return np.array(self.torque_constants)
 
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
-        return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
+        return self.select_sensor_joint_entries(state.load, state) / ca.DM(self.torque_constants)
 
 
 @base.SENSOR_READERS.register("motors.current")

@@ -15,7 +15,7 @@ import numpy as np
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, YidError, import_optional
 from yid_ocp.inference.linearized_residual import (
     is_stationary_point,
@@ -120,7 +120,7 @@ class Solution(ReprMixin):
     problem: EstimationProblem | None = None
     checks: EstimateChecksBeyondFit | None = None
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
         words, rows = {}, [("parameter", "value", "unit", "")]
         for name, e in free.items():
@@ -133,7 +133,7 @@ class Solution(ReprMixin):
         how = f"{self.status.value.replace('_', ' ')} by {self.solver_name}"
         left_out = ("of discretisation",) if self.checks is None else self.checks.uncounted_errors
         uncounted = f"± without the error {' and '.join(left_out)}" if left_out and free else ""
-        return ReprLineAndTableRows(", ".join(filter(None, (how, *told, more, fit, uncounted))), rows)
+        return ReprTexts(", ".join(filter(None, (how, *told, more, fit, uncounted))), rows)
 
     @property
     def n_iterations(self) -> int:
@@ -155,7 +155,7 @@ class Solution(ReprMixin):
         if found.ok:
             return found.episode_predictions
         predict, pairs = problem.predictor.predict_episode, enumerate(problem.episodes)
-        parts = problem.theta_and_initial_state_deviation
+        parts = problem.unpack_unknown_vector
         return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:

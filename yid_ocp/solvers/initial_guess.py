@@ -69,7 +69,7 @@ def guess_unknowns_and_node_states(
         moved = np.where(problem.positive_unknowns_mask, np.clip(factor * x, lower, upper), x)
         begins, states, multipliers, total = [], [], [], 0.0
         for i, episode in enumerate(problem.episodes):
-            shared, _ = problem.theta_and_initial_state_deviation(moved, i)
+            shared, _ = problem.unpack_unknown_vector(moved, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
             begins.append(problem.initial_state_of_episode(episode, theta))
             found: list[tuple[Array, Array]] = []
@@ -93,13 +93,13 @@ def guess_unknowns_and_node_states(
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
     """Mean square whitened residual, without effort channels, of a trajectory (N + 1, nx) of recording `i`."""
-    shared, _ = problem.theta_and_initial_state_deviation(x, i)
+    shared, _ = problem.unpack_unknown_vector(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameter_names)))
     parts = [np.zeros(1)]
     for samples in problem.episodes[i].measurements:
         if not samples.sensor.effort_joints:
-            predicted, _ = problem.predictor.readings_along_trajectory(samples, trajectory, slopes, theta)
+            predicted, _ = problem.predictor.readings_and_sensitivities(samples, trajectory, slopes, theta)
             parts.append(samples.residual_and_jacobian(predicted, threshold=problem.options.huber_threshold).residual)
     return float(np.mean(np.concatenate(parts) ** 2))
 

@@ -358,7 +358,7 @@ class _ShootingIntervals:
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are searched near those of the problem's initial values, at any point
         x = problem.initial_unknowns
-        thetas = (problem.theta_and_initial_state_deviation(x, i)[0] for i in range(len(problem.episodes)))
+        thetas = (problem.unpack_unknown_vector(x, i)[0] for i in range(len(problem.episodes)))
         starts = map(problem.initial_state_of_episode, problem.episodes, thetas)
         found = [None if start.failure_message else start.equilibrium for start in starts]
         n = problem.step.sizes["n"]
@@ -374,7 +374,7 @@ class _ShootingIntervals:
         return x, list(found.node_states)
 
     def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        shared, _ = self.problem.theta_and_initial_state_deviation(x, i)
+        shared, _ = self.problem.unpack_unknown_vector(x, i)
         theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], shared)
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
@@ -391,7 +391,7 @@ class _ShootingIntervals:
         problem = self.problem
         cost, defect, residuals, jacobians, changes, slopes = 0.0, 0.0, [], [], [], []
         for i, episode in enumerate(problem.episodes):
-            theta, offset = problem.theta_and_initial_state_deviation(x, i)
+            theta, offset = problem.unpack_unknown_vector(x, i)
             theta = problem.predictor.theta_with_episode_values(episode, theta)
             start = problem.initial_state_of_episode(episode, theta, offset, self.equilibrium_guesses[i])
             condensed = start.failure_message or self._condensed(i, theta, start, nodes[i])
@@ -401,7 +401,7 @@ class _ShootingIntervals:
             defect = max(defect, largest)
             slopes.append((by_x, by_defect))
             for samples in episode.measurements:
-                read = problem.predictor.readings_along_trajectory(samples, trajectory, by_unknowns, theta)
+                read = problem.predictor.readings_and_sensitivities(samples, trajectory, by_unknowns, theta)
                 part = samples.residual_and_jacobian(*read, problem.options.huber_threshold)
                 assert part.jacobian is not None
                 cost += part.cost

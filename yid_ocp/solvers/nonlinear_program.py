@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.display import ReprLineAndTableRows, ReprMixin, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import SolverError, unknown_name_error_arguments
 from yid_ocp.integrator.compiler import compiled_casadi_function
 from yid_ocp.parallel import CASADI_LOCK
@@ -254,7 +254,7 @@ class _VectorBlock:
 
 
 @dataclass
-class ProgramInputLayout:
+class ProgramVectorLayout:
     """Layout of a program's variables or parameters in successive blocks, with values and bounds."""
 
     size: int = 0
@@ -273,7 +273,7 @@ class ProgramInputLayout:
         self.size += len(values)
         return np.arange(self.size - len(values), self.size)
 
-    def name_indices(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
+    def assign_block_name(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
         """Name existing indices of the vector as a block. Without indices nothing is named."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
@@ -283,7 +283,7 @@ class ProgramInputLayout:
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table
         index = self.append_values(table.ravel(order="F")).reshape(table.shape, order="F")
-        self.name_indices(name, index, rows, unit)
+        self.assign_block_name(name, index, rows, unit)
         return index
 
 
@@ -325,10 +325,10 @@ class NonlinearProgram(ReprMixin):
     p: ca.MX
     user_terms: tuple[_UserTerms, ...] = ()
 
-    def _summary(self) -> ReprLineAndTableRows:
+    def _summary(self) -> ReprTexts:
         rows = [("block", "entries"), *((name, str(block.index.size)) for name, block in self.variables.items())]
         equalities = count_with_noun(sum(term.n_values for term in self.constraint_terms), "equation")
-        return ReprLineAndTableRows(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
+        return ReprTexts(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
     def named_block(self, name: str) -> _VectorBlock:
         """Find a named block's indices, row names and unit. With one recording, `[NAME]` can be omitted.

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.discrete import NlpStepConstraints, nlp_step_constraints
-from yid_ocp.integrator.statics import measured_angle_hold_stiffness
+from yid_ocp.integrator.statics import driven_joint_hold_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episode_prediction import sensor_not_predictable_at_nodes_error
 from yid_ocp.problem.episodes import Episode
@@ -45,7 +45,7 @@ from yid_ocp.solvers.nonlinear_program import (
     LocalVariableFunction,
     MappedFunctionTerm,
     NonlinearProgram,
-    ProgramInputLayout,
+    ProgramVectorLayout,
     ResidualTerm,
 )
 
@@ -106,7 +106,7 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
     x = problem.initial_unknowns.copy()
     shared, own = len(problem.shared_parameters), len(problem.local_parameters)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
-    rows = list(problem.predictor.estimated_initial_state_indices)
+    rows = list(problem.predictor.estimated_initial_state_entries)
     for i, episode in enumerate(problem.episodes):
         columns = problem.unknowns.unknown_indices_affecting_recording(i)[shared:]
         if own:
@@ -114,7 +114,7 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
         if rows:
             blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
             first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
-            theta, _ = problem.theta_and_initial_state_deviation(x, i)
+            theta, _ = problem.unpack_unknown_vector(x, i)
             begin = problem.initial_state_of_episode(episode, theta, guess=first[: problem.step.sizes["n"]])
             x[columns[own:]] = (first - begin.state)[rows]
     return x
@@ -222,7 +222,7 @@ class _Maker:
         self._problem, self._compiled = problem, compiled
         self._step, self._sizes = problem.step, problem.step.sizes
         self._names = problem.unknowns.free_parameter_names
-        self._w, self._p = ProgramInputLayout(), ProgramInputLayout()
+        self._w, self._p = ProgramVectorLayout(), ProgramVectorLayout()
         system = problem.system
         free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
         theta = ca.SX(fixed)
@@ -241,7 +241,7 @@ class _Maker:
         found = guess_unknowns_and_node_states(problem, nodes, x, error)
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.append_values(x[:shared], low[:shared], high[:shared])
-        self._w.name_indices("theta", theta[:, None], problem.shared_parameters)
+        self._w.assign_block_name("theta", theta[:, None], problem.shared_parameters)
         constraints: list[MappedFunctionTerm] = []
         residuals: list[ResidualTerm] = []
         at_ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
@@ -249,7 +249,7 @@ class _Maker:
             last = shared + len(problem.local_parameters)
             at = problem.unknowns.unknown_indices_affecting_recording(i)[shared:last]
             local = self._w.append_values(x[at], low[at], high[at])
-            self._w.name_indices(f"local[{episode.name}]", local[:, None], problem.local_parameters)
+            self._w.assign_block_name(f"local[{episode.name}]", local[:, None], problem.local_parameters)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
             at_ridge.append(local)
             places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
@@ -273,7 +273,7 @@ class _Maker:
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
-        shared, _ = problem.theta_and_initial_state_deviation(found.x, i)
+        shared, _ = problem.unpack_unknown_vector(found.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, shared)
         rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (known := begin.equilibrium) is not None:
@@ -282,7 +282,7 @@ class _Maker:
         grasped = [name for grasp in system.grasps for name in grasp.constraint_equation_names]
         at_rest = [*(joints[k] for k in sought), *system.effect_internal_coordinate_symbols, *grasped]
         rest_at = self._w.append_values(rest)
-        self._w.name_indices(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
+        self._w.assign_block_name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
         table = np.zeros((3, len(state), nx + m))
         table[0, :, :nx], table[0, :-1, nx:] = state, pull
         table[1], table[2] = -np.inf, np.inf
@@ -293,9 +293,9 @@ class _Maker:
         index = np.append(at, np.zeros(m, np.int64)).reshape(len(state), nx + m)
         states, multipliers = index[:, :nx], index[:-1, nx:]
         for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
-            self._w.name_indices(f"{label}[{name}]", part.T, rows)
-        self._w.name_indices(f"z[{name}]", states[:, 2 * n :].T, tuple(system.effect_internal_coordinate_symbols))
-        self._w.name_indices(f"lam[{name}]", multipliers.T, grasped)
+            self._w.assign_block_name(f"{label}[{name}]", part.T, rows)
+        self._w.assign_block_name(f"z[{name}]", states[:, 2 * n :].T, tuple(system.effect_internal_coordinate_symbols))
+        self._w.assign_block_name(f"lam[{name}]", multipliers.T, grasped)
         theta_at = self._p.append_block(f"theta[{name}]", theta, system.parameters.names)
         torque = self._p.append_block(f"torque[{name}]", episode.torque.T, system.driven, "N m")
         gain, reference = self._followed(episode)
@@ -318,7 +318,7 @@ class _Maker:
         """The stage with the inputs of a recording."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
-            feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_shift
+            feedback, shift = episode.tracking_feedback, self._problem.model_functions.reference_momentum_correction
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
             self._stages[key] = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
@@ -341,7 +341,7 @@ class _Maker:
             none = np.tile(std <= 0, count)
             at = self._w.append_values(np.zeros(nu * count), np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
             places[label] = at.reshape(count, nu)
-            self._w.name_indices(f"{label}[{name}]", places[label].T, driven)
+            self._w.assign_block_name(f"{label}[{name}]", places[label].T, driven)
             weight = self._p.append_block(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
             data = np.zeros((count, 0), np.int64)
             term = MappedFunctionTerm(f"{label}[{name}]", driven, itself, places[label], data, weight[:0, 0])
@@ -354,7 +354,7 @@ class _Maker:
     def _begun(self, episode: Episode, places: _Places) -> tuple[MappedFunctionTerm, list[ResidualTerm]]:
         """Constraints of the first state, and the prior of its free part."""
         problem, name, nx = self._problem, episode.name, self._sizes["nx"]
-        loose = list(problem.predictor.estimated_initial_state_indices)
+        loose = list(problem.predictor.estimated_initial_state_entries)
         fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_coordinate_indices, *loose}]
         joints = problem.system.mechanism.joint_names
         rows = [
@@ -371,7 +371,7 @@ class _Maker:
             statics = problem.model_functions.equilibrium_solver
             rest = statics.symbolic_equations
             sought, held = rest.inputs[0], rest.inputs[2]
-            stiffness = measured_angle_hold_stiffness(problem.system, bool(problem.system.driven))
+            stiffness = driven_joint_hold_stiffness(problem.system, bool(problem.system.driven))
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()
@@ -426,9 +426,9 @@ class _Maker:
         threshold = self._problem.options.huber_threshold
         if samples.noise_correlation is not None:
             mixed = np.zeros(seen.shape)
-            mixed[seen] = samples.decorrelate(samples.weight[seen] * samples.value[seen])
+            mixed[seen] = samples.decorrelate_residual_rows(samples.weight[seen] * samples.value[seen])
             target = self._p.append_block(f"value.{term.name}", mixed.T, rows, "")
-            combination = samples.decorrelate(scipy.sparse.diags_array(samples.weight[seen]) @ between)
+            combination = samples.decorrelate_residual_rows(scipy.sparse.diags_array(samples.weight[seen]) @ between)
             return ResidualTerm(term, _constant(combination), None, target.T[seen], threshold)
         value = self._p.append_block(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
         weight = self._p.append_block(f"weight.{term.name}", samples.weight.T, rows)

@@ -150,10 +150,10 @@ def run_virtual_experiment(
     options: dict[str, Any] = {"injected": chosen.injected_terms, "gear_play": chosen.gear_play, "frame_times": times}
     simulation = replace(chosen.simulation, jitter_seed=chosen.seed)
     run = simulate_in_mujoco(system, values, motion, simulation, initial_joint_angles=posture, **options)
-    return record_simulation(system, values, chosen, run)
+    return recording_from_simulation(system, values, chosen, run)
 
 
-def record_simulation(
+def recording_from_simulation(
     system: System, values: Mapping[str, float] | None, experiment: VirtualExperimentSettings, run: SimulationResult
 ) -> Recording:
     """Record a finished simulation `run` with the experiment's sensors and noise."""

@@ -169,7 +169,7 @@ def simulate_in_mujoco(
             controller = _ServoCommander(scene, motion)
             _settle_under_servo_commands(scene, nominal_damping, controller.initial_command)
         else:
-            controller = TrackingController(scene, motion, settle_to_equilibrium(scene, nominal_damping))
+            controller = TrackingController(scene, motion, settled_holding_torques(scene, nominal_damping))
         if injected is not None:
             injected.begin_motion(scene.data)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
@@ -216,7 +216,7 @@ def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | 
         mujoco.set_mjcb_passive(None)
 
 
-def settle_to_equilibrium(scene: MujocoModelAndState, damping: Array) -> Array:
+def settled_holding_torques(scene: MujocoModelAndState, damping: Array) -> Array:
     """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
 
     `damping` replaces the joint damping while the scene settles, because it can decide which of several equilibria is
@@ -449,7 +449,7 @@ def replay_mismatch_by_channel(
         assert joints.position_command is not None
         commanded = _commanded(scene, system, t, joints.position_command[:, columns])
         return _errors(system, recording, joints, columns, commanded)
-    balance = settle_to_equilibrium(scene, np.array(model.dof_damping))
+    balance = settled_holding_torques(scene, np.array(model.dof_damping))
     noisy = joints.position_std is None or bool(np.any(np.asarray(joints.position_std) > 0))
     path = _Path(moved, t, position, _SMOOTHING_SAMPLES if noisy else 0.0)
     if system.driven:

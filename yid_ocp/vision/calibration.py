@@ -33,8 +33,8 @@ from yid_ocp.vision.camera_registration import (
     StampedCloud,
     SurfaceObservationFractions,
     candidate_calibration_states,
-    pooled_surface_observation_fractions,
     robust_gradient_and_hessian,
+    seen_occluded_and_missing_surface_fractions,
 )
 from yid_ocp.vision.point_cloud import MAD_TO_STD, weighted_median
 
@@ -84,7 +84,7 @@ class _StampDelay(NamedTuple):
         return abs(self.delay) > max(_MAX_STAMP_DELAY, _STAMP_ERROR_STDS * self.std)
 
 
-def frame_stamp_delay(
+def stamp_delay_beyond_clock_offset(
     arm: ArmSurface, state: CalibrationState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Estimate the delay [s] of a frame's time stamp beyond the common clock offset. None if the arm is not in view.
@@ -297,12 +297,12 @@ class _Calibrator:
             last = _LAST_STAGE_POINTS, _LAST_STAGE_ITERATIONS
             state, cost, used = self._rounds(state, chosen, _RAY_REACH, True, *last)
             placed = [(g.stamp, state.measured_to_world_points(g.points)) for g in used]
-            own = [frame_stamp_delay(self.arm, state, *seen, self.rng) for seen in placed]
+            own = [stamp_delay_beyond_clock_offset(self.arm, state, *seen, self.rng) for seen in placed]
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = pooled_surface_observation_fractions(self.arm, chosen, state, _RAY_REACH)
+        presence = seen_occluded_and_missing_surface_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= _MIN_ARM_COVERAGE * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
@@ -347,7 +347,7 @@ class _Calibrator:
         for trial in tried:
             for reach in _STAGE_REACHES:
                 trial = self._rounds(trial, few, reach, False, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
-            presence = pooled_surface_observation_fractions(self.arm, few, trial, 0.5 * _RAY_REACH)
+            presence = seen_occluded_and_missing_surface_fractions(self.arm, few, trial, 0.5 * _RAY_REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
             if most > _GOOD_START_FRACTION:

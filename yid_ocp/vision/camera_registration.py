@@ -367,7 +367,7 @@ class SurfaceObservationFractions:
     samples: int
 
 
-def pooled_surface_observation_fractions(
+def seen_occluded_and_missing_surface_fractions(
     arm: ArmSurface, frames: Sequence[StampedCloud], state: CalibrationState, within: float
 ) -> SurfaceObservationFractions:
     """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""

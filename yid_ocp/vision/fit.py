@@ -38,7 +38,7 @@ from yid_ocp.vision.shape_evidence import (
     tube_link_projections,
 )
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd, ShapeGuessFinder
-from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
+from yid_ocp.vision.surface_meshes import link_lengths_and_radius_by_segment
 
 _Left = tuple[BoolArray, BoolArray]
 """Masks of the nodes and points of a frame that are used."""
@@ -134,7 +134,7 @@ class ShapeFitter:
         n_loose = len(self.free_joints) - len(self.bend_joints)
         self._prior = np.concatenate([held_by, np.full(n_loose, _WEAK_REGULARISATION)])
 
-        sizes = tube_link_lengths_and_radii(system, values)
+        sizes = link_lengths_and_radius_by_segment(system, values)
         self.link_radii = np.concatenate([np.full(len(lengths), radius) for lengths, radius in sizes.values()])
         self.link_segments = tuple(name for name, (lengths, _) in sizes.items() for _ in lengths)
         q = ca.SX.sym("q", system.n_coordinates)
@@ -308,7 +308,7 @@ class ShapeFitter:
             every = self._tasks(sight, none, ~evidence.is_foreign)[1][-1]
             moved = (jacobian @ self._quadratic(q, every).damped_step(0.0)).reshape(-1, 3)
         for rival in rivals:
-            moved = np.maximum(np.abs(moved), np.abs(self.points_at_configuration(rival) - places))
+            moved = np.maximum(np.abs(moved), np.abs(self.point_frame_positions(rival) - places))
         corners = self._links_at(q)
         touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING_DISTANCE
         # the spread across the links about each point
@@ -430,7 +430,7 @@ class ShapeFitter:
         """Gripper positions (grasps, 3) [m] at a configuration."""
         return self._holders(np.asarray(q, float))[0].reshape(-1, 3)
 
-    def points_at_configuration(self, q: ArrayLike) -> Array:
+    def point_frame_positions(self, q: ArrayLike) -> Array:
         """Positions (np, 3) [m] of the system's points at a configuration."""
         return self._seen(np.asarray(q, float))[0].reshape(-1, 3)
 

@@ -152,7 +152,7 @@ def _good_fits(frames: Sequence[FrameReport]) -> dict[int, FrameShapeFit]:
     return {k: frame.shape_fit for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None}
 
 
-def tracked_states_and_points(
+def states_and_points_of_good_frames(
     frames: Sequence[FrameReport],
     columns: Sequence[int],
     common: SharedFrameEstimates,

@@ -19,7 +19,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
-from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
+from yid_ocp.vision.surface_meshes import link_lengths_and_radius_by_segment
 
 XyzTuple = tuple[float, float, float]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
@@ -103,7 +103,7 @@ class ReachableObjectRegion:
         *,
         anywhere: bool = False,
     ) -> None:
-        tree, sizes = system.numeric_mechanism(values), tube_link_lengths_and_radii(system, values)
+        tree, sizes = system.numeric_mechanism(values), link_lengths_and_radius_by_segment(system, values)
         reach = {"": 0.0}
         for segment in system.segment_layouts:
             reach[segment.name] = float(sizes[segment.name][0].sum()) + reach[segment.parent_segment or ""]

@@ -26,7 +26,7 @@ from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import MAD_TO_STD
 from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, tube_link_projections
-from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
+from yid_ocp.vision.surface_meshes import link_lengths_and_radius_by_segment
 
 _BACKGROUND_NOISE_STDS = 3.0  # stds of a point within which it belongs to the background
 # fraction of the frames in which what stands still must be seen: arm and object hide it from time to time
@@ -260,7 +260,7 @@ def estimate_and_check_dimensions(
     `std` holds the standard deviations [m] of a point's distance from the surface and of the position error shared by
     all frames. `fitted` fits the frames, given parameter values and the configurations of the previous round.
     """
-    sizes = tube_link_lengths_and_radii(system, given).values()
+    sizes = link_lengths_and_radius_by_segment(system, given).values()
     told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
     count, many = len(told), len(told) // 2
     names = tuple(f"{s.name}.{kind}" for kind in _DIMENSION_KINDS for s in system.segment_layouts)

@@ -389,7 +389,7 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
     raise ModelError(what, where=str(urdf), allowed=allowed, hint="put the meshes into the package of the URDF")
 
 
-def tube_link_lengths_and_radii(
+def link_lengths_and_radius_by_segment(
     system: System, values: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Array, float]]:
     """Link lengths and radius [m] of every tube, by segment name."""
@@ -405,7 +405,7 @@ def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = N
     if not system.segment_layouts:
         what, hint = "the model has no object to see", "set model.object with segments"
         raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
-    meshes, sizes = dict[int, TriangleMesh](), tube_link_lengths_and_radii(system, values)
+    meshes, sizes = dict[int, TriangleMesh](), link_lengths_and_radius_by_segment(system, values)
     for segment in system.segment_layouts:
         lengths, radius = sizes[segment.name]
         for i, (names, length) in enumerate(zip(segment.link_joints, lengths, strict=True)):

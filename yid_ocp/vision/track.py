@@ -25,7 +25,7 @@ from yid_ocp.vision.calibration import (
     CameraCalibration,
     calibrate_camera,
     calibration_without_estimation,
-    frame_stamp_delay,
+    stamp_delay_beyond_clock_offset,
 )
 from yid_ocp.vision.camera_registration import ArmSurface, StampedCloud
 from yid_ocp.vision.fit import ShapeFitter
@@ -183,7 +183,7 @@ class FrameTracker:
 
         shared = 0.0
         if looks:
-            places = self.shape_fitter.points_at_configuration(looks[0].q)
+            places = self.shape_fitter.point_frame_positions(looks[0].q)
             shared = float(calibration.point_std_from_calibration(places, 0 * places, np.zeros(len(places))).max())
         of = self.system, self.parameter_values, self.options.estimated_dimensions
         sizes = sequence_calibration.estimate_and_check_dimensions(*of, (noise, shared), fitted)
@@ -311,7 +311,7 @@ class FrameTracker:
         filtered = None if work.filtered is None else work.filtered.points
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
-    def initial_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
+    def frame_report_before_processing(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Make a frame's report before processing, with a reason if the frame is dropped."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
@@ -329,8 +329,8 @@ class FrameTracker:
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.find_foreign_objects(frames)
         of = common, things, self.options, self.sequence.source
-        measured = frame_selection.tracked_states_and_points(frames, columns, *of)
-        place = self._shape(common.dimensions).points_at_configuration
+        measured = frame_selection.states_and_points_of_good_frames(frames, columns, *of)
+        place = self._shape(common.dimensions).point_frame_positions
         return TrackResult(
             self.point_names,
             *measured,
@@ -368,7 +368,7 @@ class FrameTracker:
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
         """The object's part of a frame, or None with the reason in its report."""
-        work = _Work(self.initial_frame_report(index, calibration, self._reasons.get(index, "")))
+        work = _Work(self.frame_report_before_processing(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:
@@ -386,7 +386,7 @@ class FrameTracker:
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
-            own = frame_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
+            own = stamp_delay_beyond_clock_offset(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
                 if own.is_significant:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
@@ -55,7 +55,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     if arguments.join:
         together = functools.partial(score_joined_slices, arguments.join, arguments.out or "joined-slices")
         return run_command_and_print(arguments, together)
-    said, default = arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME
+    said, default = arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME
     runs = [load_config(path, said, default) for path in arguments.configs or [None]]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
         runs.append(load_config(None, said, DEFAULT_CONFIG_FILE_NAME))
@@ -196,7 +196,7 @@ class _Proof:
         experiments, chains = _blind_experiments_and_refinable_subset(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
         own, of = self.part
-        whole = blind.assign_blind_case_categories(self.count, self.seed, weights, chains, self.purpose)
+        whole = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         plan = [entry for entry in whole if entry.number % of == own - 1]
         if not plan:
             what, allowed = f"slice {own}/{of} of {self.count} cases is empty", f"at most {self.count} slices"
@@ -247,7 +247,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     first = Path(folder) / f"{name}.h5"
     _BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = ensemble.candidate_sensitivities_to_plain_data()
+    detectable = ensemble.candidate_sensitivities_to_json()
     write_strict_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
@@ -257,7 +257,7 @@ def _draw_case(
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.set_candidate_sensitivities_from_plain_data(read_input_json(detectable))
+    ensemble.set_candidate_sensitivities_from_json(read_input_json(detectable))
     case, label = ensemble.draw_recordings_and_ground_truth(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")

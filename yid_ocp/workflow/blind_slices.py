@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -141,7 +141,7 @@ def rescore_blind(
     labels = {}
     for label in blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"]):
         labels[label.case] = label
-    wanted = load_config(None, overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
+    wanted = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
     names = [text.partition("=")[0].removeprefix("diagnosis.") for text in overrides]
     changes = {name: getattr(wanted, name) for name in names if hasattr(wanted, name)}
     marks, changed = [], []

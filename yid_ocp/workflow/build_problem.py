@@ -17,7 +17,7 @@ import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
 from yid_ocp.analysis.clock_checks import problem_with_fitted_point_clocks
-from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_grasp_gaps_at_posture
+from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_gap_by_grasp_at_robot_posture
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
@@ -116,7 +116,7 @@ def _checked_discretisations(run: RunSettings) -> tuple[RefinementKind, ...]:
 
 def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel | None:
     """The run's model with every link divided in two; None for an object without divisible links."""
-    if run.model.object is None or run.model.object.n_links_per_segment_or_total is None:
+    if run.model.object is None or run.model.object.uniform_or_total_link_count is None:
         return None
 
     names = system.parameters.names
@@ -198,7 +198,7 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
     theta = problem.predictor.theta_with_episode_values(episode, problem.theta)
     start = problem.initial_state_of_episode(episode, theta)
     near = None if start.failure_message else start.state[: system.n_coordinates]
-    return min_grasp_gaps_at_posture(system, posture, theta, near)
+    return min_gap_by_grasp_at_robot_posture(system, posture, theta, near)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
@@ -268,7 +268,7 @@ def _check_recordings(
     return *kept, tuple(doubts)
 
 
-def all_recording_quality_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
+def all_issues_of_one_recording(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
     """Find all data quality issues of one uncut recording. Errors are as in `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
@@ -367,7 +367,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
         return []
     found: list[Issue] = []
     for i, episode in enumerate(problem.episodes):
-        own = problem.theta_and_initial_state_deviation(problem.initial_unknowns, i)
+        own = problem.unpack_unknown_vector(problem.initial_unknowns, i)
         result = problem.predictor.predict_episode(episode, *own, False, None)
         if isinstance(result, EpisodePrediction):
             found += point_checks.object_point_rollout_issues(episode, result, size)

@@ -164,7 +164,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
     """Animations of every estimation recording with the initial parameters, or of the recording alone."""
     scenes = []
     for i, episode in enumerate(problem.episodes):
-        shared = problem.theta_and_initial_state_deviation(problem.initial_unknowns, i)[0]
+        shared = problem.unpack_unknown_vector(problem.initial_unknowns, i)[0]
         if first.ok:
             prediction = first.episode_predictions[i]
             told = predicted_configuration_trajectory("with the initial values", problem, episode, prediction, shared)
@@ -178,7 +178,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
 
 def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress) -> dict[str, Any]:
     x = problem.initial_unknowns
-    growth = discretisation.largest_alternating_error_growth(problem, x)
+    growth = discretisation.alternating_error_growth_of_worst_recording(problem, x)
     if growth is not None and not growth.keeps_errors_below_resolution:
         warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
@@ -221,7 +221,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)
     rows: list[dict[str, Any]] = []
-    count = None if run.model.object is None else run.model.object.n_links_per_segment_or_total
+    count = None if run.model.object is None else run.model.object.uniform_or_total_link_count
     if count is not None:
         other = build_system(run, link_division=2)
         known = zip(system.parameters.names, theta, strict=True)

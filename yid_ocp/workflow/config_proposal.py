@@ -18,7 +18,7 @@ from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
-from yid_ocp.problem.recorded_inputs import lowest_path_cutoff
+from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import RecordedChannelKind, additional_sensor_channel_kinds
 from yid_ocp.sensors.joints import is_noise_std_stated
@@ -104,7 +104,7 @@ class ProposedConfigChoices:
     torque_bias_std: Mapping[str, float]  # default by joint [N m]; empty if the recording states it or has no effort
 
     @property
-    def efforts_alone_identify_model(self) -> bool:
+    def is_identified_from_efforts_only(self) -> bool:
         """Whether efforts alone identify the model, as arms are prescribed and no object is observed."""
         seen = any(not group.startswith("imu") for group in self.point_placements)
         return self.arm_mode == "prescribed" and not (self.has_object and seen)
@@ -187,7 +187,7 @@ def propose_config_choices(
         _places(tree, first, branches, holder, standing) | _sensor_places(tree, first, holder),
         _noise(first, recorded, joints),
         _time_step(period),
-        lowest_path_cutoff(recordings, joints if branches and mode == "prescribed" else ()),
+        select_path_cutoff(recordings, joints if branches and mode == "prescribed" else ()),
         {group.name: _clock(group) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
         *_motor_and_gain(robot, mode, recordings),

@@ -16,7 +16,7 @@ import numpy as np
 from yid_ocp import files
 from yid_ocp.analysis.run_estimates import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.baseline import DiagnosisBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnose import diagnose
@@ -49,7 +49,7 @@ _MAX_SHOWN_UNKNOWNS = 5  # in a figure; the page's maps and trajectories.h5 cont
 
 def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `diagnose` and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE_NAME)
+    settings = load_config(arguments.config, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline_run_folders=said))
@@ -124,7 +124,7 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.screening.detectability} - {effect.label for effect in fit.effects}
-    theta, _ = problem.theta_and_initial_state_deviation(problem.unknown_vector(fit.values), 0)
+    theta, _ = problem.unpack_unknown_vector(problem.unknown_vector(fit.values), 0)
     found = {}
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
@@ -239,7 +239,7 @@ def _scenes(finding: DiagnosisResult, predicted: list[EpisodeWithNominalAndEffec
 
 
 def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePrediction) -> ConfigurationTrajectory:
-    theta = fit.problem.theta_and_initial_state_deviation(fit.problem.unknown_vector(fit.values), 0)[0]
+    theta = fit.problem.unpack_unknown_vector(fit.problem.unknown_vector(fit.values), 0)[0]
     return prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
 
 

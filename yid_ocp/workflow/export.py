@@ -141,7 +141,7 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         raise DataError("the result has no parameters", where=where, allowed=allowed, hint=hint) from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
-    whole = run_history.settings_with_added_effects(nominal, run_history.parameter_values_by_effect_label(values))
+    whole = run_history.settings_with_added_effects(nominal, run_history.group_parameter_values_by_effect_label(values))
     return _CalibratedModel(whole, nominal, values, std)
 
 

@@ -109,7 +109,7 @@ def run_identifiability(
                 "config": folder.path / "config.yaml",
                 # further inputs of the results
                 "inputs": sorted({p.absolute() for n, p in input_files_by_name(run).items() if n != "configuration"}),
-                "x": None if solution is None else fisher.unknowns_from_solution(problem, solution).tolist(),
+                "x": None if solution is None else fisher.unknown_vector_from_solution(problem, solution).tolist(),
                 "remembers": problem is whole,
                 "start": asked.start_knowledge,
                 "grasp_std": asked.grasp_offset_std,
@@ -217,7 +217,7 @@ class _IdentifiabilityTasks:
     def evaluate_experiment_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
-        """Information gained by sets of changes, one task per changed setup (a `ChangeSetEvaluationFunction`)."""
+        """Information gained by sets of changes, one task per setup (`ChangeSetsEvaluationFunction`)."""
         groups: dict[str, list[int]] = {}
         for i, changes in enumerate(sets):
             setup = sorted({change.setup_change for change in changes if change.setup_change})
@@ -253,7 +253,7 @@ def _change_set_outcomes(
     run, problem = _problem(common)
     other = system_with_second_arm_holding_object(run, build_system(run))
     two_arms = None if other is None else system_with_grasp_offset_effects(other)
-    x = fisher.unknowns_from_solution(problem, common["x"])
+    x = fisher.unknown_vector_from_solution(problem, common["x"])
     setting = UnchangedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
     return list(to_lossless_plain_data(what_if.evaluate_experiment_change_sets(setting, sets, inflation)))
 

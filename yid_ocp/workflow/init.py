@@ -190,7 +190,7 @@ def _summary_lines(
     lines += [*picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     has_efforts = "joints.effort" in proposal.noise_by_group
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
-        is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.efforts_alone_identify_model
+        is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
         lines.append(f"friction of the arm's joints: yid-ocp friction {quoted}{more}")
     return [*lines, ""]
@@ -317,9 +317,9 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
         elsewhere = (place for place in places if place.model_frame not in ("", place.point))
         if frames := {place.point: place.frame for place in elsewhere}:
             entries.append(f"frame_by_recorded_name: {_value(frames)}")
-        told_by_points = proposal.arm_mode == "prescribed" and not proposal.efforts_alone_identify_model
+        told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
         if group == "joints.effort":
-            if proposal.torque_bias_std and not proposal.efforts_alone_identify_model:
+            if proposal.torque_bias_std and not proposal.is_identified_from_efforts_only:
                 biases = {joint: float(f"{std:.2g}") for joint, std in proposal.torque_bias_std.items()}
                 values = _number(next(iter(biases.values()))) if len(set(biases.values())) == 1 else _value(biases)
                 entries.append(f"bias_std: {values}")

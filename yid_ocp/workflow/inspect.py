@@ -187,7 +187,7 @@ def _dependence(
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepResidualsAndJacobians,
-) -> tuple[step_diagnostics.ParameterInfluence, ...]:
+) -> tuple[step_diagnostics.ParameterEquationsAndResponses, ...]:
     """Equations and sensors that depend on each parameter; along the recordings if the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
     found = step_diagnostics.parameter_equations_and_responses(step, symbols, episode, point.state, point.theta, rows)

@@ -21,9 +21,9 @@ from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
-from yid_ocp.planning.motion_plan import EstimatedParameterCovariance, TargetMotionPlan, plan_motion_to_target
+from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, TargetMotionPlan, plan_motion_to_target
 from yid_ocp.problem.measurements import recording_time_grid
-from yid_ocp.problem.recorded_inputs import lowest_path_cutoff, prescribed_coordinates_at_nodes
+from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes, select_path_cutoff
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
@@ -95,20 +95,20 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
     clamps = () if cable is None else cable.clamp_pose_definitions_from_points
     grid = recording_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        low_pass = LowPassFilter(run.problem.path_cutoff or lowest_path_cutoff([recording], system.prescribed))
+        low_pass = LowPassFilter(run.problem.path_cutoff or select_path_cutoff([recording], system.prescribed))
         path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, clamps)
     return dict(zip(system.prescribed, map(float, path[0]), strict=True))
 
 
 def identified_parameters_with_covariance(
     run: RunSettings, step: Step
-) -> tuple[Array, EstimatedParameterCovariance, dict[str, Any]]:
+) -> tuple[Array, ParameterCovarianceBeforePlan, dict[str, Any]]:
     """Parameters, their covariance and their source: a run folder of `solve`, or the settings."""
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run_folder is None:
         values = {name: parameters[name].value for name in free_parameter_names(run, parameters)}
-        return theta, EstimatedParameterCovariance(), {"run": None, "parameters": values}
+        return theta, ParameterCovarianceBeforePlan(), {"run": None, "parameters": values}
     result, folder = _read_parameter_run(run, ("solve",))
     _require_same_effects(run, result["parameters"], parameters.names)
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
@@ -121,7 +121,7 @@ def identified_parameters_with_covariance(
     certain = tuple(names[i] for i in usable)
     lost = sorted(name for name in found if result["parameters"][name]["free"] and name not in certain)
     source = {"run": str(folder), "parameters": found, "uncertainty_unknown": lost}
-    return theta, EstimatedParameterCovariance(certain, np.nan_to_num(covariance[np.ix_(usable, usable)])), source
+    return theta, ParameterCovarianceBeforePlan(certain, np.nan_to_num(covariance[np.ix_(usable, usable)])), source
 
 
 def _plan_as_recording(run: RunSettings, found: _Plan) -> Recording:

@@ -69,7 +69,7 @@ def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, fold
     found = {n: e for n, e in solution.parameters.items() if e.free and e.verdict == "identifiable"}
     if not found:
         return {}
-    system, theta = problem.system, problem.theta_and_initial_state_deviation(solution.x, 0)[0]
+    system, theta = problem.system, problem.unpack_unknown_vector(solution.x, 0)[0]
     joints, lines, found_symbols = [], [], ca.vertcat(*(system.parameters[name].symbol for name in found))
 
     def numbers(*terms: ca.SX) -> Array:
@@ -202,7 +202,7 @@ def write_diagnosis_hdf5(
         for force in result.events.force_estimates:
             group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit
-            _store(group, {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.assumed_model_error})
+            _store(group, {"t": force.t, "value": force.max_likelihood_force, "allowed": force.assumed_model_error})
 
 
 def _store_sensor(

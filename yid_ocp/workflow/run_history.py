@@ -34,7 +34,7 @@ from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_prin
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
 from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import expand_recording_path, read_recordings_of_role, uniquely_named_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_recording_path, uniquely_named_recordings
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         units = {name: str(parameters[name]["unit"]) for name in names}
         explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
-        effects = parameter_values_by_effect_label(all_values)
+        effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
         what = "the result has no covariance of its parameters"
         allowed = "keys parameters and covariance, as this version writes them"
@@ -77,7 +77,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
 
 
-def parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """Values of effect parameters, by effect label and parameter name without label."""
     found: dict[str, dict[str, float]] = {}
     for name, value in parameters.items():
@@ -203,7 +203,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
         return run
     known, _, _ = pool_estimates_and_chi2(runs)
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
-    estimated = parameter_values_by_effect_label(dict(zip(known.parameter_names, known.values, strict=True)))
+    estimated = group_parameter_values_by_effect_label(dict(zip(known.parameter_names, known.values, strict=True)))
     added = {label: {**said, **estimated.get(label, {})} for label, said in known.effects.items()}
     names = [f"{label}.{quantity}" for label in added if label not in present for quantity in estimated.get(label, ())]
     freed = dict.fromkeys(names, ParameterSettings(free=True))
@@ -214,7 +214,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
     """Load recordings without the sought effect, from settings or baseline, and the reason if there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):
-        file = expand_recording_path(path)
+        file = resolve_recording_path(path)
         if not is_file(file):
             where = ("recordings", "without_effect", i)
             what, allowed = f"there is no such recording: {file}", "the path of an existing file"
@@ -224,7 +224,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
-                found.append(read_recording(expand_recording_path(path)))
+                found.append(read_recording(resolve_recording_path(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
     named = (replace(recording, name=f"{recording.name} (without)") for recording in found)

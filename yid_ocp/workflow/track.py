@@ -35,10 +35,10 @@ from yid_ocp.vision.surface_meshes import SceneDescription, VirtualFramesWithTru
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import all_recording_quality_issues, issues_to_plain_data
+from yid_ocp.workflow.build_problem import all_issues_of_one_recording, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, expand_recording_path, unknown_name_error
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path, unknown_name_error
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
@@ -63,7 +63,7 @@ def _run_track(
                 tracker, recording = _frame_tracker(tasks.settings, system)
                 config = tasks.work_folder / _CONFIG_FILE
                 _LAST_TRACKER[:] = [((files.read_input_text(config), config), tracker)]
-                doubts = [] if recording is None else all_recording_quality_issues(run, system, recording)
+                doubts = [] if recording is None else all_issues_of_one_recording(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("tracking")
@@ -89,7 +89,7 @@ def _run_track(
             write_recording(tracked, folder.path / "recording.h5")
             # tracked points can be out of the object's reach if the model defines its position
             if settings.options.root_placement == "model":
-                own = all_recording_quality_issues(run, system, tracked)
+                own = all_issues_of_one_recording(run, system, tracked)
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
             theta = system.parameters.vector()
             shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
@@ -180,7 +180,7 @@ def _truth_errors(
 ) -> Mapping[str, Mapping[str, float]]:
     shape = ShapeFitter(system)
     columns = [system.point_frames.index(name) for name in found.point_names]
-    truth = np.array([shape.points_at_configuration(made.true_configuration_at(t))[columns] for t in found.t])
+    truth = np.array([shape.point_frame_positions(made.true_configuration_at(t))[columns] for t in found.t])
     apart = np.linalg.norm(found.position - truth, axis=2)
     return {
         name: {"median": float(np.nanmedian(apart[:, i])), "largest": float(np.nanmax(apart[:, i]))}
@@ -191,7 +191,7 @@ def _truth_errors(
 
 def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFramesWithTruth]:
     """Recording and camera frames of a virtual experiment; its true values are the initial parameter values."""
-    from yid_ocp.virtual.experiment import VirtualExperimentSettings, record_simulation
+    from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_from_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
@@ -213,7 +213,7 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         named: dict[str, Any] = {"recording_name": run.name, "description": run.description}
         experiment = VirtualExperimentSettings(simulation=simulation, camera=None, seed=seed, **named)
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
-        recording = record_simulation(system, None, experiment, truth)
+        recording = recording_from_simulation(system, None, experiment, truth)
         rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
         timing = surface_meshes.VirtualCameraTiming(rate, settings.dropped_frame_fraction, *latency)
         depth = surface_meshes.DepthCameraModel(outlier_probability=settings.outlier_fraction)
@@ -237,7 +237,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
     if not run.recordings.estimate:
         return None
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = expand_recording_path(run.recordings.estimate[0])
+        path = resolve_recording_path(run.recordings.estimate[0])
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
@@ -270,7 +270,7 @@ class _FrameTasks:
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
         require_task_values([result for result in results if "abruptly" not in result.error])
         return [
-            tracker.initial_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
+            tracker.frame_report_before_processing(i, common.camera_calibration, f"work on it failed: {result.error}")
             if "abruptly" in result.error
             else files.dataclass_from_plain_data(FrameReport, result.value)
             for i, result in zip(tracker.frame_order, results, strict=True)
@@ -302,7 +302,7 @@ def _frame_tasks(
 ) -> tuple[_FrameTasks, VirtualFramesWithTruth | None]:
     """Tracking tasks of frames in files, first written if a virtual camera renders them, and their true motion."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
-    joints = expand_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
+    joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
         _read_joints(run)
         _read_frames(run, "frames_path")  # raises errors about the files with the names of the settings

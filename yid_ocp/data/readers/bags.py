@@ -400,7 +400,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_among(topic, known, "joint states")
     chosen = [topic for topic in (default if topics is None else topics) if topic != command]
-    wanted = None if options.joints is None else base.parse_renamings(options.joints, "joint", where)
+    wanted = None if options.joints is None else base.parse_old_to_new_names(options.joints, "joint", where)
     found, notes = [], []
     if wanted is not None:
         _check_together(bag, chosen, wanted, where)

@@ -107,7 +107,7 @@ def si_factors(units: Mapping[str, str], where: str) -> dict[str, float]:
     return factors
 
 
-def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
+def parse_old_to_new_names(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
     """Parse new names from entries `name` or `recorded=name`. Raises `DataError` for an empty or repeated name."""
     found: dict[str, str] = {}
     for entry in entries:
@@ -147,7 +147,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
     if group is not None:
         names = {name: name for name in group.names}
         if options.joints is not None:
-            names = parse_renamings(options.joints, "joint", where)
+            names = parse_old_to_new_names(options.joints, "joint", where)
             require_known_names(names, group.names, "joint", where, DataError)
         at = [group.names.index(name) for name in names]
         recorded = group.values_by_channel.items()

@@ -15,7 +15,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.data.recording_hdf5 import check_readable_in_fork
+from yid_ocp.data.recording_hdf5 import check_readable_in_child_process
 from yid_ocp.errors import DataError, import_optional
 from yid_ocp.files import file_sha256
 
@@ -83,7 +83,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
 
 def _markers(path: Path) -> _Markers:
     ezc3d = import_optional("ezc3d", "c3d", "reading C3D files needs the package ezc3d")
-    check_readable_in_fork(path, _complaint, "C3D")
+    check_readable_in_child_process(path, _complaint, "C3D")
     try:
         file = ezc3d.c3d(str(path))
         parameters = file["parameters"]

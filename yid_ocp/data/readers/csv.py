@@ -18,7 +18,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import mean_sample_rate
-from yid_ocp.data.foreign_formats import AXES, UNIT_WORDS, ColumnMeaning, column_meanings, select_mocap_table_reader
+from yid_ocp.data.foreign_formats import AXES, UNIT_BY_WORD, ColumnMeaning, column_meanings, select_mocap_table_reader
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -264,7 +264,7 @@ def _table_rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     head, second = next(rows, None), next(rows, None)
     if head and second and len(head[1]) == len(second[1]):
         units = [cell.strip(" []()") for cell in second[1]]
-        if all(not unit or unit.lower() in UNIT_WORDS for unit in units):
+        if all(not unit or unit.lower() in UNIT_BY_WORD for unit in units):
             names = [f"{name.strip()} [{unit}]" if unit else name for name, unit in zip(head[1], units, strict=True)]
             head, second = (head[0], names), None
     yield from filter(None, (head, second))

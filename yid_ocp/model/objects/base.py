@@ -220,7 +220,7 @@ class ObjectBuilder:
         return False
 
     @property
-    def n_links_per_segment_or_total(self) -> int | None:
+    def uniform_or_total_link_count(self) -> int | None:
         """Number of links per segment, or the total if segments differ. None without such segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.segment_definitions()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
@@ -260,7 +260,7 @@ class ObjectBetweenClamps(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FixedRootObjectBuilder(ObjectBuilder):
+class MountedObjectBuilder(ObjectBuilder):
     """Base class of objects whose root is fixed to a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[

@@ -104,7 +104,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
 
 
-def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+def parameters_from_edge_lengths(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of a cable's length parameters from its edge lengths [m]."""
     values = {f"{START_CLAMP}.length": lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]]}
     for name, chain in cable.vertex_names_by_branch.items():
@@ -307,4 +307,4 @@ model:
     def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         if not self.has_edge_lengths_per_recording:
             return {}
-        return edge_length_parameter_values(self.topology(), edge_lengths)
+        return parameters_from_edge_lengths(self.topology(), edge_lengths)

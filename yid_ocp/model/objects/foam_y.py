@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitObjectTemplate, ObjectWithInitialValues
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectTemplate, MountedObjectBuilder, ObjectWithInitialValues
 from yid_ocp.options import OptionInfo
 
 _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]
@@ -42,7 +42,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialVal
 
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
-class _FoamY(FixedRootObjectBuilder):
+class _FoamY(MountedObjectBuilder):
     """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the position of that experiment."""
 
     init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {"foam_y": InitObjectTemplate(4, _init_object)}

@@ -13,7 +13,7 @@ from yid_ocp.files import attributes_to_dict
 from yid_ocp.model.flexible import FlexibleSegment
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitObjectTemplate, ObjectWithInitialValues
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectTemplate, MountedObjectBuilder, ObjectWithInitialValues
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -166,7 +166,7 @@ def _branch(text: str, links: int) -> tuple[str, SegmentGeometrySettings]:
 
 @OBJECT_KINDS.register("segments")
 @dataclass(frozen=True, kw_only=True)
-class _SegmentedObject(FixedRootObjectBuilder):
+class _SegmentedObject(MountedObjectBuilder):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True

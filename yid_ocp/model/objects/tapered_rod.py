@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, FixedRootObjectBuilder, InitObjectTemplate, ObjectWithInitialValues
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectTemplate, MountedObjectBuilder, ObjectWithInitialValues
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -31,7 +31,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialVal
 
 @OBJECT_KINDS.register("tapered_rod")
 @dataclass(frozen=True, kw_only=True)
-class TaperedRod(FixedRootObjectBuilder):
+class TaperedRod(MountedObjectBuilder):
     """A solid round rod whose radius changes linearly from the clamped base to the tip. The segment is named `rod`.
 
     `rod.bend` and `rod.twist` [N m^2] and `rod.damping` [N m^2 s] are the values at the base. At radius r they are

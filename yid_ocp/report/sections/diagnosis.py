@@ -200,7 +200,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         courses = (shape, force.assumed_model_error, -force.assumed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
-        plot = TimePlotData(title, lines, force.t, force.max_likelihood_forces, marked_intervals=spans)
+        plot = TimePlotData(title, lines, force.t, force.max_likelihood_force, marked_intervals=spans)
         by_recording.setdefault(force.recording, []).append(plot)
     return "Brief disturbances", sentences, _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
 
@@ -328,7 +328,7 @@ def _curves(
                     squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
                     part = sensor.output_names[column].removeprefix(channel).lstrip(".")
                     name = f"{channel}, {part}" if part else channel
-                    pair = figures.prediction_and_residual_plots(name, sensor.unit, t, y, std, lines)
+                    pair = figures.prediction_and_residual_plot_data(name, sensor.unit, t, y, std, lines)
                     found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, pair))
     if not found:
         return None

@@ -30,8 +30,8 @@ _MAX_LISTED_RECORDINGS = 3  # recordings that are drawn
 _MAX_POINTS = 6  # points of a group; more are in the recording
 _ESTIMATE_COLORS = {
     "start": figures.MEASURED_COLOR,
-    "estimate": figures.LINE_COLORS[0],
-    "estimate that cannot be trusted": figures.LINE_COLORS[1],
+    "estimate": figures.LINE_PALETTE[0],
+    "estimate that cannot be trusted": figures.LINE_PALETTE[1],
 }
 _ESTIMATED, _HELD_OUT = "estimated on", "held out"
 _JOINT_CHANNELS = ("position", "velocity", "effort", "position_command")
@@ -209,7 +209,7 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
     for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
         if not isinstance(prediction, str):
-            shared, _ = problem.theta_and_initial_state_deviation(solution.x, i)
+            shared, _ = problem.unpack_unknown_vector(solution.x, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
             yield _PredictedEpisode(role, problem, theta, episode, prediction)
 
@@ -289,7 +289,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
                 name = sensor.output_names[i].rsplit(".", 1)[1]
                 told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
-                curves += figures.prediction_and_residual_plots(name, sensor.unit, *told, smooth)
+                curves += figures.prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
             yield title, curves
 
 
