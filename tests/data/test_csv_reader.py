@@ -126,7 +126,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg and in rad", ""),
     "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "meaning of column 'q_a .mrad.'", ""),
     "force of no link": ("t,force_x,force_y,force_z\n0,1,1,1\n", {}, "meaning of column 'force_x'", ""),
-    "unit of what": (GOOD, {"units": {"angle": "deg"}}, "the quantity 'angle' of a unit", ""),
+    "unit of what": (GOOD, {"units": {"angle": "deg"}}, "'angle', which is not the name of a quantity", ""),
     "unit": (GOOD, {"units": {"velocity": "deg"}}, "'deg' is not a unit of 'velocity'", "did you mean 'deg/s'"),
 }
 
@@ -360,7 +360,7 @@ def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are
     )
     for broken in (without_rate, text.splitlines()[0] + "\n"):
         (tmp_path / name).write_text(broken)
-        with pytest.raises(DataError, match="the motion capture export cannot be understood"):
+        with pytest.raises(DataError, match="the motion capture export is not as the program writes it"):
             read_any(tmp_path / name)
 
 

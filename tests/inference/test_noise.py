@@ -114,7 +114,7 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
 def test_a_step_without_a_measurement_adds_no_likelihood_and_lets_the_state_go_on():
     covariance = np.array([[2.0, 0.3], [0.3, 1.0]])
     map_ = np.array([[0.9, 0.2]])
-    transition = kalman.FilterStateTransition(map_, np.array([0.5]))
+    transition = kalman.StateTransition(map_, np.array([0.5]))
     step, after, log_determinant = kalman.kalman_matrices_and_next_covariance(covariance, np.zeros((0, 2)), transition)
     assert log_determinant == 0.0
     whole = np.vstack([map_, [0.0, 0.5]])

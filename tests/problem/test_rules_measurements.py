@@ -12,7 +12,7 @@ from yid_ocp.problem.measurements import (
     huber_loss_and_residual_factors,
     measurements_located_on_grid,
     measurements_with_paper_weights,
-    recording_time_grid,
+    rollout_time_grid,
 )
 from yid_ocp.sensors.base import SensorData
 
@@ -33,16 +33,16 @@ def test_a_time_lies_between_two_nodes():
 def test_a_grid_covers_the_recording_or_as_much_as_is_wanted(last, duration, steps):
     t = 3.0 + np.array([0.0, last])
     made = recording(joints(["a"], t, np.zeros((2, 1))), seen(["p"], [0.0, 9.0], np.zeros((2, 1, 3))))
-    found = recording_time_grid(made, 0.1, duration)
+    found = rollout_time_grid(made, 0.1, duration)
     assert (found.start_time, found.time_step, found.steps) == (3.0, 0.1, steps)
     np.testing.assert_allclose(found.node_times, 3.0 + 0.1 * np.arange(steps + 1))
 
 
 def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
     made = recording(None, seen(["p"], [1.0, 1.4], np.zeros((2, 1, 3))))
-    assert (recording_time_grid(made, 0.1).start_time, recording_time_grid(made, 0.1).steps) == (1.0, 4)
+    assert (rollout_time_grid(made, 0.1).start_time, rollout_time_grid(made, 0.1).steps) == (1.0, 4)
     with pytest.raises(DataError, match=r"0\.4 s of data are shorter than two time steps"):
-        recording_time_grid(made, 0.3)
+        rollout_time_grid(made, 0.3)
 
 
 def test_hubers_loss_is_square_first_and_then_straight():
@@ -204,5 +204,5 @@ CLOCKS = {
 def test_a_clock_in_other_units_or_that_jumps_does_not_make_an_endless_rollout(t, time_step):
     made = recording(joints(["a"], t, np.zeros((len(t), 1))))
     with pytest.raises(DataError, match="times are in seconds and the clock does not jump"):
-        recording_time_grid(made, time_step)
-    assert recording_time_grid(made, 100 * time_step).steps > 2
+        rollout_time_grid(made, time_step)
+    assert rollout_time_grid(made, 100 * time_step).steps > 2

@@ -285,7 +285,7 @@ def test_experiments_that_do_not_fit_are_refused() -> None:
     brief, of_two = SimulationOptions(0.1, time_step=1e-3), ArmSensorNoise(effort_std=(0.1, 0.2))
     with pytest.raises(ConfigError, match="2 standard deviations for 7 joints"):
         run_virtual_experiment(SYSTEMS[1], None, VirtualExperimentSettings(None, None, brief, of_two))
-    with pytest.raises(ConfigError, match="arms = 3"):
+    with pytest.raises(ConfigError, match="there is no system with 3 arms"):
         baxter_foam_y_system(3)
     system = SYSTEMS[1]
     motion = random_multisine_motion(system, seed=0)

@@ -143,8 +143,8 @@ def unreadable():
 
 DUST = np.random.default_rng(0)
 BAD = {
-    "the cloud is empty": lambda points: points[:0],
-    "the cloud is empty:": lambda points: np.full_like(points, np.nan),
+    "the cloud has no finite points": lambda points: points[:0],
+    "the cloud has no finite points:": lambda points: np.full_like(points, np.nan),
     "not in metres": lambda points: 1000 * points,
     "no point lies where the object can be": lambda points: points + np.array([30.0, 0.0, 0.0]),
     "too few points of the object": lambda points: points[:60],

@@ -134,7 +134,7 @@ def test_the_command_runs_the_fleet_in_processes(cli, pendulum, fleet, tmp_path)
 SETTINGS = (
     "model.arms.mode=driven",
     "recordings.held_out=[]",
-    "diagnosis.candidates=[joint_viscous, joint_coulomb]",
+    "diagnosis.candidates=[joint_viscous, joint_spring]",
     "problem.use_compiler=true",
     "output.write_report=false",
 )
@@ -178,10 +178,10 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
     judged = blind.rescore_blind(folder, tmp_path / "judged").result
     told = ("verdict", "answer", "confusable", "right", "location_first")
     assert [[own[key] for key in told] for own in judged["marks"]] == [[own[key] for key in told] for own in marks]
-    with pytest.raises(OutputError, match=r"another ensemble \(2 cases, seed 3, for report\)"):
+    with pytest.raises(OutputError, match=r"other cases \(2 cases, seed 3, for report\): other purpose"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor(), purpose="calibration")
     (folder / "sealed" / "labels.json").write_bytes(text.replace(b"case_001", b"case_002"))
-    with pytest.raises(DataError, match="committed"):
+    with pytest.raises(DataError, match="differ from the commitment"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor())
 
 

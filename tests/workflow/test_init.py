@@ -471,7 +471,7 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
     write_recording(moved(SHORT), bench / "one.h5")
     assert init(*CABLE, files=["one.h5", "bag.csv"]) == 2
-    assert "joint 'pitch' of one is not recorded" in capsys.readouterr().err
+    assert "the recording lacks joint 'pitch' of one" in capsys.readouterr().err
     assert "--joints shoulder=roll" in told
     assert not (bench / "bag.h5").exists()
     (bench / "run.yaml").write_text("kept: true\n")

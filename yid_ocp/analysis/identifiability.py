@@ -293,7 +293,7 @@ class _Sensitivities:
 
     @property
     def alone(self) -> Array:
-        """Norm (p,) of the sensitivity to relative changes if everything else is known."""
+        """Norms (p,) of the whitened sensitivities to relative changes of each parameter, all else being known."""
         return np.linalg.norm(self.by_alone, axis=0)
 
     def unit(self, name: str) -> str:

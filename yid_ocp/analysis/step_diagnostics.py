@@ -196,7 +196,7 @@ class SparsityPattern:
 
     @property
     def n_nonzeros(self) -> int:
-        """Number of structural nonzeros."""
+        """Number of entries of the matrix that can be nonzero."""
         return int(np.count_nonzero(self.nonzero_mask))
 
 

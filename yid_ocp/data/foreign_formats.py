@@ -117,7 +117,6 @@ def _spelled_meaning(column: str) -> ColumnMeaning:
 _Rows = Iterable[tuple[int, list[str]]]
 _VICON_SECTIONS = ("Trajectories", "Devices", "Model Outputs", "Joints", "Segments")
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
-_ALLOWED = "an export with its header as the program writes it"
 
 
 _MocapTable = tuple[PointGroup, str, tuple[str, ...]]
@@ -241,8 +240,8 @@ def _is_number(cell: str) -> bool:
 
 
 def _broken(where: str, allowed: str) -> DataError:
-    what = "the motion capture export cannot be understood"
-    return DataError(what, where=where, allowed=f"{_ALLOWED}: {allowed}", hint="export it again with its header")
+    what = "the motion capture export is not as the program writes it"
+    return DataError(what, where=where, allowed=allowed, hint="export it again, with its header, and do not edit it")
 
 
 OTHER_JOINT_MESSAGE_TYPES = (

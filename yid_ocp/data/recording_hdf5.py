@@ -143,12 +143,13 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             required = ("names", "sensor", "frame")
             own = _read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
             points.append(PointGroup(name, sensor_name=own.pop("sensor"), camera_pose=own.pop("pose", None), **own))
-    truth = _json(texts["truth"] or "{}", f"{origin}, attribute truth")
     where, allowed = f"{origin}, attribute truth", '{"name": number, ...}'
+    truth = _json(texts["truth"] or "{}", where, allowed)
     raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object", where, allowed)
-    notes = _json(texts["notes"] or "[]", f"{origin}, attribute notes")
+    where, allowed = f"{origin}, attribute notes", '["sentence", ...]'
+    notes = _json(texts["notes"] or "[]", where, allowed)
     good = isinstance(notes, list) and all(isinstance(note, str) for note in notes)
-    raise_data_error_unless(good, "the JSON is not a list of text", f"{origin}, attribute notes", '["sentence", ...]')
+    raise_data_error_unless(good, "the JSON is not a list of text", where, allowed)
     said = texts["description"], texts["source"], path.stem, digest, truth, straight, tuple(notes)
     return Recording(joints, tuple(points), *said, tuple(channels))
 
@@ -209,12 +210,11 @@ def _text(value: object, where: str) -> str:
     return str(value)
 
 
-def _json(text: str, where: str) -> Any:
+def _json(text: str, where: str, allowed: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        what, hint = "the text is not JSON", "correct the text, or delete the attribute"
-        raise DataError(what, where=where, allowed="an object or a list in JSON", hint=hint) from error
+        raise DataError("the text is not JSON", where=where, allowed=allowed, hint="correct or delete it") from error
 
 
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]

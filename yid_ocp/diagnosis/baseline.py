@@ -55,7 +55,7 @@ class _ParameterShift:
 
 @dataclass(frozen=True)
 class ParameterShiftsSinceBaseline:
-    """Comparison of a fit with baseline runs: their agreement, and the shift of every parameter."""
+    """Shift of every parameter from the baseline runs, and the agreement among these runs."""
 
     is_baseline_explained: bool  # whether the model explained the earlier runs' recordings
     between_runs_p_value: float  # of the differences between earlier runs; one for one run

@@ -74,9 +74,9 @@ def make_candidate_effects(
 
 
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Return the candidates except those that `names` lists as `kind` or `kind@location`.
+    """Return the candidate effects except those that `names` lists as `kind` or `kind@location`.
 
-    Excluded candidates stay in the compiled step at their neutral values, so nothing is recompiled. Raises
+    Excluded candidates stay in the compiled step, at values without effect, so nothing is recompiled. Raises
     `ConfigError` if a name is not a candidate, or if no candidate is left.
     """
     where = "diagnosis.excluded_candidates"
@@ -219,7 +219,7 @@ class AllCandidatesProblem:
         return self if own is None else replace(self, problem=own, functions_of_place=None)
 
     def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
-        """Estimation problem with the nominal parameters and those of `effects` free."""
+        """Estimation problem in which the nominal model's free parameters and all those of `effects` are free."""
         own = (name for effect in effects for name in effect.parameters.names)
         return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameter_names, *own))
 

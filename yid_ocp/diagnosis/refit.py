@@ -282,7 +282,7 @@ def _evaluated(
 
 
 def evaluate_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
-    """A refit with its problem and evaluation in the step of all candidates; its estimates and predictions are kept."""
+    """Evaluate a refit again, at its estimates, in the step of all candidates. Its other results are kept."""
     if fit.problem.step is problem.problem.step:
         return fit
     own, finish = _evaluated(problem, fit.effects, fit.values)

@@ -27,7 +27,7 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 
 @dataclass(frozen=True)
-class FilterStateTransition:
+class StateTransition:
     """Linear state transition of a filter: s' = M (s, sum of the parameter groups p_i), p' = f p."""
 
     state_rows: Array  # M, shape (ns, ns + m)
@@ -66,7 +66,7 @@ class KalmanStepMatrices:
     observation: Array  # H, shape (r, nx)
     whitening: Array  # S^(-1/2), shape (r, r)
     projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
-    transition: FilterStateTransition
+    transition: StateTransition
 
     def normalized_innovations_and_final_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
         """Normalized innovations of `measured` (r, c), and the state means (nx, c) after the step."""
@@ -93,7 +93,7 @@ class KalmanStepMatrices:
 
 
 def kalman_matrices_and_next_covariance(
-    covariance: Array, observation: Array, transition: FilterStateTransition
+    covariance: Array, observation: Array, transition: StateTransition
 ) -> tuple[KalmanStepMatrices, Array, float]:
     """Compute a filter step's gains, the next state covariance without process noise, and log det S.
 
@@ -139,9 +139,9 @@ class KalmanSteps:
         return [slice(*ends) for ends in pairwise(self.row_start)]
 
     @property
-    def _transitions(self) -> list[FilterStateTransition]:
+    def _transitions(self) -> list[StateTransition]:
         known = self.moves.shape[2] - self.noises
-        return [FilterStateTransition(move[:, :known], own) for move, own in zip(self.moves, self.decay, strict=True)]
+        return [StateTransition(move[:, :known], own) for move, own in zip(self.moves, self.decay, strict=True)]
 
     def _single_steps(self) -> list[tuple[slice, KalmanStepMatrices]]:
         roots = np.split(self.whitening, np.cumsum([(span.stop - span.start) ** 2 for span in self._spans])[:-1])

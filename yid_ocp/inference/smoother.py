@@ -27,7 +27,7 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import FilterStateTransition, KalmanStepMatrices, kalman_matrices_and_next_covariance
+from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, kalman_matrices_and_next_covariance
 from yid_ocp.inference.smoother_model import (
     LinearResidualModel,
     SmoothedUnknownGroup,
@@ -123,13 +123,13 @@ class _Filtered:
     updates: Sequence[_Update]
 
     @cached_property
-    def error_steps(self) -> Sequence[tuple[Array, Array, Array, FilterStateTransition]]:
+    def error_steps(self) -> Sequence[tuple[Array, Array, Array, StateTransition]]:
         """Of each interval: whitened observation; that of states and unknowns with variance, their gain and motion."""
         found, ns = [], len(self.model.initial_state_std)
         kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(self.updates[0].p)[ns:] > 0)])
         for step in (update.step for update in self.updates):
             move, shaped = step.transition, step.whitening @ step.observation
-            follow = FilterStateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
+            follow = StateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
             found.append((shaped, shaped[:, kept], step.projected_covariance[:, kept].T.copy(), follow))
         return found
 
@@ -162,7 +162,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         design = np.hstack([interval.state_jacobian, interval.unknown_jacobian[:, used]])
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
-        transition = FilterStateTransition(move, np.full(nd, model.interval_correlation))
+        transition = StateTransition(move, np.full(nd, model.interval_correlation))
         step, later, own = kalman_matrices_and_next_covariance(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, begin, products, math.inf, ())

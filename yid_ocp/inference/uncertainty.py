@@ -112,8 +112,8 @@ def assess_goodness_of_fit(
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
     """Covariance of the unknowns (nx, nx) from data and stated priors, and chi2 per degree of freedom.
 
-    Directions without information in the data get the variance (1e8 x scale)^2 instead of an infinite variance. The
-    standard deviation of a prior is never scaled below its stated value, even if other stated values are too large.
+    A direction without information gets the std 1e8 x the unknown's scale. The covariance is scaled by max(1, chi2);
+    a prior counts at least with its stated std, also if stated ones were scaled down (`stated_std_factor` below 1).
     """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan

@@ -172,7 +172,7 @@ def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[st
 
 @dataclass(frozen=True)
 class StepSparsityTables:
-    """Index tables of a step's Jacobians, valid at every state."""
+    """Index tables of the sparse Jacobians of a step and of their elimination, valid at every state."""
 
     unknown_rows: _Indices  # full row (balance, internal, constraint) of each unknown (free q1, z1, lam), (ny,)
     elimination_order: _Indices  # internal coordinates, tips before roots, multipliers last, (ny,)

@@ -137,7 +137,7 @@ class _March:
                 _answer(group)
 
     def abandon(self) -> None:
-        """End all items that wait, now or later."""
+        """End all items that wait for answers, and those that ask later, by an exception `_Abandoned` in each."""
         with self.changed:
             self.abandoned = True
             for request in self.waiting:

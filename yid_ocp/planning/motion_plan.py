@@ -210,8 +210,8 @@ def _scenarios(
     """The same motion with parameters off by one std, along the axes that move the point's equilibrium most."""
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
-        what, where = "the uncertainty of the parameters is not known", "plan.minimize_parameter_sensitivity"
-        raise ConfigError(what, where=where, allowed="plan.parameter_run_folder: FOLDER of `solve`")
+        what, where = "no parameter uncertainty is known, but this needs it", "plan.minimize_parameter_sensitivity"
+        raise ConfigError(what, where=where, allowed="false, or with plan.parameter_run_folder: FOLDER of `solve`")
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
     slope = _point_slopes(rows, rows.quasi_static_coefficients, known)

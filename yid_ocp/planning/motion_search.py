@@ -156,7 +156,7 @@ class PlanResidualAndLimitFunctions:
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
     def worst_value_and_bound_by_violated_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
-        """For each violated kind of limit: name, value and bound of its worst row."""
+        """For each kind of limit that `value` violates: name, value and bound of the row that violates it most."""
         found = {}
         for rows, own in self.split_values_by_limit_kind(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit

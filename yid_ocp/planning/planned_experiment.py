@@ -301,7 +301,7 @@ class SplineMotionExperiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
-        """Finite differences (w.size, nr, columns) of the sensitivities by w; None if a rollout fails."""
+        """Derivatives (w.size, nr, columns) by w of sensitivities that are `rows` at w; None if a rollout fails."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()

@@ -261,7 +261,7 @@ class EpisodePredictor:
             return start.failure_message
         by_start = start.state_sensitivity
         inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, start.state, by_start, inputs)
-        feedback, driven = episode.tracking_feedback_about_smoothed_motion, self.system.actuated_coordinate_indices
+        feedback, driven = episode.tracking_feedback_to_smoothed_reference, self.system.actuated_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
@@ -426,7 +426,7 @@ class EpisodePredictor:
         lag = self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted)
         if lag is not None:
             lagged = FirstOrderLag(*lag, self.integrator_step.time_step)
-            by_effort, by_lag = lagged.lagged_node_values_adjoint(rollout.effort, by_effort)
+            by_effort, by_lag = lagged.lagged_node_values_gradients(rollout.effort, by_effort)
             total += by_lag
         feedback = episode.tracking_feedback
         if feedback is not None:

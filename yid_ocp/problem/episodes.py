@@ -26,7 +26,7 @@ from yid_ocp.problem.measurements import (
     TimeGrid,
     measurements_located_on_grid,
     measurements_with_paper_weights,
-    recording_time_grid,
+    rollout_time_grid,
 )
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
@@ -200,7 +200,7 @@ class Episode:
     equilibrium_guess: Array | None = None  # near the initial equilibrium, if that is not of least energy, (n,)
 
     @property
-    def tracking_feedback_about_smoothed_motion(self) -> TrackingFeedback | None:
+    def tracking_feedback_to_smoothed_reference(self) -> TrackingFeedback | None:
         """Tracking filter about the Kalman smoother's estimate, or unchanged if there is no such estimate."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
@@ -228,7 +228,7 @@ def prepare_episode(
     step, system = functions.step, functions.step.system
     efforts = options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
     recording = recording.with_effort_sampling_kind(efforts.effort_sampling_kind)
-    grid = recording_time_grid(recording, step.time_step, options.duration)
+    grid = rollout_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         what = "the arms of the model are driven, but the recording has no joints"
         where, hint = f"recording '{recording.name}'", "import the joints too, or set model.arms.mode: prescribed"

@@ -44,7 +44,7 @@ class TimeGrid:
         return node, position - node
 
 
-def recording_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
+def rollout_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
     """Make a time grid over the time span of the joint samples or, in a recording without joints, of the first group.
 
     Raises `DataError` if the span is shorter than two steps, or has more than `_MAX_STEPS` steps or too many steps per

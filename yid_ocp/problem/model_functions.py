@@ -200,7 +200,7 @@ class InputCorrectionFunctions:
     def sensor_delays_with_derivatives(
         self, sensor: Sensor, theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Recorded minus true time (k,) [s] of each sensor output, with derivatives. None without delays."""
+        """Recorded minus true time (k,) [s] of each output and its derivatives (k, d) by `names`; None if no delays."""
         return self._evaluate(self._sensor_delays(sensor), theta, names)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:

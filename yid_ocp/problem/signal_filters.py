@@ -178,7 +178,7 @@ class FirstOrderLag:
         total[:, :, :width] += self._by_time(value, followed)[:, :, None] * self.time_constant_sensitivity
         return followed, total
 
-    def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
+    def lagged_node_values_gradients(self, value: Array, pull: Array) -> tuple[Array, Array]:
         """Convert a cost's gradient by lagged node values to gradients by input and parameters (adjoint)."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)

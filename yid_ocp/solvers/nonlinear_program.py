@@ -279,7 +279,7 @@ class ProgramVectorLayout:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
     def append_block(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IntArray:
-        """Append a named block column by column. Returns its indices (rows, columns)."""
+        """Append a table column by column as a named block. Returns the vector index of each entry (rows, columns)."""
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table
         index = self.append_values(table.ravel(order="F")).reshape(table.shape, order="F")

@@ -45,7 +45,7 @@ def baxter_foam_y_system(arms: int) -> System:
     every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms.
     """
     if arms not in (1, 2):
-        raise ConfigError(f"arms = {arms}", where="arms", allowed="1 or 2")
+        raise ConfigError(f"there is no system with {arms} arms", where="arms", allowed="1 or 2", hint="choose 1 or 2")
     sides = ("left", "right")[:arms]
     names = [f"{side}_{joint}" for side in sides for joint in joint_motion.BAXTER_JOINT_NAMES_WITHOUT_SIDE]
     robot = read_urdf("package:baxter", joints=names)

@@ -183,7 +183,7 @@ def simulate_in_mujoco(
 
 @dataclass(frozen=True, eq=False)
 class MujocoModelAndState:
-    """A MuJoCo model with its state, and the ids of joints, moved joints and points."""
+    """A MuJoCo model and its state, with ids of all joints, of driven (else prescribed) joints and of points."""
 
     mujoco: ModuleType
     model: Any

@@ -202,7 +202,7 @@ class ArmSurface:
     def linearized_surface_distances(
         self, state: CalibrationState, frame: StampedCloud, reach: float, along: bool
     ) -> _CalibrationEquations:
-        """Distances of a frame's points from the arm's surface, linearised in the camera state."""
+        """Distances [m] of points within `reach` of the arm, linearised in the camera state; `along`: camera rays."""
         points, t = state.measured_to_world_points(frame.points), float(state.stamps_to_joint_clock(frame.stamp))
         met = self.match_points_to_surface(points, state.pose[:3, 3], t, reach, along)
         slope = np.empty((len(met.point_indices), CAMERA_STATE_SIZE))

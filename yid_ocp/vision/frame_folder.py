@@ -316,7 +316,7 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
     if not isinstance(coefficients, (list, tuple)) or not all(type(k) in (int, float) for k in coefficients):
-        raise DataError(f"the coefficients are {coefficients!r}", where=f"{where}: intrinsics", allowed="numbers")
+        raise DataError(f"the coefficients are {coefficients!r}", where=f"{where}: intrinsics", allowed="[number, ...]")
     model, distortion = str(entry.get("model", "plumb_bob")), tuple(float(k) for k in coefficients)
     return frames.CameraIntrinsics(int(width), int(height), fx, fy, cx, cy, model, distortion)
 

@@ -34,7 +34,7 @@ _PER_METRE = "/option/Depth_Units/value"  # topic of RealSense's files with the 
 
 def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str | None) -> FrameSequence:
     """Open the frames in a bag."""
-    camera = validated_camera_pose(pose, f"{path}: give track.camera_pose")
+    camera = validated_camera_pose(pose, str(path))
     bag, scale = OpenBag(path), metres_per_unit(unit, str(path))
     name = _topic(bag, topic)
     messages, stamps = _frames(bag, name)
@@ -111,7 +111,7 @@ def _topic(bag: OpenBag, wanted: str | None) -> str:
     clouds = bag.topic_names_of_types(_CLOUD_MESSAGE)
     usable = bag.topic_names_of_types(_CLOUD_MESSAGE, _IMAGE_MESSAGE)
     if wanted is not None:
-        bag.check_topic_is_among(wanted, usable, "clouds or depth images")
+        bag.check_topic_is_one_of(wanted, usable, "clouds or depth images")
         return wanted
     deep = [name for name in usable if name in clouds or _is_depth(bag, name)]
     if len(deep) == 1:

@@ -209,7 +209,7 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
     """Camera pose (4, 4) after checks. Raises `DataError` if it is missing or not a rigid transform."""
     allowed = "a 4x4 matrix from camera to world coordinates: x right, y down, z forward, translation in metres"
-    hint = "set track.camera_pose, or `pose` in camera.json"
+    hint = "set track.camera_pose, or, for a folder of frames, `pose` in its camera.json"
     if pose is None:
         raise DataError("the pose of the camera is missing", where=where, allowed=allowed, hint=hint)
     try:

@@ -150,8 +150,7 @@ class FrameTracker:
         self._check_clock(usable)
         if options.filters.object_colours and sequence.load_colours is None:
             hint = "leave track.options.filters.object_colours out, or record clouds with colours"
-            allowed = "clouds with colours"
-            raise DataError("the clouds have no colours", where=sequence.source, allowed=allowed, hint=hint)
+            raise DataError("the clouds have no colours", where=sequence.source, allowed="coloured clouds", hint=hint)
         self._asked = _spread(usable, _MAX_SIZED_FRAMES)
         self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
@@ -252,14 +251,15 @@ class FrameTracker:
     @staticmethod
     def _finite(sequence: FrameSequence, index: int) -> tuple[Array, BoolArray]:
         """A frame's finite points in the camera's frame, and their indices among all its points."""
-        points = sequence.load_cloud(index)
+        points, where = sequence.load_cloud(index), f"{sequence.source}: {sequence.frame_names[index]}"
         finite: BoolArray = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points if finite.all() else points[finite]
         if not len(points):
-            raise DataError("the cloud is empty")
+            raise DataError("the cloud has no finite points", where=where, allowed="finite points", hint="leave it out")
         far = float(np.median(np.abs(points[:: 1 + len(points) // _DISTANCE_SAMPLE_POINTS]).max(axis=1)))
         if far > _MAX_DISTANCE:
-            raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
+            what = f"the cloud is not in metres: half of its points are {far:.0f} m away or more"
+            raise DataError(f"{what} (if in mm, set track.point_cloud_unit)", where=where, allowed="points in metres")
         return points, finite
 
     def _read(self, index: int, calibration: CameraCalibration) -> tuple[WeightedCloud, Array]:

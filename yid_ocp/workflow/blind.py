@@ -172,9 +172,9 @@ class _Proof:
         asked["slice"] = "/".join(map(str, self.part))
         if {key: said[key] for key in asked} != asked:
             holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
-            hint = "choose another --out, or the same configurations, --cases, --seed and --calibration"
-            what = f"the folder holds another ensemble ({holds})"
-            allowed = "a new folder, or the same ensemble to complete"
+            hint = "choose another --out, or the same configurations, --cases, --seed, --slice and --calibration"
+            what = f"the folder holds other cases ({holds}): other {', '.join(k for k in asked if said[k] != asked[k])}"
+            allowed = "a new folder, or one with the same cases to complete"
             raise OutputError(what, where=str(self.folder), allowed=allowed, hint=hint)
         tasks = []
         for entry in read_input_json(self.folder / "cases" / "cases.json"):

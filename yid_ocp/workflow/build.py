@@ -56,7 +56,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     robot = None
     if model.robot is not None:
         with add_setting_location_to_errors(run, "model", "arms", "joints"):
-            robot = read_urdf(model.robot, **urdf_reader_options(run))
+            robot = read_urdf(model.robot, **urdf_joint_and_link_options(run))
     joints = () if robot is None else robot.joint_names
     damping, of_object = _dampings(run, joints)
     item = model.object
@@ -100,7 +100,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     return _completed(run, system, link_division)
 
 
-def urdf_reader_options(run: RunSettings) -> dict[str, Any]:
+def urdf_joint_and_link_options(run: RunSettings) -> dict[str, Any]:
     """Options of `read_urdf` for the joints and links of the robot that a run uses."""
     arms = run.model.arms
     return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}

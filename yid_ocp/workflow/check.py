@@ -24,7 +24,7 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
-from yid_ocp.workflow.build import build_step, build_system, divided_joint_parameter_scale, urdf_reader_options
+from yid_ocp.workflow.build import build_step, build_system, divided_joint_parameter_scale, urdf_joint_and_link_options
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_grasp_gaps_at_start
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_settings_command
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
@@ -93,7 +93,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
     path = input_files_by_name(run)[run.model.robot] if run.model.robot is not None else None
     if path is not None and b"<mujoco" not in check_input_file(path).read_bytes():
         # Pinocchio reads the URDF file itself, without changes by settings or effects
-        read, gravity = urdf_reader_options(run), np.array(run.model.gravity, float)
+        read, gravity = urdf_joint_and_link_options(run), np.array(run.model.gravity, float)
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:

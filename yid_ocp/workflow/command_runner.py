@@ -92,7 +92,7 @@ def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig 
 
 
 def print_json(result: Mapping[str, Any]) -> None:
-    """Print a result on standard output exactly as in its file."""
+    """Print a result on standard output, as the same JSON text as in a result file."""
     print(json.dumps(to_json_types(result), indent=1, allow_nan=False))
 
 

@@ -164,7 +164,7 @@ def propose_config_choices(
     joints = tuple(tree.joint_names[j] for j in sorted(needed)) if branches else tree.joint_names
     for other in recordings:
         for name in (name for name in joints if name not in other.joint_names):
-            what, hint = f"joint '{name}' of {first.name} is not recorded", "record it too, or leave the recording out"
+            what, hint = f"the recording lacks joint '{name}' of {first.name}", "record it, or leave this recording out"
             raise ConfigError(what, where=other.name, allowed=f"the joints {', '.join(joints)}", hint=hint)
     mode, why = _mode(first, recorded, bool(held), has_object=bool(branches))
     moving = ""

@@ -329,7 +329,7 @@ def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     with open_hdf5_after_read_check(source) as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:
-            allowed, hint = ", ".join(_PREDICTION_TOPICS), "run the command again with this version"
+            allowed, hint = ", ".join(_PREDICTION_TOPICS), "run `solve` or `diagnose` again with this version"
             raise DataError(f"the trajectories have the format '{form}'", where=str(source), allowed=allowed, hint=hint)
         for name, signals in _recordings(file, form).items():
             files.append(Path(out) / f"{name}.mcap")

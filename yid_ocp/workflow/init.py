@@ -40,8 +40,8 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     """Run the command `init` and return its exit code."""
     out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):
-        hint = f"write --out {out.stem}.yaml"
-        raise ConfigError(f"the file name is '{out.name}'", where="--out", allowed="NAME.yaml", hint=hint)
+        hint = f"write --out {out.parent / (out.stem + '.yaml')}"
+        raise ConfigError(f"the file name is '{out.name}'", where="--out", allowed="NAME.yaml or NAME.yml", hint=hint)
     read_urdf(robot)
     item = _object_from_arguments(arguments)
     with stderr_progress_display(arguments) as progress:

@@ -22,7 +22,7 @@ from yid_ocp.files import attributes_to_dict
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, TargetMotionPlan, plan_motion_to_target
-from yid_ocp.problem.measurements import recording_time_grid
+from yid_ocp.problem.measurements import rollout_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes, select_path_cutoff
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
@@ -93,7 +93,7 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
         return run.plan.start_joint_positions
     [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system
     clamps = () if cable is None else cable.clamp_pose_definitions_from_points
-    grid = recording_time_grid(recording, step.time_step, run.problem.duration)
+    grid = rollout_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
         low_pass = LowPassFilter(run.problem.path_cutoff or select_path_cutoff([recording], system.prescribed))
         path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, clamps)

@@ -60,7 +60,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
 
 
 def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
-    """Make lines to copy from an estimate, for the identifiable parameters. Empty if there are none.
+    """Make texts to copy, such as YAML lines, from estimates of identifiable parameters. Empty if there are none.
 
     The result holds `values` with total standard deviations, `joints` (number of links and range of joint stiffness [N
     m/rad], per segment and deformation), lines of `yaml` and `mjcf`, rows of `latex`, the command that exports the

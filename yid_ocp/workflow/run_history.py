@@ -171,7 +171,7 @@ def require_comparable_runs(folders: Sequence[Path]) -> None:
         if differing := _difference(known[0][1], settings):
             what = f"the runs are of different models: model.{differing} differs"
             allowed = f"{_SAME_MODEL} as in {known[0][0]}"
-            hint = "to compare two models, give two runs of the same recordings, which are overlaid"
+            hint = "give runs of one model; to compare two models, give two runs of the same recordings"
             raise ConfigError(what, where=str(folder / "config.yaml"), allowed=allowed, hint=hint)
 
 
@@ -198,7 +198,7 @@ def _settings(folder: str | Path) -> RunSettings | None:
 
 
 def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
-    """Settings with a baseline's effects at their estimated values. Parameters estimated in the baseline are free."""
+    """Add the effects of the baseline `runs` at their estimated values, with their estimated parameters free."""
     if not runs:
         return run
     known, _, _ = pool_estimates_and_chi2(runs)

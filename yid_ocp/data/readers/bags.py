@@ -106,7 +106,7 @@ class OpenBag:
         """Names of the bag's topics with one of the given message types."""
         return [topic.name for topic in self.topics if topic.kind in kinds]
 
-    def check_topic_is_among(self, name: str, known: Sequence[str], noun: str) -> None:
+    def check_topic_is_one_of(self, name: str, known: Sequence[str], noun: str) -> None:
         """Raise `DataError` if the topic `name` is not among `known`. `noun` names the content of these topics."""
         if name not in known:
             what = f"there are no {noun} on the topic '{name}'"
@@ -186,7 +186,7 @@ def read_bag(
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
     if distance is not None and not 0 < distance < float("inf"):
-        what, allowed = f"pose_axis_point_distance is {distance:g} m", "a distance above 0 [m]"
+        what, allowed = f"pose_axis_point_distance is {distance:g} m", "a finite distance above 0 [m]"
         raise DataError(what, where=f"--pose-axis-point-distance, for {path}", allowed=allowed)
     bag = _contents(path, tuple(at for at in options.point_names or () if ":" in at), progress, options.message_fields)
     groups, notes = _joints(bag, options, str(path))
@@ -296,7 +296,7 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
     topics = sorted({topic for topic, _, _ in split.values()})
     where, allowed = str(bag.path), "CHANNEL=/TOPIC.FIELD, of one topic, position among them"
     for channel, (topic, _, path) in split.items():
-        bag.check_topic_is_among(topic, [known.name for known in bag.topics], "messages")
+        bag.check_topic_is_one_of(topic, [known.name for known in bag.topics], "messages")
         if not path:
             hint = f"write --field {channel}={topic}.FIELD"
             raise DataError(f"the field of '{channel}' has no name", where=where, allowed=allowed, hint=hint)
@@ -398,7 +398,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
     default = [bag.topic_of_fields] if bag.topic_of_fields else _default_joint_topics(bag.file)
     known = list(dict.fromkeys([*known, *default]))
     for topic in (*(topics or ()), *((command,) if command else ())):
-        bag.file.check_topic_is_among(topic, known, "joint states")
+        bag.file.check_topic_is_one_of(topic, known, "joint states")
     chosen = [topic for topic in (default if topics is None else topics) if topic != command]
     wanted = None if options.joints is None else base.parse_old_to_new_names(options.joints, "joint", where)
     found, notes = [], []
@@ -511,7 +511,7 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
     known = [*present, *(f"{tree}:FRAME" for tree in bag.file.topic_names_of_types(*_TREES))]
     for source in () if points is None else names:
         if source not in present:
-            bag.file.check_topic_is_among(source, known, "points")
+            bag.file.check_topic_is_one_of(source, known, "points")
     base.check_unique_point_names(names, where)
     groups: _MessagesByFrame = {}
     for message in bag.places:

@@ -97,8 +97,8 @@ def si_factors(units: Mapping[str, str], where: str) -> dict[str, float]:
     factors = dict.fromkeys(_QUANTITIES, 1.0)
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
-            what = f"the quantity '{quantity}' of a unit is unknown"
-            raise DataError(what, where=where, **unknown_name_error_arguments(quantity, _QUANTITIES))
+            what = f"a unit is given for '{quantity}', which is not the name of a quantity"
+            raise DataError(what, where=f"--units, for {where}", **unknown_name_error_arguments(quantity, _QUANTITIES))
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
             what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
@@ -185,9 +185,9 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
     names = list(chosen.values())
     shared = [source for source, name in chosen.items() if names.count(name) > 1]
     if shared:
-        what = f"{', '.join(shared)} give points of the same name"
-        hint = "name them: --points " + ",".join(f"{source}=NAME{i + 1}" for i, source in enumerate(shared[:4]))
-        raise DataError(what, where=where, allowed="a name of its own for each point", hint=hint)
+        what = f"points of the same name: {', '.join(f'{source} as {chosen[source]}' for source in shared)}"
+        hint = ",".join(f"{source}=NAME{i + 1}" for i, source in enumerate(shared[:4])) + ",..." * (len(shared) > 4)
+        raise DataError(what, where=where, allowed="a name of its own for each", hint=f"name them: --points {hint}")
 
 
 def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, where: str) -> Array:

@@ -84,7 +84,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     if (capture := _mocap_table(path)) is not None:
         if options.column_meanings:
             what = "this is a motion capture export, whose header names its columns"
-            allowed, hint = "motion capture exports without --columns", "choose markers with --points MARKER=POINT"
+            allowed, hint = "exports without --columns", "leave --columns out; choose markers: --points MARKER=POINT"
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         seen, unit, remarks = capture
         sensor = seen.sensor_name if options.point_sensor_name == "unknown" else options.point_sensor_name

@@ -69,7 +69,7 @@ class CableTopology:
     def __post_init__(self) -> None:
         free = self.main_branch_vertex_names[2:-2]
         if not free:
-            what = f"the parent has {len(self.main_branch_vertex_names)} vertices"
+            what = f"the main branch has {len(self.main_branch_vertex_names)} vertices"
             allowed, hint = "5 or more: two are held at each end", "add vertices between the ends"
             raise ModelError(what, where="cable: main_branch_vertex_names", allowed=allowed, hint=hint)
         for name, vertices in self.child_branch_vertex_names.items():
