@@ -20,7 +20,7 @@ HEAD = """\
 
 This page lists every key of a configuration file. NAME is a name of yours or of the model. Units are SI, in brackets.
 `needed` keys have no default; an empty default is `null`. Any key can be set on the command line, as in
-`--set problem.time_step=0.005`. A section merges with the existing one, key by key, and an empty one clears it. How to
+`--set problem.time_step=0.005`. With `--set`, a section changes only the keys that it names, and `{}` clears it. How to
 choose links, time step and split: [choosing.md](../howto/choosing.md). Recordings and their units:
 [recordings.md](recordings.md). This page is generated from the code; CONTRIBUTING.md has the command.
 """

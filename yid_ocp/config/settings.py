@@ -53,8 +53,8 @@ class _FrameSettings(MountSettings):
     use_recorded_straight_position: Annotated[
         bool,
         OptionInfo(
-            "whether its position is that of the point of this name in the dataset `straight` of each recording, "
-            "instead of xyz; for markers on an object whose root is fixed in the world"
+            "whether recordings give its position, instead of xyz: the point of this name in their dataset `straight` "
+            "(see recordings.md); for markers on an object whose root is fixed in the world"
         ),
     ] = False
     position_std: Annotated[
@@ -70,7 +70,7 @@ class GraspSettings:
 
     holder_frame: Annotated[str, OptionInfo("frame of the robot")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
-    kind: Annotated[_GraspKind, OptionInfo("point, axis (and z axes) or weld (and orientation)")] = "point"
+    kind: Annotated[_GraspKind, OptionInfo("point (position), axis (plus z axis) or weld (plus orientation)")] = "point"
     held_frame_rpy: Annotated[_Vector3, OptionInfo("orientation in holder_frame", "rad")] = (0.0, 0.0, 0.0)
 
 
@@ -89,7 +89,7 @@ class EffectSettings:
 
     kind: Annotated[str, OptionInfo("kind of effect: kelvin_voigt, joint_coulomb, ..., or law")]
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
-    values: Annotated[Mapping[str, float], OptionInfo("parameters that are not neutral")] = field(default_factory=dict)
+    values: Annotated[Mapping[str, float], OptionInfo("values; the others are neutral")] = field(default_factory=dict)
     depends_on: Annotated[TorqueLawQuantitiesName | None, OptionInfo("quantities on which a law depends")] = None
     law_csv: Annotated[_FilePath | None, OptionInfo("table of a law, in the format of a diagnosis' law.csv")] = None
 
@@ -102,9 +102,9 @@ class _JointActuationSettings:
     mode: Annotated[
         _ArmMode,
         OptionInfo(
-            "driven (by measured efforts), prescribed (by measured angles), servo (by position servos that follow "
-            "recorded commands) or passive; prescribed arms with a grasp and recorded torques become states that "
-            "their encoders correct"
+            "driven: measured efforts move the joints; prescribed: they move as measured; servo: position servos "
+            "follow recorded commands; passive: no drive. A prescribed arm with a grasp and recorded efforts is "
+            "simulated as a driven one, with its measured angles as data of the fit"
         ),
     ] = "driven"
     servo: Annotated[ServoModelOptions, OptionInfo("position servos of the mode servo")] = field(
@@ -135,8 +135,8 @@ class FrictionLawSettings:
     law: Annotated[
         FrictionLawName,
         OptionInfo(
-            "viscous; coulomb (and viscous); stribeck (more at low speed, and coulomb); presliding (Dahl, with "
-            "stiction); load (grows with the torque through the gear, and coulomb); load_stribeck (load and stribeck)"
+            "viscous; coulomb: also viscous; stribeck: coulomb, higher at low speed; presliding: Dahl's law, with "
+            "stiction; load: coulomb, and grows with the torque through the gear; load_stribeck: load and stribeck"
         ),
     ]
     joints: Annotated[_Names | None, OptionInfo("joints with this friction; default: all that move")] = None
@@ -179,15 +179,15 @@ class _ModelSettings:
     damping: Annotated[
         Annotated[float, Ge(0)] | Mapping[str, Annotated[float, Ge(0)]],
         OptionInfo(
-            "viscous damping of every coordinate, or by joint of the robot (default 0.05) and by the name `object`",
+            "viscous damping: one number for all, or one per robot joint (default 0.05) and one for all of `object`",
             "N m s/rad",
         ),
     ] = 0.05
     friction: Annotated[
-        FrictionLawSettings | None, OptionInfo("nominal friction law of the joints, with free amplitudes and damping")
+        FrictionLawSettings | None, OptionInfo("friction law of the joints; amplitudes and damping become free")
     ] = None
     gravity: Annotated[_Vector3, OptionInfo("gravity in the world frame", "m/s^2")] = (0.0, 0.0, -9.81)
-    measured_points: Annotated[_Names | None, OptionInfo("sensor frames such as T1:40%; default: segment tips")] = None
+    measured_points: Annotated[_Names | None, OptionInfo("measured frames; T1:40%: at 40 % of T1; else tips")] = None
     bodies_missing_from_urdf: Annotated[
         tuple[ExtraMesh, ...],
         OptionInfo("bodies that a camera sees and the URDF lacks, such as a table; `track` removes their points"),
@@ -276,7 +276,7 @@ class ProblemSettings(ProblemOptions):
     ] = 0.01
     force_split: Annotated[ForceSplit, OptionInfo("split of a step's forces; left: Caldwell et al.")] = "symmetric"
     constraint_force_at: Annotated[
-        ConstraintForcePlacement, OptionInfo("where grasp forces act; node: Caldwell et al.")
+        ConstraintForcePlacement, OptionInfo("where in a step grasp forces act; node: Caldwell et al.")
     ] = "midpoint"
     use_compiler: Annotated[bool, OptionInfo("whether to compile the step if there is a C compiler")] = True
 
@@ -411,7 +411,7 @@ class OutputSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """Settings of one run: all sections of its configuration file."""
+    """All sections of a configuration file. A section in --set changes only the keys it names; {} clears a section."""
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
     plugins: Annotated[

@@ -38,22 +38,22 @@ class Thresholds:
     n_refit_per_round: Annotated[int, Ge(1), OptionInfo("number of candidates refitted per round")] = 6
     n_refit_pairs: Annotated[int, Ge(0), OptionInfo("pairs of candidates refitted if one effect leaves a gap")] = 4
     signature_overlap: Annotated[
-        float, Gt(0), Le(1), OptionInfo("fraction of a signature from which two candidates are confusable")
+        float, Gt(0), Le(1), OptionInfo("fraction of a signature that another candidate must explain to be confusable")
     ] = 0.9
     budget: Annotated[float | None, Gt(0), OptionInfo("time after which no further refit starts", "s")] = None
     # which effects are added
     max_effects: Annotated[int, Ge(1), Le(10), OptionInfo("largest number of added effects")] = 3
     min_z: Annotated[float, Ge(0), OptionInfo("standard deviations from neutral below which no effect is kept")] = 2.0
-    min_gap_closed: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of the held-out gap to be closed")] = 0.05
+    min_gap_closed: Annotated[float, Ge(0), Lt(1), OptionInfo("least closure that an added effect must reach")] = 0.05
     prior_range_margin_in_widths: Annotated[
-        float, Ge(0), OptionInfo("excess allowed beyond the range: in widths, or a factor of 1 + this")
+        float, Ge(0), OptionInfo("how far a value may leave its usual range: in widths, or a factor of 1 + this")
     ] = 1.0
     transfer_rtol: Annotated[
         float, Ge(0), OptionInfo("relative difference by which an effect may differ on held-out recordings")
     ] = 0.3
-    always_allowed_transfer_z: Annotated[float, Gt(0), OptionInfo("difference that is always allowed [stds]")] = 4.5
+    always_allowed_transfer_z: Annotated[float, Gt(0), OptionInfo("allowed difference in standard deviations")] = 4.5
     min_explained_fraction: Annotated[
-        float, Ge(0), Le(1), OptionInfo("fraction of the gap that an effect must explain")
+        float, Ge(0), Le(1), OptionInfo("explained fraction or closure that one effect must reach")
     ] = 0.75
     # where the gap lies, and when
     max_event_duration: Annotated[float, Gt(0), OptionInfo("largest duration of an event", "s")] = 1.0

@@ -106,9 +106,9 @@ class MotorModelOptions:
     kind: Annotated[
         _MotorKind,
         OptionInfo(
-            "ideal: torque = clip(gain error - damping speed); dc: torque = clip(gain error) - damping speed, with "
-            "the limit of the duty cycle and the back-EMF as damping; the gain is per unit of the firmware's gain if "
-            "recordings state it (`proportional_gain`)"
+            "ideal: torque = clip(gain * error - damping * speed); dc: torque = clip(gain * error) - damping * speed: "
+            "the duty cycle limits the first term, and the back-EMF is the damping. If recordings state the gain of "
+            "the firmware (`proportional_gain`), gain is per unit of it. See dc_motor.md"
         ),
     ] = "ideal"
     preset: Annotated[_MotorPreset | None, OptionInfo("dc motor with published initial values and priors")] = None
@@ -144,9 +144,9 @@ class ServoModelOptions:
         tuple[_FirmwareTerm, ...],
         OptionInfo(
             "further terms of the firmware, with parameters that start at zero: integral (JOINT.servo_integral: time "
-            "integral of the error from the start of the recording), derivative (JOINT.servo_derivative: torque "
-            "against the speed within the duty limit of a dc motor), dead_band (JOINT.servo_dead_band: smaller errors "
-            "are ignored)"
+            "integral of the error from the start of the recording), derivative (JOINT.servo_derivative, kind dc: a "
+            "damping inside clip; JOINT.servo_damping is outside), dead_band (JOINT.servo_dead_band: smaller errors "
+            "are ignored); see dc_motor.md"
         ),
     ] = ()
 

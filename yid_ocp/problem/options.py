@@ -100,8 +100,8 @@ class ProblemOptions:
     initial_state: Annotated[
         _InitialStateKind,
         OptionInfo(
-            "equilibrium at the first posture; estimated: with a free offset that has a prior; fitted to the first "
-            "points"
+            "equilibrium at the first posture; estimated: the equilibrium plus a free offset with a prior; "
+            "fitted_to_points: fitted to the first measured points"
         ),
     ] = "equilibrium"
     arm_tracking_feedback: Annotated[
@@ -122,7 +122,7 @@ class ProblemOptions:
         float,
         Ge(0),
         OptionInfo(
-            "low-pass cutoff of prescribed paths and of compared efforts; 0: the lowest, from 10 Hz in octaves, above "
+            "low-pass cutoff of prescribed paths and of compared efforts; 0: the lowest of 10, 20, 40 Hz, ... above "
             "which recorded angles are noise",
             "Hz",
         ),
@@ -137,8 +137,8 @@ class ProblemOptions:
         float,
         Ge(0),
         OptionInfo(
-            "one standard deviation of the weak prior, as a factor; it keeps uninformed positive parameters without "
-            "a prior near their initial value; 0: none; weighting paper has none"
+            "one standard deviation of the weak prior, as a factor on the initial value (10: a tenth to ten times); it "
+            "holds positive parameters that neither recordings nor a prior determine; 0 or weighting paper: none"
         ),
     ] = 10.0
     initial_configuration_prior_std: Annotated[

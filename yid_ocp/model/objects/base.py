@@ -33,7 +33,7 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 class MountSettings:
     """Mount of an object: the parent frame and the pose of the object's root in it."""
 
-    parent_frame: Annotated[str | None, OptionInfo("frame of the root; default: the world")] = None
+    parent_frame: Annotated[str | None, OptionInfo("frame in which xyz and rpy are given; default: world")] = None
     xyz: Annotated[_Vector3, OptionInfo("position in the parent frame", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in the parent frame", "rad")] = (0.0, 0.0, 0.0)
 

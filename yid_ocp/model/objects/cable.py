@@ -69,7 +69,7 @@ class CableOptions:
     """
 
     branch_density_and_damping: Annotated[
-        Mapping[str, CableBranchRigidityAndDensity], OptionInfo("by branch, parent and children")
+        Mapping[str, CableBranchRigidityAndDensity], OptionInfo("by name of the branch; the main one is `parent`")
     ] = field(default_factory=dict)
     default_branch: CableBranchRigidityAndDensity = field(default_factory=CableBranchRigidityAndDensity)
     radius: Annotated[float, Gt(0), Le(1), OptionInfo("radius of the cylinders for the links' inertia", "m")] = 0.005
@@ -78,13 +78,13 @@ class CableOptions:
         OptionInfo("axis: the roll at the end clamp is free; weld: it is held at the parameter clamp_end.roll"),
     ] = "axis"
     has_edge_lengths_per_recording: Annotated[
-        bool, OptionInfo("whether every recording has its own edge lengths; every edge then has a length parameter")
+        bool, OptionInfo("whether every recording has its own distances of neighbouring points, as length parameters")
     ] = True
     shape_memory_fraction: Annotated[
         float | None,
         Ge(0),
         Le(1),
-        OptionInfo("fraction of the shape at the start of the recording in the rest shape; default: none"),
+        OptionInfo("fraction of the recording's first shape that the rest shape keeps; default: none"),
     ] = None
     has_rest_angle_parameters: Annotated[
         bool,
@@ -255,7 +255,7 @@ def _segments(
 @OBJECT_KINDS.register("cable")
 @dataclass(frozen=True, kw_only=True)
 class ClampedCable(CableOptions, ObjectBuilder):
-    """A branched cable held by clamps at two ends. The clamps follow measured points; recordings give edge lengths."""
+    """A cable (with branches or without) between two clamps that follow measured points, without a robot."""
 
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: cable": """\

@@ -167,7 +167,7 @@ def _branch(text: str, links: int) -> tuple[str, SegmentGeometrySettings]:
 @OBJECT_KINDS.register("segments")
 @dataclass(frozen=True, kw_only=True)
 class _SegmentedObject(MountedObjectBuilder):
-    """A flexible object built from segments, such as a beam or a tube with branches."""
+    """A flexible object built from segments (cable, beam, tube with branches), on a robot or fixed in the world."""
 
     default_link_refinement = True
     init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
