@@ -31,7 +31,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (
-    CableBranchRigidityAndDensity,
+    CableBranchRigidityAndLinearDensity,
     CableOptions,
     clamped_cable_system,
     parameters_from_edge_lengths,
@@ -51,7 +51,7 @@ TIME_STEP = 0.01  # [s]
 NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 to 0.20 mm) [m]
 MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
 GRAVITY = 9.81  # [m/s^2]
-BRANCH = CableBranchRigidityAndDensity(
+BRANCH = CableBranchRigidityAndLinearDensity(
     bend_rigidity=1.5e-3, twist_rigidity=1e-3, bend_damping=1e-3, has_separate_twist_damping=True
 )  # a guess
 OPTIONS = CableOptions(default_branch=BRANCH, shape_memory_fraction=0.5, has_rest_angle_parameters=True)

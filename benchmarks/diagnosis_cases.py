@@ -268,7 +268,7 @@ def run(name: str, seeds: Sequence[int], record: str = "") -> dict[str, str]:
         else "-",
         "chi2/n held out": f"{finding.nominal_held_out_test.chi2_per_dof:.3g}",
         "with the truth": "-" if math.isnan(best) else f"{best:.3g}",
-        "closure": f"{100 * finding.gap_closure.fraction:.0f} %" if finding.accepted_effects else "-",
+        "closure": f"{100 * finding.closure_by_selected_effects.fraction:.0f} %" if finding.accepted_effects else "-",
         "time": f"{seconds:.0f} s",
     }
 

@@ -77,7 +77,7 @@ def test_a_spring_is_found_at_a_wrist():
     assert finding.verdict in ("effect", "confusable")
     assert finding.accepted_effects[0].label == "joint_spring@right_w1"
     assert finding.gap_locations[0].location == "right_w1"
-    assert finding.gap_closure.fraction > 0.95
+    assert finding.closure_by_selected_effects.fraction > 0.95
     found = finding.final_model.effect_parameters_as_reported(finding.accepted_effects[0])
     assert found["stiffness"].value == pytest.approx(3.0, rel=0.05)
 

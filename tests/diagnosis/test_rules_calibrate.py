@@ -18,8 +18,8 @@ from yid_ocp.diagnosis.blind_scores import (
     _conformal_quantile,
     _recommended_settings,
     calibrate_thresholds,
-    permissive_thresholds,
     score_blind_case,
+    thresholds_accepting_best_candidate,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.virtual.injected import InjectedEffect
@@ -158,7 +158,7 @@ def test_cases_that_could_not_be_fitted_do_not_count() -> None:
 
 def test_every_rule_is_of_a_threshold() -> None:
     assert all(hasattr(Thresholds(), rule.setting) for rule in _CALIBRATION_RULES.values())
-    wide = permissive_thresholds(Thresholds(n_refit_per_round=3))
+    wide = thresholds_accepting_best_candidate(Thresholds(n_refit_per_round=3))
     assert wide.n_refit_per_round == 3
     assert wide.significance_level > 1 > Thresholds().significance_level
 

@@ -49,7 +49,7 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     back = (case.theta, plain, case.feedback, names, (np.ones_like(plain.state), None, None))
     assert poor.grants_needed(lambda: kernel.adjoint_gradient(*back)) == 1
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
-    assert poor.grants_needed(lambda: kernel.linearize_step_equations(*trajectory)) == 1
+    assert poor.grants_needed(lambda: kernel.step_residuals_and_jacobians(*trajectory)) == 1
     loads = np.zeros((sum(step.sizes[key] for key in ("n", "nz", "m")), 0)), np.zeros((step.sizes["n"], 0))
     mapped = case.theta, plain, case.feedback, np.zeros((*plain.torque.shape, 1)), loads
     assert poor.grants_needed(lambda: kernel.next_state_derivatives(*mapped)) == 1
@@ -194,7 +194,7 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
             assert rollout.status.is_converged, rollout.status.message
             cost = (np.ones_like(rollout.state), None, None)
             back = step.kernel.adjoint_gradient(theta, rollout, case.feedback, names, cost)
-            along = step.kernel.linearize_step_equations(
+            along = step.kernel.step_residuals_and_jacobians(
                 theta, rollout.state, rollout.multipliers, rollout.torque, names, True
             )
             found = [getattr(rollout, name) for name in GIVEN]

@@ -129,7 +129,7 @@ def first_correction(hard: Hard) -> float:
     after[list(hard.system.prescribed_coordinate_indices)] = path[1]
     sizes, unknown = step.sizes, step.model.index_tables.unknown_rows
     pair = np.stack([start, after])
-    found = step.kernel.linearize_step_equations(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
+    found = step.kernel.step_residuals_and_jacobians(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
     change = np.linalg.solve(found.residual_by_new[0][np.ix_(unknown, unknown)], found.residual[0][unknown])
     return float(np.max(np.abs(change[: len(unknown) - sizes["m"]])))
 

@@ -91,7 +91,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     s, step, names = case.step.sizes, case.step, case.step.system.parameters.names[::3]
     n, h = s["n"], step.time_step
     rollout = case.rollout()
-    exact = step.kernel.linearize_step_equations(
+    exact = step.kernel.step_residuals_and_jacobians(
         case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False
     )
     solved = exact.residual[:, step.model.index_tables.unknown_rows]
@@ -105,7 +105,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
     lam = rollout.multipliers + 0.01 * rng.normal(size=rollout.multipliers.shape)
     one, two = (
-        s.kernel.linearize_step_equations(case.theta, state, lam, case.torque, names, True)
+        s.kernel.step_residuals_and_jacobians(case.theta, state, lam, case.torque, names, True)
         for s in (step, case.interpreted_step)
     )
     for key in vars(one):
@@ -119,7 +119,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
 
     def at(epsilon):
         arguments = [value + epsilon * move for value, move in zip(values, moves, strict=True)]
-        return step.kernel.linearize_step_equations(*arguments, (), False)
+        return step.kernel.step_residuals_and_jacobians(*arguments, (), False)
 
     epsilon = 1e-6
     plus, minus = at(epsilon), at(-epsilon)

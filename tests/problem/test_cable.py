@@ -13,7 +13,7 @@ from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (
-    CableBranchRigidityAndDensity,
+    CableBranchRigidityAndLinearDensity,
     CableOptions,
     clamped_cable_system,
     parameters_from_edge_lengths,
@@ -94,7 +94,7 @@ def twin(cable, clamps):
     """The compiled step of a cable, and a recording made with it at known values, from rest."""
     t, held = clamps
     options = CableOptions(
-        default_branch=CableBranchRigidityAndDensity(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4),
+        default_branch=CableBranchRigidityAndLinearDensity(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4),
         has_edge_lengths_per_recording=False,
     )
     stub = as_recording(cable, t, held)

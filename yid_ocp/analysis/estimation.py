@@ -176,7 +176,7 @@ _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 
 @dataclass(frozen=True)
-class FitWithOrWithoutCableMemory:
+class CableMemoryChoice:
     """Chosen fit, with or without cable memory (`*.memory`). `message` is the reason, empty if there was no choice."""
 
     problem: EstimationProblem
@@ -189,7 +189,7 @@ def choose_cable_memory_fit(
     solver: Solver,
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-) -> FitWithOrWithoutCableMemory:
+) -> CableMemoryChoice:
     """Choose between the fit with and a refit without cable memory, if recordings start in motion.
 
     The load of a cable that moves at the start of a recording is unknown, and this motion can be mistaken for memory.
@@ -198,21 +198,21 @@ def choose_cable_memory_fit(
     """
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
-        return FitWithOrWithoutCableMemory(problem, solution)
+        return CableMemoryChoice(problem, solution)
     without = problem_without_cable_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
     other = solvers.solve(without, solver, without.unknown_vector(known).tolist(), limits=limits)
     if other.evaluation is None:
-        return FitWithOrWithoutCableMemory(problem, solution)
+        return CableMemoryChoice(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
         words = "memory is not kept: too few recordings start in motion to bear it out"
-        return FitWithOrWithoutCableMemory(without, other, words)
+        return CableMemoryChoice(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
     told = "recordings that start in motion, each predicted from the others, have the root mean square error"
     errors = f"{told} {kept:.3g} with it and {dropped:.3g} without, in standard deviations"
     if kept < dropped:
-        return FitWithOrWithoutCableMemory(problem, solution, f"memory is kept: {errors}")
-    return FitWithOrWithoutCableMemory(without, other, f"memory is not kept: {errors}")
+        return CableMemoryChoice(problem, solution, f"memory is kept: {errors}")
+    return CableMemoryChoice(without, other, f"memory is not kept: {errors}")
 
 
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:

@@ -176,7 +176,7 @@ def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: 
     step = problem.step
     n, none = step.sizes["n"], np.zeros((len(torque), 0))
     state = np.hstack([q, np.zeros((len(q), n))])
-    found = step.kernel.linearize_step_equations(theta, state, none, torque, (), False)
+    found = step.kernel.step_residuals_and_jacobians(theta, state, none, torque, (), False)
     return np.asarray((found.residual[1:, :n] + found.p1[:-1]) / step.time_step)
 
 

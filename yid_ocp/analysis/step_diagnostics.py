@@ -37,7 +37,7 @@ def linearise_step_equations(
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
-    return step.kernel.linearize_step_equations(
+    return step.kernel.step_residuals_and_jacobians(
         theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True
     )
 

@@ -21,10 +21,10 @@ from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
 from yid_ocp.diagnosis.refit import EffectSearchResults, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import (
-    AllCandidatesScoreModel,
     CandidateDetectability,
     CandidateScore,
     ConfusabilityMatrix,
+    LinearModelOfAllCandidates,
     ScreeningResult,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -299,7 +299,7 @@ _Statistics = Mapping[str, Any]
 _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
-def permissive_thresholds(limits: Thresholds) -> Thresholds:
+def thresholds_accepting_best_candidate(limits: Thresholds) -> Thresholds:
     """Return thresholds with which every residual is a gap and the best candidate is always accepted."""
     sure = 1.0 + 1e-9
     return replace(
@@ -536,7 +536,7 @@ class _RecordedCase:
         return ScreeningResult(seen, scores, ConfusabilityMatrix(tuple(data["labels"]), overlaps), _NO_JOINT_MODEL)
 
 
-_NO_JOINT_MODEL = AllCandidatesScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
+_NO_JOINT_MODEL = LinearModelOfAllCandidates((), (), np.zeros((0, 0)), np.zeros(0))
 
 
 def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBase:

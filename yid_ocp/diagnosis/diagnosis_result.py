@@ -172,7 +172,7 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
-        "closure_low": result.gap_closure.ci_low,
+        "closure_low": result.closure_by_selected_effects.ci_low,
         "explained": result.explained_fraction,
         # largest difference between estimation and held-out estimates [standard deviations]
         "carried": max((apart / std for apart, std in differences if std > 0), default=None),
@@ -328,7 +328,12 @@ def _places(result: DiagnosisResult) -> str:
 
 def _causes(result: DiagnosisResult) -> list[str]:
     """Sentences on the selected effects, and on why the verdict is unknown."""
-    added, total, limits, text = result.selected_effects, result.gap_closure, result.thresholds, list[str]()
+    added, total, limits, text = (
+        result.selected_effects,
+        result.closure_by_selected_effects,
+        result.thresholds,
+        list[str](),
+    )
     if added:
         names = " and ".join(_named(entry.effect, added[-1].refitted_model) for entry in added)
         verb, part = "closes" if len(added) == 1 else "together close", "no measurable part of it on held-out motions"

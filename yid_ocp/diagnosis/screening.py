@@ -283,7 +283,7 @@ ScoredCandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], flo
 
 
 @dataclass(frozen=True)
-class AllCandidatesScoreModel:
+class LinearModelOfAllCandidates:
     """Joint linear model of the residual in the amplitudes of all candidates, each at one shape value."""
 
     effects: tuple[EffectBase, ...]
@@ -317,7 +317,7 @@ class AllCandidatesScoreModel:
 
 def _make_joint_score_model(
     point: ProjectedCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
-) -> AllCandidatesScoreModel:
+) -> LinearModelOfAllCandidates:
     """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
     groups: dict[str, list[_EffectSignature]] = {}
@@ -329,10 +329,10 @@ def _make_joint_score_model(
     every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
     effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
     bias = np.concatenate([np.zeros(0), *(s.score_bias for s in kept)])
-    return AllCandidatesScoreModel(effects, shapes, every.T @ every, bias - every.T @ point.projected_residual)
+    return LinearModelOfAllCandidates(effects, shapes, every.T @ every, bias - every.T @ point.projected_residual)
 
 
-def _confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:
+def _confusability_matrix(everything: LinearModelOfAllCandidates) -> ConfusabilityMatrix:
     """Fractions of signatures that candidates explain of each other, with amplitudes scaled by prior range."""
     ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_parameter_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
@@ -355,11 +355,11 @@ class ScreeningResult:
     detectability: tuple[CandidateDetectability, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
-    joint_score_model: AllCandidatesScoreModel
+    joint_score_model: LinearModelOfAllCandidates
 
 
 EMPTY_SCREENING_RESULT = ScreeningResult(
-    (), (), ConfusabilityMatrix((), np.zeros((0, 0))), AllCandidatesScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
+    (), (), ConfusabilityMatrix((), np.zeros((0, 0))), LinearModelOfAllCandidates((), (), np.zeros((0, 0)), np.zeros(0))
 )
 """Screening where the model cannot be simulated: no candidate is known there."""
 

@@ -107,7 +107,7 @@ class Judgement:
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
 
     @property
-    def gap_closure(self) -> GapClosure:
+    def closure_by_selected_effects(self) -> GapClosure:
         """Closure of the whole gap by all selected effects."""
         return total_gap_closure(self.selected_effects)
 
@@ -150,7 +150,7 @@ class Judgement:
     @property
     def _largest_explained_fraction(self) -> float:
         """Explained fraction of the gap: fitted, or if larger the 95 % lower limit of the held-out closure."""
-        return max(self.explained_fraction, self.gap_closure.ci_low)
+        return max(self.explained_fraction, self.closure_by_selected_effects.ci_low)
 
     def required_total_explained_fraction(self, limits: Thresholds) -> float:
         """Smallest explained fraction of the gap at which the selected effects are accepted.

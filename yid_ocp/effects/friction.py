@@ -125,7 +125,7 @@ class _JointLoadFriction(_JointFriction):
         """Torque through the gear [N m]."""
         system, index = state.system, state.system.mechanism.joint_index(self.location)
         if self.location not in system.driven:  # its motor is assumed to balance the external torque
-            return -2 * system.weight_and_grasp_force_on_coordinate(state, index)
+            return -2 * system.gravity_and_grasp_force_on_coordinate(state, index)
         return system.gear_torque_on_coordinate(state, index)
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:

@@ -214,7 +214,7 @@ class CompiledKernel:
                 array[:] = np.nan
         return gradient
 
-    def linearize_step_equations(
+    def step_residuals_and_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepResidualsAndJacobians:
         """Evaluate step residuals along a trajectory in C, with their Jacobians if `derivatives` is set."""

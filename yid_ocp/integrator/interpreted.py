@@ -265,7 +265,7 @@ class InterpretedKernel:
         by_path[0] = costate[list(self._model.system.prescribed_coordinate_indices)]
         return RolloutCostGradient(by_theta, costate, by_torque, by_path)
 
-    def linearize_step_equations(
+    def step_residuals_and_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepResidualsAndJacobians:
         """Evaluate step residuals along a trajectory one by one, with their Jacobians if `derivatives` is set."""

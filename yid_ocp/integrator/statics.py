@@ -239,7 +239,7 @@ class EquilibriumSolver:
         none, u = np.zeros(n), hold.held + hold.stiffness * hold.give(q, system)
         driven = list(system.actuated_coordinate_indices)
         state = np.tile(np.concatenate([q, none, z]), (2, 1))
-        found = step.kernel.linearize_step_equations(theta, state, lam[None], u[None], names, True)
+        found = step.kernel.step_residuals_and_jacobians(theta, state, lam[None], u[None], names, True)
 
         def by_point(new: Array, old: Array, push: Array) -> Array:
             """By (q, z, lam), both nodes together and torques as they follow the angles."""

@@ -70,7 +70,7 @@ def lqr_tracking_feedback(
     # p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, (N + 1, nu), which starts from rest
     angles, pushes = np.vstack([reference[:1], reference]), np.vstack([torques[:1], torques])
     course = arm_theta, np.hstack([angles, np.zeros_like(angles)]), np.zeros((len(pushes), 0)), pushes
-    momenta = arm_step.kernel.linearize_step_equations(*course, (), False).p1
+    momenta = arm_step.kernel.step_residuals_and_jacobians(*course, (), False).p1
     steps = len(reference) - 1
 
     weight_q, weight_u = (np.eye(nu) * (1.0 / std**2) for std in (_ANGLE_STD, _TORQUE_STD))
@@ -117,7 +117,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
     none, own = np.zeros((2 * count - 1, 0)), slice(None, None, 2)
     try:
         for _ in range(NEWTON_ITERATION_LIMIT):
-            found = arm_step.kernel.linearize_step_equations(theta, state, none, torques, (), True)
+            found = arm_step.kernel.step_residuals_and_jacobians(theta, state, none, torques, (), True)
             change = np.linalg.solve(found.residual_by_new[own], found.residual[own, :, None])[:, :, 0]
             if not np.max(np.abs(change), initial=0.0) > arm_step.model.tolerance:
                 break

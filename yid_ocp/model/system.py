@@ -429,7 +429,7 @@ class System(ReprMixin):
             force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
 
-    def weight_and_grasp_force_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
+    def gravity_and_grasp_force_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
         """Generalized force [N m or N] at coordinate `index` from grasps and the weight of all bodies that it moves."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)
@@ -444,7 +444,7 @@ class System(ReprMixin):
 
     def gear_torque_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
         """Torque [N m or N] through the gear of a driven joint: input minus weight and grasps beyond."""
-        outside = self.weight_and_grasp_force_on_coordinate(state, index)
+        outside = self.gravity_and_grasp_force_on_coordinate(state, index)
         return self.input_force(state.u, state.q, state.v)[index] - outside
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:

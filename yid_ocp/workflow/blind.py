@@ -291,7 +291,7 @@ def _diagnose_case_from_recordings_task(
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
     found["evidence"] = evidence
     if experiment["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
-        wide = blind_scores.permissive_thresholds(run.diagnosis)
+        wide = blind_scores.thresholds_accepting_best_candidate(run.diagnosis)
         try:
             anything = blind.diagnose_blind_case(ensemble, case, candidates, wide)
             found["open"] = to_json_types(diagnosis_decision_statistics(anything))

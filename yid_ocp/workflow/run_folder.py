@@ -27,7 +27,7 @@ from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_tex
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
-from yid_ocp.workflow.run_inputs import input_files_by_name, plugin_versions
+from yid_ocp.workflow.run_inputs import input_files_by_name, installed_plugin_versions
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "yid-ocp.lock", 1000
@@ -319,4 +319,4 @@ def current_local_time_text() -> str:
 
 def software_and_plugin_versions() -> dict[str, str]:
     """Versions of Python, this package, its numerical dependencies, and packages whose plug-ins are in use."""
-    return installed_versions() | plugin_versions()
+    return installed_versions() | installed_plugin_versions()

@@ -53,7 +53,7 @@ def load_plugins(run: RunSettings) -> None:
             _loaded[name] = digest
 
 
-def plugin_versions() -> dict[str, str]:
+def installed_plugin_versions() -> dict[str, str]:
     """Return the package and version of each installed plugin (entry point group `yid_ocp.effects`)."""
     return {f"entry point {entry.name}": _distribution(entry) for entry in _installed()}
 

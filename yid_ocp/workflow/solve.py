@@ -69,7 +69,7 @@ run_from_arguments = make_settings_command(run_solve, "live")
 
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
-) -> estimation.FitWithOrWithoutCableMemory:
+) -> estimation.CableMemoryChoice:
     """Estimate with the run's solver, and choose between the fits with and without a cable's shape memory."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria

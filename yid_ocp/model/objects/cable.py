@@ -47,7 +47,7 @@ INITIAL_RMS_SPEED_PARAMETER = "start.speed"
 
 
 @dataclass(frozen=True)
-class CableBranchRigidityAndDensity:
+class CableBranchRigidityAndLinearDensity:
     """Nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
 
     bend_rigidity: float = 1.5e-3  # a configuration sets this and the next two under `parameters`
@@ -69,9 +69,9 @@ class CableOptions:
     """
 
     branch_density_and_damping: Annotated[
-        Mapping[str, CableBranchRigidityAndDensity], OptionInfo("by name of the branch; the main one is `parent`")
+        Mapping[str, CableBranchRigidityAndLinearDensity], OptionInfo("by name of the branch; the main one is `parent`")
     ] = field(default_factory=dict)
-    default_branch: CableBranchRigidityAndDensity = field(default_factory=CableBranchRigidityAndDensity)
+    default_branch: CableBranchRigidityAndLinearDensity = field(default_factory=CableBranchRigidityAndLinearDensity)
     radius: Annotated[float, Gt(0), Le(1), OptionInfo("radius of the cylinders for the links' inertia", "m")] = 0.005
     end_clamp_grasp_kind: Annotated[
         Literal["axis", "weld"],
