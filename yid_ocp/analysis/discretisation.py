@@ -36,7 +36,7 @@ _NORMAL_QUANTILE_95 = 1.96
 _EXTRAPOLATION_FACTOR = 2.0
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MAX_FINER_FIT_ITERATIONS, _MAX_LINEAR_CHANGE = 3, 10.0  # of r'r, below which a linear step decides
-_MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
+_MIN_STEPS_TO_COMPILE, _DERIVATIVE_COST = 2000, 0.25  # of a finer model; time of a step by one unknown over a step's
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 
 
@@ -102,9 +102,8 @@ def _gauss_newton_step_in_finer_model(
     """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns x (nx,).
 
     Also returns the linearised residual after the step, or a message if the step fails. Data, bounds and priors are
-    those of the coarse problem, with the evaluation `at_x`. With `model_difference_only`, for points other than an
-    estimate, the coarse prediction replaces the data. With process noise, weights and Jacobian are the coarse ones, and
-    only the residual is the finer model's (Richardson extrapolation), which saves a filter.
+    those of the coarse problem, evaluated in `at_x`. With `model_difference_only`, for points that are no estimate, the
+    coarse prediction replaces the data. With process noise, only the residual is the finer model's (Richardson).
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -160,9 +159,8 @@ def problem_without_error_of_links(
     """Subtract from all data, held-out ones included, what twice the links change in the predictions of a fit.
 
     `at_x` is the evaluation at the fit `x` (nx,), with Jacobian. If the change is much larger than the residual, a
-    linear step does not tell what a refit would leave, and the finer model is refitted first. Returns None if a refit
-    on the new data is not predicted to lower r'r by `min_chi2_decrease`, if the object cannot be divided, if torques
-    have noise, which moves the arms of both models apart, or if the finer model does not follow.
+    linear step tells nothing, and the finer model is refitted first. Returns None if a refit is not predicted to lower
+    r'r by `min_chi2_decrease`, if the object cannot be divided, if torques have noise, or if the finer model fails.
     """
     divided, segments = problem.options.divided_links_model, problem.system.segment_layouts
     if divided is None or not segments or problem.has_process_noise:
@@ -189,7 +187,7 @@ def problem_without_error_of_links(
         left = after - at_x.jacobian @ np.linalg.lstsq(at_x.jacobian, after, rcond=1e-10)[0]
         if not before @ before - left @ left > min_chi2_decrease:
             return None
-        finer = _refined_problem(problem, "links", [episode.recording for episode in problem.held_out]).problem
+        finer = _refined_problem(problem, "links", [e.recording for e in problem.held_out], finer.step).problem
         held_out = (own.predict_held_out(at) for own, at in ((problem, x), (finer, point)))
         others = [_with_data_shifted(e, one, other) for (e, one), (_, other) in zip(*held_out, strict=True)]
     except YidError:
@@ -305,15 +303,17 @@ def estimate_shifts_by_discretisation(
 
 
 def _refined_problem(
-    problem: EstimationProblem, what: RefinementKind, held_out: Sequence[Recording] = ()
+    problem: EstimationProblem, what: RefinementKind, held_out: Sequence[Recording] = (), step: Step | None = None
 ) -> _FinerDiscretisationProblem:
     options, fine = problem.options, problem.options.divided_links_model
     if what == "time_step" or fine is None:
         return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
     recordings = [episode.recording for episode in problem.episodes]
-    steps, factors = sum(e.grid.steps for e in problem.episodes), fine.parameter_factors
-    built = fine.build_step(problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE)
-    step = step_with_time_step(built, problem.step.time_step)
+    factors = fine.parameter_factors
+    if step is None:
+        work = sum(e.grid.steps for e in problem.episodes) * (1 + _DERIVATIVE_COST * len(problem.unknown_names))
+        built = fine.build_step(problem.step.is_compiled and work > _MIN_STEPS_TO_COMPILE)
+        step = step_with_time_step(built, problem.step.time_step)
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)

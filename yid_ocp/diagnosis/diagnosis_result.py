@@ -328,12 +328,8 @@ def _places(result: DiagnosisResult) -> str:
 
 def _causes(result: DiagnosisResult) -> list[str]:
     """Sentences on the selected effects, and on why the verdict is unknown."""
-    added, total, limits, text = (
-        result.selected_effects,
-        result.closure_by_selected_effects,
-        result.thresholds,
-        list[str](),
-    )
+    added, total = result.selected_effects, result.closure_by_selected_effects
+    limits, text = result.thresholds, list[str]()
     if added:
         names = " and ".join(_named(entry.effect, added[-1].refitted_model) for entry in added)
         verb, part = "closes" if len(added) == 1 else "together close", "no measurable part of it on held-out motions"

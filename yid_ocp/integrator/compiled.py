@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import (
     StepResidualsAndJacobians,
     TrackingFeedback,
     allocate_linearization,
-    allocate_nan_rollout,
+    allocate_rollout,
     attach_status_to_rollout,
     out_of_memory_error,
 )
@@ -174,7 +174,7 @@ class CompiledKernel:
         sizes = self._model.sizes
         outs, motions, trajectories, sensitivities = [], [], [], []
         for m in members:
-            out = allocate_nan_rollout(sizes, len(m.torque), None if m.directions is None else m.directions.count)
+            out = allocate_rollout(sizes, len(m.torque), None if m.directions is None else m.directions.count)
             out.state[0] = m.initial_state
             directions = None
             if m.directions is not None and out.state_sensitivity is not None:

@@ -27,7 +27,7 @@ from yid_ocp.integrator.step_model import (
     StepResidualsAndJacobians,
     TrackingFeedback,
     allocate_linearization,
-    allocate_nan_rollout,
+    allocate_rollout,
     attach_status_to_rollout,
 )
 from yid_ocp.parallel import CasadiLockedCache
@@ -135,7 +135,7 @@ class InterpretedKernel:
         theta, torque, path = inputs.theta, inputs.torque, inputs.prescribed_path
         feedback, wanted = inputs.feedback, inputs.directions
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
-        out = allocate_nan_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
+        out = allocate_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
         state, by = out.state, [getattr(out, f"{name}_sensitivity") for name in ("state", "multipliers", "effort")]
         state[0] = inputs.initial_state
         if wanted is not None:

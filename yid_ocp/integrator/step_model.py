@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any
@@ -242,14 +242,14 @@ class StepResidualsAndJacobians:
     p1_by_theta: Array
 
 
-def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
-    """Allocate a rollout of `steps` steps filled with NaN; `count` sensitivity directions (None: none)."""
+def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
+    """Allocate an empty rollout of `steps` steps; `count` sensitivity directions (None: none)."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
     names = [f"{name}_sensitivity" for name in ("state", "multipliers", "effort")]
     if count is not None:
         shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
-    arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
+    arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, np.empty)
     values: dict[str, Any] = dict.fromkeys(names) | arrays
     return Rollout(**values, status=RolloutStatus(NewtonStatusCode.OK, 0, 0.0, 0, 0))
 
@@ -263,12 +263,12 @@ def allocate_linearization(
     shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
     for name, columns in {"new": nt, "old": n + nz, "input": nu, "theta": width}.items():
         shapes |= {f"residual_by_{name}": (steps, nt, columns), f"p1_by_{name}": (steps, n, columns)}
-    return StepResidualsAndJacobians(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
+    return StepResidualsAndJacobians(**_arrays(f"the derivatives of {count} steps", shapes, np.zeros))
 
 
-def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> dict[str, Array]:
+def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], make: Callable[..., Array]) -> dict[str, Array]:
     try:
-        return {name: np.full(shape, value) if value else np.zeros(shape) for name, shape in shapes.items()}
+        return {name: make(shape) for name, shape in shapes.items()}
     except MemoryError as error:
         raise out_of_memory_error(what, 8 * sum(math.prod(shape) for shape in shapes.values())) from error
 
@@ -285,7 +285,11 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 def attach_status_to_rollout(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """Return a rollout with a `RolloutStatus`. `error` is the last correction, `counts` iterations, factorisations."""
+    """The rollout, NaN where it failed, with its status. `counts`: iterations, factorisations."""
+    if code != NewtonStatusCode.OK:
+        first_missing = {"state": step + 2, "state_sensitivity": step + 1}  # the last state that was tried is kept
+        for name in [name for name, array in vars(rollout).items() if isinstance(array, np.ndarray)]:
+            getattr(rollout, name)[first_missing.get(name, step) :] = np.nan
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
     return replace(rollout, status=RolloutStatus(NewtonStatusCode(code), step, error, *counts, last, inner))
