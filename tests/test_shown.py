@@ -60,11 +60,7 @@ def shown(urdf_folder):
     tube = flexible_object([FlexibleSegment("tube", length=0.4, mass=0.1, radius=0.01, links=2)])
     system, [seen_channel, *_] = step.system, solution.channel_measurements_and_predictions()
     things = [made, step, system, system.mechanism, system.parameters, tube, problem, solution, solution.evaluation]
-    things += [
-        seen_channel,
-        yid.identifiability(problem, solution),
-        NamedStepEquations.from_equations(step.equations),
-    ]
+    things += [seen_channel, yid.identifiability(problem, solution), NamedStepEquations.from_equations(step.equations)]
     return {type(thing).__name__: thing for thing in things}
 
 

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 from made_recordings import holding_pendulum
 
-from yid_ocp.analysis.step_diagnostics import (
-    linearise_step_equations,
-    step_sparsity_patterns,
-)
+from yid_ocp.analysis.step_diagnostics import linearise_step_equations, step_sparsity_patterns
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver

@@ -10,11 +10,7 @@ import numpy as np
 import pytest
 from held_rod import held_rod
 
-from yid_ocp.analysis.step_symbols import (
-    NamedStepEquations,
-    count_operations,
-    format_expressions,
-)
+from yid_ocp.analysis.step_symbols import NamedStepEquations, count_operations, format_expressions
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import Grasp

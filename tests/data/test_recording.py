@@ -132,10 +132,7 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
     "infinite effort": (lambda: with_joints(external_effort=changed(Q, (0, 0), np.inf)), "'external_effort' of joint"),
     "infinite point": (lambda: with_camera(position=changed(CAMERA.position, (0, 0, 0), np.inf)), "'w_T1' is .*inf"),
     "half seen": (lambda: with_camera(position=changed(CAMERA.position, (3, 1, 2), np.nan)), "'w_T2' is .*nan"),
-    "negative std": (
-        lambda: with_camera(std=changed(np.ones((4, 3, 3)), (0, 0, 0), -0.5)),
-        "that was seen is -0.5 m",
-    ),
+    "negative std": (lambda: with_camera(std=changed(np.ones((4, 3, 3)), (0, 0, 0), -0.5)), "that was seen is -0.5 m"),
     "NaN std": (lambda: with_camera(std=changed(np.ones((4, 3, 3)), (0, 0, 0), np.nan)), "that was seen is nan m"),
     "negative joint std": (lambda: with_joints(position_std=-1.0), "position_std is -1.0"),
     "NaN joint std": (lambda: with_joints(velocity_std=np.array([0.1, np.nan])), "velocity_std is"),

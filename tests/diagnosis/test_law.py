@@ -25,10 +25,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow.build import build_system
 
 JOINTS, DAMPING, NOISE = ("shoulder", "elbow"), 0.1, 0.02
-UNNAMED = {
-    "speed": lambda q, v: -0.3 * np.maximum(v, 0.0),
-    "angle": lambda q, v: 0.1 * np.sin(6.0 * q),
-}
+UNNAMED = {"speed": lambda q, v: -0.3 * np.maximum(v, 0.0), "angle": lambda q, v: 0.1 * np.sin(6.0 * q)}
 
 
 @pytest.fixture(scope="module")

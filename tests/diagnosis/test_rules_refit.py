@@ -368,8 +368,7 @@ def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting)
 
 
 @cases(
-    "known, start, solved",
-    {"a solution is there": (3.0, {"k": 3.0}, 0), "it is solved first": (None, {"k": 2.0}, 1)},
+    "known, start, solved", {"a solution is there": (3.0, {"k": 3.0}, 0), "it is solved first": (None, {"k": 2.0}, 1)}
 )
 def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, solved):
     def solution(value):

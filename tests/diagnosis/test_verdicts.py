@@ -1,5 +1,6 @@
 """One case of each verdict, the format of what comes out, and input that is refused."""
 
+import importlib
 import json
 import math
 from dataclasses import replace
@@ -14,10 +15,11 @@ from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
-from yid_ocp.errors import YidError
+from yid_ocp.errors import SolverError, YidError
 from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
+diagnose_module = importlib.import_module("yid_ocp.diagnosis.diagnose")  # the function hides its module
 FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
 
 
@@ -109,6 +111,22 @@ def test_a_model_that_is_right_has_no_gap(bench):
     assert {told[name] for name in ("closure_low", "carried", "evidence")} == {None}
 
 
+@pytest.mark.usefixtures("without_law")
+def test_a_model_that_fails_with_all_candidates_is_diagnosed_at_a_shorter_step(bench, monkeypatch):
+    real, failures = diagnose_module.screen_candidates, [SolverError("it fails")] * 2
+
+    def screen(*arguments):
+        if failures:
+            raise failures.pop()
+        return real(*arguments)
+
+    monkeypatch.setattr(diagnose_module, "screen_candidates", screen)
+    finding, _ = found(bench, {}, FRICTION)
+    stated = bench.step.time_step
+    assert (finding.verdict, finding.stated_and_used_time_step) == ("no_gap", (stated, stated / 4))
+    assert f"Steps of {stated:.4g} s are too long here" in finding.summary
+
+
 @pytest.mark.parametrize(
     ("friction", "verdict", "steps"), [({}, "no_gap", (0.04, 0.02)), ({"tau_c": 0.1}, "effect", (0.04, 0.04))]
 )
@@ -126,7 +144,7 @@ def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench,
     assert (finding.verdict, finding.stated_and_used_time_step) == (verdict, steps)
     assert {effect.label for effect in finding.accepted_effects} == set(own)
     told = finding.to_dict()
-    assert ("The discretisation error of 0.04 s steps looks like a gap" in told["summary"]) is (steps[0] != steps[1])
+    assert ("Steps of 0.04 s are too long here" in told["summary"]) is (steps[0] != steps[1])
     assert ("the nominal model at 0.02 s" in names) is (steps[0] != steps[1])
 
 

@@ -222,10 +222,7 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     problem = problem_of(urdf_folder, "driven, filtered, both", seeds=(1,))
     episode, vector = problem.episodes[0], problem.system.parameters.vector
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
-    none, shifted = (
-        np.zeros(problem.step.sizes["nx"]),
-        problem.predictor.corrected_inputs_with_effect_momentum,
-    )
+    none, shifted = (np.zeros(problem.step.sizes["nx"]), problem.predictor.corrected_inputs_with_effect_momentum)
     assert shifted(episode, vector(neutral), (), none).momentum_shift is None
     name = "rotor_inertia@shoulder.armature"
     found = shifted(episode, vector(neutral | {name: 0.05}), (name,), none)
@@ -318,10 +315,7 @@ def test_rates_at_nodes_are_those_of_a_parabola_and_of_one_step_at_the_ends():
     np.testing.assert_allclose(speed, np.stack([expected, -np.ones(6)], axis=1))
     np.testing.assert_allclose(rate, np.tile([6.0, 0.0], (6, 1)), atol=1e-9)
     pull = np.random.default_rng(0).standard_normal((6, 2))
-    for forward, back in (
-        (speed, central_difference_velocity_adjoint),
-        (rate, second_difference_acceleration_adjoint),
-    ):
+    for forward, back in ((speed, central_difference_velocity_adjoint), (rate, second_difference_acceleration_adjoint)):
         assert np.sum(back(pull, nodes, 6, h) * q) == pytest.approx(np.sum(pull * forward))
 
 

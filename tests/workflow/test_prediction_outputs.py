@@ -304,15 +304,10 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     def estimate(value, verdict):
         return ParameterEstimate(value, 0.5, "N m/rad", 3.0, 0.0, np.inf, True, verdict)
 
-    found = {
-        "T1.bend": estimate(22.0, "identifiable"),
-        "T1.twist": estimate(7.0, "not_identifiable"),
-    }
+    found = {"T1.bend": estimate(22.0, "identifiable"), "T1.twist": estimate(7.0, "not_identifiable")}
     told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "my runs/a")
     assert told["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
-    assert told["joints"] == [
-        {"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0},
-    ]
+    assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]

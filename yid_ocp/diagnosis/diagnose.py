@@ -61,6 +61,7 @@ from yid_ocp.solvers import GaussNewton, Solution, solve
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
 _MIN_FORCE_EVENT_GAP_FRACTION = 0.1  # of the gap that force events must remove
+_MAX_STEP_OF_LAST_HALVING = 2.5e-3  # step from which on a failure of the model with all candidates is final [s]
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
@@ -155,7 +156,12 @@ def _examined(
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     # the whitening of all hypotheses is fixed here
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
-    screened = screen_candidates(composed, (), nominal.values)
+    try:
+        screened = screen_candidates(composed, (), nominal.values)
+    except SolverError:
+        if not nominal.problem.step.time_step > _MAX_STEP_OF_LAST_HALVING:
+            raise
+        return _examined(*_at_half_time_step(search, nominal, "the model with all candidates fails"))
     evidence = NominalModelGapEvidence(nominal, *tests, screened)
     _end_stage(search, "screening")
     if evidence.warrants_search(limits) and not is_corrected_for_links:
@@ -163,7 +169,7 @@ def _examined(
         gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
         fall = _fall_at_half_time_step(search, nominal, events)
         if fall > gap / 2:
-            return _examined(*_at_half_time_step(search, nominal, fall))
+            return _examined(*_at_half_time_step(search, nominal, f"half the time step lowers chi2 by {fall:.3g}"))
         corrected = _without_error_of_links(with_events, nominal, gap)
         if corrected is not None:
             return _examined(*corrected, cuts, True)
@@ -180,10 +186,10 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     return -math.inf if left is None else _excess_of(fit.evaluation.residual) - _excess_of(left)
 
 
-def _at_half_time_step(search: RefitContext, fit: RefittedModel, fall: float) -> tuple[RefitContext, RefittedModel]:
+def _at_half_time_step(search: RefitContext, fit: RefittedModel, why: str) -> tuple[RefitContext, RefittedModel]:
     """Hypotheses and nominal fit at half the time step."""
     h = fit.problem.step.time_step / 2
-    search.progress.begin_stage(f"half the time step lowers chi2 by {fall:.3g}: going on at {h:g} s")
+    search.progress.begin_stage(f"{why}: going on at {h:g} s")
     search = replace(search, problem=search.problem.with_time_step(h))
     return search, _fitted_nominal_model(search, fit.values)
 

@@ -257,11 +257,11 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     text += [_listed(stopped, result.untried), *map(held_out_truncation_message, result.truncated_recordings)]
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
-    step = f"so this result is for {used} s (set problem.time_step: {used} for other commands)"
+    step = f"Steps of {stated} s are too long here, so this result is for {used} s"
     links = "The error of few links looks like a gap. It was removed here; other commands need more links."
     blocks = "No other recording could be held out, so alternate blocks of the recordings were."
     notes = (
-        (stated != used, f"The discretisation error of {stated} s steps looks like a gap, {step}."),
+        (stated != used, f"{step} (set problem.time_step: {used} for other commands)."),
         (result.is_corrected_for_links, links),
         (result.is_split_in_blocks, blocks),
     )

@@ -38,12 +38,12 @@ from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
-REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
-"""A refit starts near its end and must be good to a small part of its std only."""
+REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)  # good to a part of a std
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range
+_MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -226,10 +226,6 @@ class RefitContext:
         # a model's rollouts would fill the memory
         answers.setdefault(name, cast(_Answer, found.statistics() if isinstance(found, RefittedModel) else found))
         return found
-
-
-_MAX_RECORDED_PAIRS = 48
-"""Number of recorded pairs of candidates; all further pairs predict a smaller decrease than the refitted pairs."""
 
 
 _Attempt = tuple[EstimationProblem, SolverResult, Evaluation]

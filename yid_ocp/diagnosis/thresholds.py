@@ -68,4 +68,3 @@ class Thresholds:
 
 
 DEFAULT_THRESHOLDS = Thresholds()
-"""Default thresholds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,14 +33,11 @@ from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads, mean_step_input_delay_derivative, mean_step_inputs
 from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeValueSmoother
 
+# largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
-"""Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""
-_MAX_FIRST_SAMPLE_TIME = 1.0
-"""Latest time at which a point's first sample still shows the initial equilibrium [s]."""
-_POOR_EQUILIBRIUM_RMSE = 5.0
-"""Root mean square error of first points above which another equilibrium is sought [standard deviations]."""
-_MAX_REMAINING_ERROR_FRACTION = 0.5
-"""Largest fraction of that error that may remain at another equilibrium."""
+_MAX_FIRST_SAMPLE_TIME = 1.0  # latest time at which a point's first sample still shows the initial equilibrium [s]
+# root mean square error of first points above which another equilibrium is sought [stds], and the part that may remain
+_POOR_EQUILIBRIUM_RMSE, _MAX_REMAINING_ERROR_FRACTION = 5.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -512,16 +510,17 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
     error = _error(predictor, seen, least, own)
     if not error > _POOR_EQUILIBRIUM_RMSE:
         return episode
-    try:
+    elastic = [predictor.system.mechanism.joint_index(spring.joint_name) for spring in predictor.system.elastic_joints]
+    shapes = [least.state[:n].copy()]
+    shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
+    with contextlib.suppress(DataError):
         fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
         # an equilibrium near this configuration has the details
-        shape = fit(at, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path, roughly=True).state[:n]
-    except DataError:
-        return episode
-    other = predictor.initial_state_of_episode(episode, own, offset, (), shape)
-    if not _error(predictor, seen, other, own) < _MAX_REMAINING_ERROR_FRACTION * error:
-        return episode
-    return replace(episode, equilibrium_guess=other.state[:n])
+        shapes.append(fit(at, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path, roughly=True).state[:n])
+    others = [predictor.initial_state_of_episode(episode, own, offset, (), shape) for shape in shapes]
+    left, i = min((_error(predictor, seen, start, own), i) for i, start in enumerate(others))
+    is_better = left < _MAX_REMAINING_ERROR_FRACTION * error
+    return replace(episode, equilibrium_guess=others[i].state[:n]) if is_better else episode
 
 
 def _first(samples: SensorMeasurements, time_step: float) -> SensorMeasurements | None:
