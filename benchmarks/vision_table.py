@@ -111,7 +111,7 @@ ROWS: dict[str, Row] = {
     "pose 4, latency 400 ms": Row(turn=4.0, shift=0.04, latency=0.4),
     "drift 0.1 %": Row(drift=1e-3, duration=60.0),
     "exposure 100 ms": Row(exposure=0.1, travel=1.3),
-    "exposure 100 ms, told": Row(exposure=0.1, travel=1.3, options={"exposure": 0.1}),
+    "exposure 100 ms, told": Row(exposure=0.1, travel=1.3, options={"exposure_time": 0.1}),
     "person": Row(clutter="person"),
     "table": Row(clutter="table"),
     "pole": Row(clutter="pole"),

@@ -48,7 +48,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         allowed, hint = "--out RECORDING.h5, or --preview", "add --out RECORDING.h5"
         raise ConfigError("the option --out is missing", where="--out", allowed=allowed, hint=hint)
     if not has_native_recording_suffix(arguments.out):
-        what, hint = f"the file name is '{arguments.out}'", f"write --out {Path(arguments.out).stem}.h5"
+        what, hint = f"the file name is '{arguments.out}'", f"write --out {Path(arguments.out).with_suffix('.h5')}"
         raise ConfigError(what, where="--out", allowed="NAME.h5", hint=hint)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
