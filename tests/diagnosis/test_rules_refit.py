@@ -14,7 +14,7 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     StoredFit,
     _effect_p_values,
-    _held_out_loss,
+    held_out_loss,
     refit_with_each_effect,
     refit_with_effects,
 )
@@ -38,7 +38,7 @@ class Problem:
         self.cost, self.rows, self.unknown_names, self.nominal_free_parameter_names = cost, rows, names, ("k",)
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters, self.has_process_noise = None, (), False
-        self.step = SimpleNamespace(time_step=0.01)
+        self.step, self.held_out_spread = SimpleNamespace(time_step=0.01), np.zeros((0, 0))
 
     @property
     def problem(self):
@@ -96,12 +96,13 @@ def solved(monkeypatch):
         status = Status.FAILED if failed else Status.STALLED
         return SimpleNamespace(x=np.asarray(x), message="done", status=status, equilibrium_guesses="there")
 
-    def held_out(problem, x):
+    def held_out(problem, x, spread):
+        assert spread is problem.held_out_spread
         made.losses.append(problem.named_values(x))
         return loss(1.5, 1.6)
 
     monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
-    monkeypatch.setattr(module, "_held_out_loss", held_out)
+    monkeypatch.setattr(module, "held_out_loss", held_out)
     monkeypatch.setattr(
         module, "_refit_covariance_factor", lambda problem, finish, limits: 0.1 * np.eye(len(problem.unknown_names))
     )
@@ -335,12 +336,15 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     predicted = np.array([[2.0, 1.0], [3.0, 9.0], [3.0, 1.0], [4.0, 5.0], [6.0, 6.0]])
     outputs = SimpleNamespace(predicted_outputs=(predicted, np.array([[1.0, 2.0]])))
     problem, told = predicting((episode(of=[group, more]), outputs))
-    found = _held_out_loss(problem, np.zeros(1))
+    found = held_out_loss(problem, np.zeros(1))
     # blocks of half a second: [0, 0.5), [0.5, 1.0) and the last sample
     np.testing.assert_allclose(found.block_chi2, [1 + 4 + 9 + 36, 4 + 1, 1 + 4])
     np.testing.assert_allclose(found.block_sample_counts, [2 + 1 + 2, 4, 2])
     assert found.channel_rmse == {"a": (0.25, "m")}
     assert told["episodes"] == ["other"]
+    # an uncertain offset of all eleven residuals, whose sum is 14, is no gap
+    unsure = held_out_loss(problem, np.zeros(1), np.full((11, 1), 1e6))
+    assert unsure.total_chi2 == pytest.approx(found.total_chi2 - 14**2 / 11)
 
 
 @cases(
@@ -352,19 +356,19 @@ def test_held_out_time_is_cut_in_some_forty_blocks(predicting, seconds, length):
     group = measured([0.0, 0.99 * length, 1.01 * length], np.ones((3, 2)), np.ones((3, 2)))
     outputs = SimpleNamespace(predicted_outputs=(np.ones((3, 2)),))
     problem, _ = predicting(*((episode(steps=round(s / 0.01), of=[group]), outputs) for s in seconds))
-    np.testing.assert_array_equal(_held_out_loss(problem, np.zeros(1)).block_sample_counts, [4.0, 2.0] * len(seconds))
+    np.testing.assert_array_equal(held_out_loss(problem, np.zeros(1)).block_sample_counts, [4.0, 2.0] * len(seconds))
 
 
 def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting):
     group = measured([0.1, 0.6], [[1, 1], [1, 1]], [[1, 1], [1, 0]])
     good = SimpleNamespace(predicted_outputs=(np.ones((2, 2)),))
     problem, told = predicting((episode("one", of=[group]), "it snaps"), (episode("two", of=[group]), good))
-    found = _held_out_loss(problem, np.zeros(1))
+    found = held_out_loss(problem, np.zeros(1))
     np.testing.assert_array_equal(found.block_chi2, [math.inf, math.inf, 0.0, 0.0])
     np.testing.assert_array_equal(found.block_sample_counts, [2.0, 1.0, 2.0, 1.0])
     assert told["episodes"] == ["two"]
     none, _ = predicting((episode("one", of=[group]), "it snaps"))
-    assert _held_out_loss(none, np.zeros(1)).channel_rmse == {}
+    assert held_out_loss(none, np.zeros(1)).channel_rmse == {}
 
 
 @cases(

@@ -66,8 +66,7 @@ class ParameterStdsAndVerdict:
 class _ParameterDirection:
     """A direction of relative parameter changes and its uncertainty, judged like a parameter.
 
-    The singular value is that of the whitened sensitivity to relative changes after elimination of nuisances: standard
-    deviations of the data per unit change.
+    The singular value is that of the whitened sensitivity [stds per unit change] after elimination of nuisances.
     """
 
     singular_value: float

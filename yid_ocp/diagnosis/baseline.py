@@ -34,8 +34,7 @@ from yid_ocp.solvers import Status
 
 _SHIFT = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
 _SHIFT += " changed=has_changed"
-_MIN_INFORMED_FRACTION = 0.05
-"""Relative reduction of a prior's variance below which the data do not inform a parameter."""
+_MIN_INFORMED_FRACTION = 0.05  # relative reduction of a prior's variance below which the data do not inform a parameter
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,9 @@ from yid_ocp.model.parameters import Parameter, Parameters
 
 _FORMAT = "yid-blind/1"
 _CATEGORIES = tuple(BLIND_CASE_CATEGORY_SHARES)
-_OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
-"""Categories whose true effect is not among the candidates."""
+_OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")  # categories whose true effect is not among the candidates
 _MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
-_NOT_JUDGED = "not_judged"
-"""Verdict of a recorded case if other thresholds need a refit that was not made."""
+_NOT_JUDGED = "not_judged"  # verdict of a recorded case if other thresholds need a refit that was not made
 _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", _NOT_JUDGED)
 
 

@@ -42,6 +42,7 @@ from yid_ocp.diagnosis.refit import (
     RefitStore,
     RefittedModel,
     evaluate_in_all_candidates_step,
+    held_out_loss,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import screen_candidates
@@ -155,7 +156,9 @@ def _examined(
     tests = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     # the whitening of all hypotheses is fixed here
-    composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
+    own, spread = nominal.problem, _held_out_spread(nominal)
+    composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
+    nominal = replace(nominal, held_out_loss=held_out_loss(own, own.unknown_vector(nominal.values), spread))
     try:
         screened = screen_candidates(composed, (), nominal.values)
     except SolverError:
@@ -328,8 +331,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
     end_stage("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
-    is_finer = steps[0] != steps[1]
-    law = find_gap_law(search, problem.with_time_step(steps[1]) if is_finer else problem, final, places, seen.events)
+    law = find_gap_law(search, problem, final, places, seen.events)
     end_stage("law")
     ends = search.stage_ends
     finding = DiagnosisResult(
@@ -448,9 +450,17 @@ def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool 
     return found
 
 
+def _held_out_spread(fit: RefittedModel) -> Array:
+    """Change (n, k) of the held-out residuals by one standard deviation of each error of a fit's shared parameters."""
+    problem, shared = fit.problem, len(fit.problem.shared_parameters)
+    found = _held_out_residuals(problem, problem.unknown_vector(fit.values), True)
+    slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
+    return np.asarray(slopes @ noise_only_covariance_factor(problem, fit.evaluation)[:shared])
+
+
 def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
     """The null test of a model on the held-out recordings."""
-    problem, x, shared = fit.problem, fit.problem.unknown_vector(fit.values), len(fit.problem.shared_parameters)
+    problem, x = fit.problem, fit.problem.unknown_vector(fit.values)
     own, filters = problem.with_episodes(problem.held_out, ()), problem.held_out_whitening_filters
 
     def residual_of(moved: EstimationProblem) -> Array | None:
@@ -459,12 +469,9 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
             return np.concatenate([part.residual for part in _held_out_residuals(other, x)])
         return None
 
-    found = _held_out_residuals(problem, x, True)
-    residual = np.concatenate([part.residual for part in found])
-    slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
-    by_parameters = slopes @ noise_only_covariance_factor(problem, fit.evaluation)[:shared]
+    residual = np.concatenate([part.residual for part in _held_out_residuals(problem, x)])
     by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
-    residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
+    residual = null_test.whiten_with_extra_errors(residual, np.hstack([_held_out_spread(fit), by_path]))
     return _null_test(own, residual, 0, limits)
 
 

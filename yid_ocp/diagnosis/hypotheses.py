@@ -126,6 +126,7 @@ class AllCandidatesProblem:
     is_split_in_blocks: bool  # whether a single recording is both estimated on and held out, in alternate blocks
     # functions of the nominal system with the effects of one location, by time step [s]
     functions_of_place: CasadiLockedCache[tuple[str, float], ModelFunctions] | None = None
+    held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
 
     @staticmethod
     def from_problem(
@@ -176,9 +177,9 @@ class AllCandidatesProblem:
         """Problem with another time step [s] and the whole recordings, whitened by sensor noise alone."""
         made = self.problem.with_time_step(time_step)
         if self.is_split_in_blocks or not with_held_out:
-            return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made)
+            return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made, held_out_spread=None)
         held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(time_step)
-        return replace(self, problem=made.with_episodes(made.episodes, held.episodes))
+        return replace(self, problem=made.with_episodes(made.episodes, held.episodes), held_out_spread=None)
 
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], kept_fraction: float

@@ -126,6 +126,8 @@ def find_gap_law(
     places = [p for p in dict.fromkeys(places) if allowed_torque_law_quantity_names(problem.system, p)][:_MAX_PLACES]
     if not places or search.record_skip_if_past_deadline("a law"):
         return None
+    if (h := last.problem.step.time_step) != problem.step.time_step:
+        problem = problem.with_time_step(h)
     search.progress.begin_stage(f"estimating a law at {' or '.join(places)}", 3.0, 2.5)
     # a torque over time would interpolate the held-out blocks
     left_out = ("time",) if search.problem.is_split_in_blocks else ()

@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
+from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start, whiten_with_extra_errors
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_factor
 from yid_ocp.inference.whitening import (
     max_torque_bias_change_in_stds,
@@ -194,7 +194,8 @@ class RefitContext:
             return None
         self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
         problem = self.problem.problem
-        turned = replace(self.problem, problem=problem.with_episodes(problem.held_out, problem.episodes))
+        exchanged = problem.with_episodes(problem.held_out, problem.episodes)
+        turned = replace(self.problem, problem=exchanged, held_out_spread=None)
         # parameters shared by both sets of recordings, without initial states
         names = (*problem.free, *(name for effect in fit.effects for name in effect.parameters.names))
         start = {name: fit.values[name] for name in fit.values.keys() & names}
@@ -250,7 +251,7 @@ def refit_with_effects(
     if stored := store.stored_refit(name):
         placed, at_stored = _evaluated(problem, effects, stored.values)
         if at_stored.ok:
-            return _model(stored, effects, placed, at_stored)
+            return _model(stored, effects, placed, at_stored, problem.held_out_spread)
     runs = [_attempt(problem, effects, start)]
     runs += [_attempt(problem, effects, other) for other in _other_starts(problem, effects, start, runs[0], limits)]
     own, outcome, finish = min(runs, key=lambda run: run[-1].cost)
@@ -265,7 +266,7 @@ def refit_with_effects(
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
     found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
     store.put(name, found)
-    return _model(found, effects, own, finish)
+    return _model(found, effects, own, finish, problem.held_out_spread)
 
 
 def _evaluated(
@@ -285,9 +286,11 @@ def evaluate_in_all_candidates_step(problem: AllCandidatesProblem, fit: Refitted
     return replace(fit, problem=own, evaluation=finish, cost=finish.cost) if finish.ok else fit
 
 
-def _model(known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation) -> RefittedModel:
+def _model(
+    known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation, spread: Array | None
+) -> RefittedModel:
     kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
-    loss = _held_out_loss(own, own.unknown_vector(known.values))
+    loss = held_out_loss(own, own.unknown_vector(known.values), spread)
     return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
 
 
@@ -415,11 +418,12 @@ def refit_with_each_effect(
     return [fit for fit in fits if fit is not None and math.isfinite(fit.held_out_loss.total_chi2)]
 
 
-def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
-    """Loss of a model on the held-out recordings; initial states are found in the same way for every model."""
+@np.errstate(invalid="ignore")  # of recordings that cannot be predicted
+def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = None) -> HeldOutLoss:
+    """Loss of a model on the held-out recordings, with `spread` (n, k) of `AllCandidatesProblem.held_out_spread`."""
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
-    found, squares, counts = problem.predict_held_out(x), [], []
+    found, residuals, counts, numbered = problem.predict_held_out(x), [], [], []
     for i, (episode, result) in enumerate(found):
         blocks = []
         for samples in episode.measurements:
@@ -427,11 +431,16 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
             block = np.trunc(times / length).reshape(len(times), -1)
             blocks.append(np.broadcast_to(block, used.shape)[used])
         block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
-        residual = np.full(len(block), np.inf)
+        residuals.append(np.full(len(block), np.inf))
         if not isinstance(result, str):
-            residual = problem.whitened_held_out_prediction_residual(i, episode, result).residual
-        squares.append(np.bincount(block, weights=residual**2))
+            residuals[-1] = problem.whitened_held_out_prediction_residual(i, episode, result).residual
         counts.append(np.bincount(block).astype(float))
+        numbered.append(block)
+    whole = np.concatenate(residuals)
+    if spread is not None:  # what the nominal parameters leave uncertain is no gap
+        whole = np.nan_to_num(whiten_with_extra_errors(whole, spread), nan=np.inf, posinf=np.inf, neginf=np.inf)
+    parts = np.split(whole, np.cumsum([len(own) for own in residuals])[:-1])
+    squares = [np.bincount(block, weights=own**2) for block, own in zip(numbered, parts, strict=True)]
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
         found = problem_with_sensor_noise_only(problem).predict_held_out(x)

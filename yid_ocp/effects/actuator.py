@@ -230,8 +230,7 @@ class _LateTorque(EffectBase):
 class _EffortDelay(_LateTorque):
     """Delay of a joint's torque: the torque that acts at time t was recorded at t - delay.
 
-    At a prescribed arm, the effort recorded at t belongs to the motion at t + delay. A negative delay means that the
-    effort is recorded late.
+    At a prescribed arm, the effort recorded at t belongs to the motion at t + delay; negative: it is recorded late.
     """
 
     equation = "the torque that acts at t was recorded at t - delay"
@@ -328,8 +327,7 @@ class _BackEmf(_ServoChange):
 class _CurrentLimit(_ServoChange):
     """Current limit of a DC motor, where current = motor torque / published torque constant kt.
 
-    Unlike the duty limit, it also limits braking torque. The internal parameter is limit^-16, so that its neutral value
-    zero means that there is no limit.
+    Unlike the duty limit, it also limits braking torque. The internal parameter is limit^-16; zero means no limit.
     """
 
     equation = "torque = kt clip(torque/kt, limit)"
@@ -362,8 +360,7 @@ class _ServoDelay(_ServoChange):
 class _ServoSaturation(_ServoChange):
     """Additional smooth torque limit of a servo, with torque = demand / (1 + |demand/limit|^16)^(1/16).
 
-    The internal parameter is limit^-16. Its neutral value zero means that there is no additional limit, and its
-    derivative is nonzero at zero. It is added to the model's own limit^-16.
+    The internal parameter is limit^-16, added to the model's own; at zero (no limit) its derivative is nonzero.
     """
 
     equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"

@@ -90,8 +90,7 @@ class _MountCompliance(_JointInsertion):
 class _JunctionCompliance(_JointInsertion):
     """Massless two-axis rotational spring between a segment and the branches that leave it at a junction.
 
-    At `w_PARENT` all branches rotate together about x and y of the parent's last link. At `junction_BRANCH` one branch
-    rotates about its own axes.
+    At `w_PARENT` all branches rotate together about x and y of the parent's last link, at `junction_BRANCH` one alone.
     """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the branches"

@@ -21,8 +21,8 @@ def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, 
     """The CasADi functions that `export_step_functions` writes.
 
     `rows` (del, internal, constraint, p1), `rows_by_theta` and, if not too large, `rows_by_unknowns` (q1, z1, lam) take
-    `_ARGUMENT_NAMES`. `points` maps (q, theta) to positions of the sensors' points [m]. `mechanics` maps (q, v, theta)
-    to mass matrix, dL/dq and dL/dv of the bodies. The last two set internal coordinates to zero.
+    `_ARGUMENT_NAMES`. `points` maps (q, theta) to positions of points [m], `mechanics` (q, v, theta) to mass matrix,
+    dL/dq and dL/dv. The last two set internal coordinates to zero.
     """
     e, system = symbols.equations, symbols.equations.system
     names, blocks = zip(*((block.name, block.expressions) for block in symbols.row_blocks), strict=True)

@@ -48,8 +48,7 @@ _NO_OPTIMIZATION_FLAG = "-O0"
 _COMPILE_TIMEOUT, _VERSION_TIMEOUT = 900.0, 30.0  # [s]
 _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spoken of [s]
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
-_HUNG_COMPILERS: set[str] = set()
-"""Compilers that did not end in time: they are waited for once."""
+_HUNG_COMPILERS: set[str] = set()  # compilers that did not end in time: they are waited for once
 _MARKER_SYMBOL = "yid_compiled"
 _NOT_LOADED = "compiled code cannot be loaded (%s); going on without it"
 

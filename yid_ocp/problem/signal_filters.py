@@ -17,8 +17,7 @@ from yid_ocp.errors import DataError
 
 _MIN_CUTOFF_FRACTION = 1e-4  # of half the sampling rate; below it, the filter's sections are numerically singular
 _FILTER_ORDER = 4
-_MIN_RELATIVE_WEIGHT = 1e-4
-"""Fraction of the largest weight below which weights are dropped in the filter's matrix."""
+_MIN_RELATIVE_WEIGHT = 1e-4  # fraction of the largest weight below which weights are dropped in the filter's matrix
 
 
 @dataclass(frozen=True)

@@ -198,8 +198,7 @@ class ResidualTerm:
         """Weight of each residual in the Hessian of the loss. None if all weights are one.
 
         With `exact`, the weight is the second derivative of the Huber loss: one up to the threshold, zero beyond.
-        Without `exact`, it is the weight of iteratively reweighted least squares, which has the same gradient and is
-        never zero.
+        Without `exact`, it is that of iteratively reweighted least squares, with the same gradient and never zero.
         """
         if math.isinf(self.huber_threshold):
             return None

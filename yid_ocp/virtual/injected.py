@@ -251,8 +251,7 @@ def _slid(size: _Values, s: float, q: float, v: float, step: float) -> float:
 def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[InjectedEffect]) -> _ForceCallback:
     """Dry friction of joints as MuJoCo's own `frictionloss`, whose size is updated at every inner step.
 
-    It starts with the motion and is at most tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|. The load is the motor
-    torque minus that of weights and grasps.
+    It is at most tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|, with the motor torque minus that of weights.
     """
     names = list(dict.fromkeys(effect.location for effect in effects))
     at = np.array([model.joint(name).id for name in names])

@@ -324,9 +324,8 @@ def _settle_under_servo_commands(scene: MujocoModelAndState, damping: Array, com
 def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
     """Let a scene settle with the model `held`, and yield its largest velocity [rad/s] every 0.1 s.
 
-    With short steps, a gripper that is not at its grasped point can throw a fine chain about, because the time constant
-    of a grasp is two steps. If the state is lost, the scene restarts, and grasps close at the usual rate in the first
-    0.1 s.
+    With short steps, a gripper that is not at its grasped point can throw a fine chain about. If the state is lost, the
+    scene restarts, and grasps close at the usual rate in the first 0.1 s.
     """
     data, step = scene.data, scene.mujoco.mj_step
     start, commands = data.qpos.copy(), data.ctrl.copy()

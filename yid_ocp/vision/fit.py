@@ -459,7 +459,7 @@ def _symbolic_functions(system: System, options: ShapeFitOptions, free_joints: S
 
     `corners` of the links, `seen` points of the system and errors of `held` frames in standard deviations have
     derivatives by the free joints as a second output. `gap` of the grasps, `holders` and places `taken` by them.
-    `grown` are derivatives of the first three by the logarithm of each tube's length.
+    `grown`: derivatives of the first three by the logarithm of each tube's length.
     """
     symbols, tree, (q, kinematics) = system.parameters.symbols, system.mechanism, system.symbolic_kinematics
     corners = []

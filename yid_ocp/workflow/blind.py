@@ -276,8 +276,7 @@ def _diagnose_case_from_recordings_task(
 ) -> dict[str, Any]:
     """Task: diagnose a case from its recordings, the last one held out. Returns {seconds, result, evidence}.
 
-    `evidence` allows the case to be judged again. For calibration, a case without a gap also has `open`: the statistics
-    of a diagnosis with permissive thresholds.
+    `evidence` allows the case to be judged again. For calibration, a case without a gap also has `open`.
     """
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates

@@ -370,8 +370,7 @@ def _with_extra_frames(
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
     """Robot and objects with the additional frames of the settings.
 
-    A frame of uncertain position, or that recordings locate (`marker_positions_from_reference_pose`), has parameters
-    NAME.x, .y, .z.
+    A frame of uncertain position, or located by `marker_positions_from_reference_pose`, has parameters NAME.x, .y, .z.
     """
     made = list(items)
     for name, said in run.model.frames.items():

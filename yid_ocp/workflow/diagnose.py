@@ -270,8 +270,7 @@ def _unknown_force_scene(finding: DiagnosisResult) -> list[AnimationData]:
 class _SingleJsonFileRefitStore:
     """A store of refits in one JSON file, replaced as a whole after every refit.
 
-    A file from other inputs, another configuration or another version is ignored with a notice. Refits run in threads
-    that share a compiled step, because building it in another process takes longer than a refit.
+    A file from other inputs, another configuration or another version is ignored with a notice.
     """
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:

@@ -86,8 +86,7 @@ def _compile_step_for_planning(run: RunSettings) -> Step:
 def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapping[str, float] | None:
     """Joint positions at the start of the motion, from the settings or else from the first recording.
 
-    None means the joint angles of the first grasp of the undeformed object. Two arms that hold a straight object are
-    then fully stretched, and it snaps to either side; recordings rarely start like this.
+    None: those of the first grasp of the undeformed object, which two arms hold fully stretched, so that it may snap.
     """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
