@@ -192,6 +192,13 @@ def test_what_effects_explain_of_what_exceeds_the_noise(costs, count, left, part
     assert _explained_fraction(nominal, last, LIMITS) == pytest.approx(part)
 
 
+@cases("before, left, part", {"part": (1.12, 1.09, 38 / 78), "third": (1.14, 1.09, 1.0), "noise": (1.005, 1.009, 1.0)})
+def test_a_gap_that_is_small_itself_is_explained_where_a_third_of_it_goes(before, left, part):
+    nominal = replace(fit(lost=loss(before, before, count=1e4), cost=100.0), residual_count=122)
+    last = fit([ONE], loss(left, left, count=1e4), cost=80.5)
+    assert _explained_fraction(nominal, last, LIMITS) == pytest.approx(part)
+
+
 @cases(
     "weight, plant, sensor, both, side",
     {

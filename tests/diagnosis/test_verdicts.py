@@ -121,8 +121,7 @@ def test_a_model_that_fails_with_all_candidates_is_diagnosed_at_a_shorter_step(b
         return real(*arguments)
 
     monkeypatch.setattr(diagnose_module, "screen_candidates", screen)
-    finding, _ = found(bench, {}, FRICTION)
-    stated = bench.step.time_step
+    stated, finding = bench.step.time_step, found(bench, {}, FRICTION)[0]
     assert (finding.verdict, finding.stated_and_used_time_step) == ("no_gap", (stated, stated / 4))
     assert f"Steps of {stated:.4g} s are too long here" in finding.summary
 

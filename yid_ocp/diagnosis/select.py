@@ -75,7 +75,7 @@ def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
     return GapClosure(fraction, float(low), float(high))
 
 
-def leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
+def _leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether a fit's held-out chi2 per sample is near 1, so that its residual is mainly noise."""
     return fit.held_out_loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
 
@@ -114,12 +114,11 @@ def _near_best_models(
 ) -> list[tuple[RefitStatistics, float]]:
     """Models that the recordings cannot distinguish from the best one, with their distance from it, 0 to 1.
 
-    Plausible models come first. If the best model leaves only noise, all recordings form one likelihood, the distance
-    is a log odds in units of what decides, and the likeliest model is best. Otherwise it is the held-out prediction
-    error in units of its standard error, and of equally good models the simplest is best.
+    Plausible models come first. If the best one leaves only noise, the distance is a log odds in units of what decides.
+    Otherwise it is the held-out error in units of its standard error, and of equals the simplest is first.
     """
     best = min(fits, key=_chi2, default=nominal)
-    if leaves_noise(best, limits):
+    if _leaves_noise(best, limits):
         best = min(fits, key=lambda fit: bic_difference(fit, nominal), default=nominal)
         most = _undecided_chi2(nominal, best, limits)
         distances = [bic_difference(fit, best) / most for fit in fits]
@@ -186,7 +185,7 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Threshold
     before, after = without.held_out_loss, fit.held_out_loss
     gained, error = held_out_improvement(before, after)
     is_clear = gained > max(error, limits.min_gap_closed * before.excess_chi2_per_sample)
-    if leaves_noise(without, limits):
+    if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
     return is_clear and all(_is_significant(e, fit, limits) for e in _beside(without.effects, fit))
 
@@ -203,8 +202,6 @@ def _plausible_beside(
     """Fits whose effects beside `base` are plausible; others would correct errors of the effects in `base`."""
     return [fit for fit in fits if all(_is_plausible(effect, fit, limits) for effect in _beside(base, fit))]
 
-
-# -- several effects --------------------------------------------------------------------------------------------------
 
 _Start = tuple[tuple[EffectBase, ...], Mapping[str, float]]
 """Effects that are refitted, and their values at the start."""

@@ -13,7 +13,7 @@ from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, leaves_noise, select_effects, total_gap_closure
+from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
@@ -233,10 +233,12 @@ def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> fl
 
 
 def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits: Thresholds) -> float:
-    """Decrease of r'r by effects, minus degrees of freedom, over its excess over noise. 1 if hardly more is left."""
+    """Decrease of r'r by effects over its excess over noise; 1 if only noise, or 2/3 of a small gap, is left."""
+    before, left = nominal.held_out_loss, last.held_out_loss.excess_chi2_per_sample
     decrease = 2 * (nominal.cost - last.cost) - last.total_effect_parameter_count
     excess = max(2 * nominal.cost - nominal.residual_count, decrease, 1.0)
-    return 1.0 if leaves_noise(last, limits) else decrease / excess
+    least = max(before.excess_chi2_per_sample * 2 / 3, math.sqrt(2.0 / float(before.block_sample_counts.sum())))
+    return 1.0 if left < min(least, limits.min_excess_chi2_per_dof) else decrease / excess
 
 
 def _check_effect_amplitude_transfer(
