@@ -12,7 +12,7 @@ from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import law
-from yid_ocp.diagnosis.diagnose import _held_out_null_test, diagnose, fit_nominal_model
+from yid_ocp.diagnosis.diagnose import _held_out_null_test_and_spread, diagnose, fit_nominal_model
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
@@ -176,7 +176,7 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     bare = problem_without_input_errors(made.problem)
     plain = bare.evaluate(bare.unknown_vector(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
-    test = _held_out_null_test(fit)
+    test, _ = _held_out_null_test_and_spread(fit)
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
 
@@ -188,9 +188,9 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     spread = noise_only_covariance_factor(fit.problem, fit.evaluation)
     off = fit.problem.unknown_vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     moved = replace(fit, values=fit.problem.named_values(off))
-    assert _held_out_null_test(moved).p_value < 1e-12
+    assert _held_out_null_test_and_spread(moved)[0].p_value < 1e-12
     less = replace(fit.evaluation, jacobian=fit.evaluation.jacobian / 50)
-    test = _held_out_null_test(replace(moved, evaluation=less))
+    test, _ = _held_out_null_test_and_spread(replace(moved, evaluation=less))
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
 

@@ -158,9 +158,9 @@ def problem_without_error_of_links(
 ) -> EstimationProblem | None:
     """Subtract from all data, held-out ones included, what twice the links change in the predictions of a fit.
 
-    `at_x` is the evaluation at the fit `x` (nx,), with Jacobian. If the change is much larger than the residual, a
-    linear step tells nothing, and the finer model is refitted first. Returns None if a refit is not predicted to lower
-    r'r by `min_chi2_decrease`, if the object cannot be divided, if torques have noise, or if the finer model fails.
+    `at_x` is the evaluation at the fit `x` (nx,), with Jacobian. The finer model is refitted first if the change is
+    much larger than the residual: a linear step is too inaccurate there. Returns None if a refit would not lower r'r by
+    `min_chi2_decrease`, if the object cannot be divided, if torques have noise, or if the finer model fails.
     """
     divided, segments = problem.options.divided_links_model, problem.system.segment_layouts
     if divided is None or not segments or problem.has_process_noise:

@@ -21,10 +21,10 @@ from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
 from yid_ocp.diagnosis.refit import EffectSearchResults, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import (
+    EMPTY_SCREENING_RESULT,
     CandidateDetectability,
     CandidateScore,
     ConfusabilityMatrix,
-    LinearModelOfAllCandidates,
     ScreeningResult,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -531,10 +531,8 @@ class _RecordedCase:
             overlaps[i, j] = fraction
         scores = tuple(CandidateScore(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
         seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in data["detectable"].items())
-        return ScreeningResult(seen, scores, ConfusabilityMatrix(tuple(data["labels"]), overlaps), _NO_JOINT_MODEL)
-
-
-_NO_JOINT_MODEL = LinearModelOfAllCandidates((), (), np.zeros((0, 0)), np.zeros(0))
+        confusability = ConfusabilityMatrix(tuple(data["labels"]), overlaps)
+        return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, confusability=confusability)
 
 
 def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBase:

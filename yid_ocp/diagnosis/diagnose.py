@@ -153,10 +153,11 @@ def _examined(
     _end_stage(search, "events")
     angles = _largest_joint_angles(nominal)
     effects = tuple(effect.with_prior_ranges_scaled_to_angles(angles) for effect in search.problem.candidate_effects)
-    tests = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
+    held_out_test, spread = _held_out_null_test_and_spread(nominal, limits)
+    tests = _estimation_null_test(nominal, limits), held_out_test
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     # the whitening of all hypotheses is fixed here
-    own, spread = nominal.problem, _held_out_spread(nominal)
+    own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     nominal = replace(nominal, held_out_loss=held_out_loss(own, own.unknown_vector(nominal.values), spread))
     try:
@@ -397,7 +398,8 @@ def _after(
     before: NullTestResult, last: RefittedModel, where: tuple[GapLocation, ...], judged: Judgement, limits: Thresholds
 ) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
     """Held-out null test with the accepted effects, locations of the gap, and locations of the residual gap."""
-    tests, rest = (_estimation_null_test(last, limits), _held_out_null_test(last, limits)), tuple[GapLocation, ...]()
+    tests = _estimation_null_test(last, limits), _held_out_null_test_and_spread(last, limits)[0]
+    rest = tuple[GapLocation, ...]()
     if null_test.residuals_exceed_noise(tests, limits.null_test_limits):
         rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits))
     windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
@@ -450,17 +452,11 @@ def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool 
     return found
 
 
-def _held_out_spread(fit: RefittedModel) -> Array:
-    """Change (n, k) of the held-out residuals by one standard deviation of each error of a fit's shared parameters."""
-    problem, shared = fit.problem, len(fit.problem.shared_parameters)
-    found = _held_out_residuals(problem, problem.unknown_vector(fit.values), True)
-    slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
-    return np.asarray(slopes @ noise_only_covariance_factor(problem, fit.evaluation)[:shared])
-
-
-def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
-    """The null test of a model on the held-out recordings."""
-    problem, x = fit.problem, fit.problem.unknown_vector(fit.values)
+def _held_out_null_test_and_spread(
+    fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS
+) -> tuple[NullTestResult, Array]:
+    """The held-out null test, and the change (n, k) of residuals by one std of each error of shared parameters."""
+    problem, x, shared = fit.problem, fit.problem.unknown_vector(fit.values), len(fit.problem.shared_parameters)
     own, filters = problem.with_episodes(problem.held_out, ()), problem.held_out_whitening_filters
 
     def residual_of(moved: EstimationProblem) -> Array | None:
@@ -469,10 +465,13 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
             return np.concatenate([part.residual for part in _held_out_residuals(other, x)])
         return None
 
-    residual = np.concatenate([part.residual for part in _held_out_residuals(problem, x)])
+    found = _held_out_residuals(problem, x, True)
+    residual = np.concatenate([part.residual for part in found])
+    slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
+    by_parameters = np.asarray(slopes @ noise_only_covariance_factor(problem, fit.evaluation)[:shared])
     by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
-    residual = null_test.whiten_with_extra_errors(residual, np.hstack([_held_out_spread(fit), by_path]))
-    return _null_test(own, residual, 0, limits)
+    residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
+    return _null_test(own, residual, 0, limits), by_parameters
 
 
 def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnknownsResult:

@@ -423,7 +423,7 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
     """Loss of a model on the held-out recordings, with `spread` (n, k) of `AllCandidatesProblem.held_out_spread`."""
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
-    found, residuals, counts, numbered = problem.predict_held_out(x), [], [], []
+    found, residuals, numbered = problem.predict_held_out(x), [], []
     for i, (episode, result) in enumerate(found):
         blocks = []
         for samples in episode.measurements:
@@ -434,13 +434,13 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
         residuals.append(np.full(len(block), np.inf))
         if not isinstance(result, str):
             residuals[-1] = problem.whitened_held_out_prediction_residual(i, episode, result).residual
-        counts.append(np.bincount(block).astype(float))
         numbered.append(block)
     whole = np.concatenate(residuals)
     if spread is not None:  # what the nominal parameters leave uncertain is no gap
         whole = np.nan_to_num(whiten_with_extra_errors(whole, spread), nan=np.inf, posinf=np.inf, neginf=np.inf)
     parts = np.split(whole, np.cumsum([len(own) for own in residuals])[:-1])
     squares = [np.bincount(block, weights=own**2) for block, own in zip(numbered, parts, strict=True)]
+    counts = [np.bincount(block).astype(float) for block in numbered]
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
         found = problem_with_sensor_noise_only(problem).predict_held_out(x)
