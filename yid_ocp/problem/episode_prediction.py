@@ -17,7 +17,7 @@ from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDir
 from yid_ocp.integrator.tracking_feedback import JointMotionAndTorqueSensitivities
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialStateWithSensitivity
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialStateWithSensitivity, truncate_episode
 from yid_ocp.problem.evaluation import UnknownVectorLayout
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import (
@@ -35,7 +35,8 @@ from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeVal
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
-_MAX_FIRST_SAMPLE_TIME = 1.0  # latest time at which a point's first sample still shows the initial equilibrium [s]
+_MAX_RESTING_TIME = 1.0  # latest time at which a point's first sample still shows the shape of the equilibrium [s]
+_STEPS_AFTER_FIRST_POINTS = 2  # so many steps a first sample between two nodes needs
 # root mean square error of first points above which another equilibrium is sought [stds], and the part that may remain
 _POOR_EQUILIBRIUM_RMSE, _MAX_REMAINING_ERROR_FRACTION = 5.0, 0.5
 
@@ -501,51 +502,51 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
     fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
     if fitted or not predictor.system.grasps:
         return episode
-    seen = [found for samples in episode.measurements if (found := _first(samples, episode.grid.time_step)) is not None]
-    if not seen:
+    early = _until_first_points(episode)
+    if early is None:
         return episode
     own, n = predictor.theta_with_episode_values(episode, theta), predictor.system.n_coordinates
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
-    least = predictor.initial_state_of_episode(episode, own, offset, ())
-    error = _error(predictor, seen, least, own)
+    error = _first_points_error(predictor, early, theta)
     if not error > _POOR_EQUILIBRIUM_RMSE:
         return episode
     elastic = [predictor.system.mechanism.joint_index(spring.joint_name) for spring in predictor.system.elastic_joints]
-    shapes = [least.state[:n].copy()]
+    shapes = [predictor.initial_state_of_episode(episode, own, offset, ()).state[:n].copy()]
     shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
     with contextlib.suppress(DataError):
         fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
         # an equilibrium near this configuration has the details
-        shapes.append(fit(at, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path, roughly=True).state[:n])
-    others = [predictor.initial_state_of_episode(episode, own, offset, (), shape) for shape in shapes]
-    left, i = min((_error(predictor, seen, start, own), i) for i, start in enumerate(others))
-    is_better = left < _MAX_REMAINING_ERROR_FRACTION * error
-    return replace(episode, equilibrium_guess=others[i].state[:n]) if is_better else episode
+        fitted_shape = fit(at, early.measurements, own, _MAX_RESTING_TIME, episode.prescribed_path, roughly=True)
+        shapes.append(fitted_shape.state[:n])
+    others = [predictor.initial_state_of_episode(episode, own, offset, (), shape).state[:n] for shape in shapes]
+    errors = [_first_points_error(predictor, replace(early, equilibrium_guess=q), theta) for q in others]
+    best = int(np.argmin(errors))
+    is_better = errors[best] < _MAX_REMAINING_ERROR_FRACTION * error
+    return replace(episode, equilibrium_guess=others[best]) if is_better else episode
 
 
-def _first(samples: SensorMeasurements, time_step: float) -> SensorMeasurements | None:
-    """The first sample of points, moved to node 0; None if it comes too late."""
-    rows = np.flatnonzero(samples.positive_weight_mask.any(axis=1))[:1]
-    if not samples.sensor.point_names or not len(rows):
+def _until_first_points(episode: Episode) -> Episode | None:
+    """The episode until every point sensor has one sample, with these samples only; None without points."""
+    first = []
+    for samples in episode.measurements:
+        rows = np.flatnonzero(samples.positive_weight_mask.any(axis=1))[:1]
+        if samples.sensor.point_names and len(rows):
+            parts = {name: getattr(samples, name)[rows] for name in ("node", "fraction", "value", "weight", "std")}
+            change = None if samples.change_by_clock is None else samples.change_by_clock[rows]
+            first.append(replace(samples, **parts, noise_correlation=None, change_by_clock=change))
+    if not first:
         return None
-    if np.max(samples.node[rows]) * time_step > _MAX_FIRST_SAMPLE_TIME:
-        return None
-    parts = {name: getattr(samples, name)[rows] for name in ("value", "weight", "std")}
-    return replace(samples, node=np.zeros(1, np.int64), fraction=np.zeros(1), noise_correlation=None, **parts)
+    steps = max(int(samples.node[0]) for samples in first) + _STEPS_AFTER_FIRST_POINTS
+    return truncate_episode(replace(episode, measurements=tuple(first)), steps)
 
 
-def _error(
-    predictor: EpisodePredictor, seen: Sequence[SensorMeasurements], start: InitialStateWithSensitivity, theta: Array
-) -> float:
-    """Root mean square error of the first points at an initial state [stds]; infinite if it is no equilibrium."""
-    if start.failure_message:
+def _first_points_error(predictor: EpisodePredictor, early: Episode, theta: Array) -> float:
+    """Root mean square error of the first points [stds], predicted from rest; infinite if that fails."""
+    found = predictor.predict_episode(early, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
+    if isinstance(found, str):
         return math.inf
-    state, names = start.state[None], predictor.unknowns.free_parameter_names
-    squares: list[Array] = []
-    for samples in seen:
-        read = predictor.model_functions.compiled_sensor_function(samples.sensor, names)
-        predicted = read(NodeStateValues.from_trajectory(predictor.integrator_step, state), theta).output
-        squares.append(samples.whitened_residual(predicted)[samples.positive_weight_mask] ** 2)
+    pairs = zip(early.measurements, found.predicted_outputs, strict=True)
+    squares = [samples.whitened_residual(read)[samples.positive_weight_mask] ** 2 for samples, read in pairs]
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
