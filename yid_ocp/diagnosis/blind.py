@@ -134,8 +134,8 @@ _OUT_OF_LIBRARY_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "one_way_damping": ("segment", 0.3, 1.0, ""),
 }
 """Effects outside the library, by kind: type of location, smallest and largest size, reference of relative sizes."""
-_GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.08
-"""Travel of a single gripper, and of several grippers on one object, which snaps easily [m]."""
+_GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.05
+"""Travel of a single gripper, and of several grippers on one object, which snaps over in a sixth of motions of 8 cm."""
 
 
 @dataclass(frozen=True)
