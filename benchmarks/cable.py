@@ -31,10 +31,10 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (
-    CableBranchRigidityAndLinearDensity,
+    CableBranchRigidityDampingAndDensity,
     CableOptions,
     clamped_cable_system,
-    parameters_from_edge_lengths,
+    length_parameters_from_edges,
     read_vertex_positions_by_name,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -51,7 +51,7 @@ TIME_STEP = 0.01  # [s]
 NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 to 0.20 mm) [m]
 MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
 GRAVITY = 9.81  # [m/s^2]
-BRANCH = CableBranchRigidityAndLinearDensity(
+BRANCH = CableBranchRigidityDampingAndDensity(
     bend_rigidity=1.5e-3, twist_rigidity=1e-3, bend_damping=1e-3, has_separate_twist_damping=True
 )  # a guess
 OPTIONS = CableOptions(default_branch=BRANCH, shape_memory_fraction=0.5, has_rest_angle_parameters=True)
@@ -71,7 +71,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
     names: list[str] = []
     for name in cable.vertex_names_by_branch:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
-        if options.branch_density_and_damping.get(name, options.default_branch).has_separate_twist_damping:
+        if options.branch_properties_by_name.get(name, options.default_branch).has_separate_twist_damping:
             names.append(f"{name}.twist_damping")
         if options.shape_memory_fraction is not None:
             names.append(f"{name}.memory")
@@ -87,7 +87,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
 def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
     known = {
-        r.name: parameters_from_edge_lengths(cable, typical_point_pair_distances(cable.edge_vertex_names, [r], 2))
+        r.name: length_parameters_from_edges(cable, typical_point_pair_distances(cable.edge_vertex_names, [r], 2))
         for r in recordings
     }
     names = [name for name in identifiable_cable_parameter_names(cable, options) if name.endswith(".rest")]
@@ -95,7 +95,7 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
         initial_state="fitted_to_points",
         path_cutoff=8.0,
         sensors={"points": SensorOptions(std=MODEL_ERROR, used_points=cable.unclamped_vertex_names)},
-        clamp_pose_definitions_from_points=cable.clamp_pose_definitions_from_points,
+        clamp_pose_point_names=cable.clamp_pose_point_names,
         prior_stds=dict.fromkeys(names, 0.2),
         initial_state_fit_window=TIME_STEP,
         start_point_noise_std=NOISE,
@@ -116,7 +116,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
     """
     errors, found = {}, problem.predict_held_out(x)
     for i, episode in enumerate(problem.episodes):
-        own = problem.unpack_unknown_vector(x, i)
+        own = problem.unpack_episode_unknowns(x, i)
         found.append((episode, problem.predictor.predict_episode(episode, *own, False)))
     for episode, result in found:
         if isinstance(result, str):
@@ -157,7 +157,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)
     seconds["starts"] = time.perf_counter() - clock
     episode = problem.episodes[0]
-    (theta, offset) = problem.unpack_unknown_vector(problem.initial_unknowns, 0)
+    (theta, offset) = problem.unpack_episode_unknowns(problem.initial_unknowns, 0)
     clock = time.perf_counter()
     problem.predictor.predict_episode(episode, theta, offset, False)
     seconds["rollout"] = time.perf_counter() - clock
@@ -211,7 +211,7 @@ def parameters(cable: CableTopology, x: Any, covariance: Any, names: tuple[str, 
         branch, _, quantity = name.partition(".")
         result[name] = {"value": float(x[i]), "std": float(covariance[i, i]) ** 0.5}
         if branch in cable.vertex_names_by_branch and quantity in units:
-            weight = OPTIONS.branch_density_and_damping.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
+            weight = OPTIONS.branch_properties_by_name.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
             result[name] |= {"per_weight": float(x[i]) / weight, "per_weight_unit": units[quantity]}
     return result
 

@@ -53,14 +53,14 @@ def with_torque_noise(case: str, folder: Path) -> tuple[str, ...]:
     from diagnosis_cases import CASES
     from make_recordings import TRAVEL, TRUTH
 
-    from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+    from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
     from yid_ocp.data.recording_hdf5 import write_recording
     from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
     from yid_ocp.virtual.injected import run_experiment_with_effects
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.workflow.build import build_system
 
-    system = build_system(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
+    system = build_system(load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME))
     posture, travel = grasping_joint_angles(system, TRUTH), MultisineOptions(gripper_travel=TRAVEL[1])
     command = ["diagnose", "--set", "diagnosis.candidates=all"]
     for role, seed, noise_seed in (("estimate", 1, 401), ("held_out", 7, 402)):

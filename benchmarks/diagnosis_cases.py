@@ -27,7 +27,7 @@ from typing import Any
 import threadpoolctl
 from make_recordings import TRAVEL, TRUTH
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.blind import scale_parameters_to_more_links
 from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict, rejudge_diagnosis_evidence
@@ -152,7 +152,7 @@ CASES: Mapping[str, Case] = {
 
 
 def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
-    run = load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    run = load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     nominal = build_system(run)
     links = len(nominal.segment_layouts[0].link_joints) * case.links
     system = nominal if case.links == 1 else build_system(run, links)
@@ -178,7 +178,7 @@ def found(name: str, seeds: Sequence[int], truth: bool = True) -> tuple[Diagnosi
     """
     case = CASES[name]
     estimate, held_out = (record(case, *pair) for pair in zip(seeds, NOISE_SEEDS, strict=True))
-    nominal = build_problem(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
+    nominal = build_problem(load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME))
     problem = EstimationProblem(nominal.step, [estimate], nominal.free, nominal.options)
     everything = [effect.label for effect in make_candidate_effects(problem.system, [estimate], "all")]
     library = [label for label in everything if label.partition("@")[0] not in case.without]
@@ -215,7 +215,7 @@ def right(case: Case, finding: DiagnosisResult) -> bool:
 
 def rescored(folder: Path, names: Sequence[str], overrides: Sequence[str]) -> int:
     """Recorded cases judged again, beside what was said; how many differ."""
-    wanted, differ = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis, 0
+    wanted, differ = load_config(None, overrides, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis, 0
     changes = {name: getattr(wanted, name) for name in (text.split("=")[0].split(".")[-1] for text in overrides)}
     print("| case | then | now | differs |\n|---|---|---|---|")
     for name in names:

@@ -15,7 +15,7 @@ import time
 from rich.console import Console
 from rich.table import Table
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build_problem import build_problem
@@ -28,7 +28,7 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=2)
     given = parser.parse_args()
     for config in given.configs or [None]:
-        show(build_problem(load_config(config, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)), given.runs)
+        show(build_problem(load_config(config, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)), given.runs)
     return 0
 
 

@@ -37,7 +37,7 @@ from coverage import (
 )
 from make_recordings import OFFSETS, TRUTH
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.files import json_sha256, to_json_types, write_strict_json
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
@@ -127,9 +127,7 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         f"recordings.{key}=[{json.dumps(str(path))}]" for key, path in zip(USES, (estimate, held_out), strict=True)
     ]
     with tempfile.TemporaryDirectory() as folder:
-        made = load_config(
-            config, [*given, "output.write_report=false", *settings], EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME
-        )
+        made = load_config(config, [*given, "output.write_report=false", *settings], SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
         finding = run_diagnose(made, Path(folder) / "run").output
     detectable = {
         f"{entry.effect.label}.{name}": value

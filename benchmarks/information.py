@@ -30,7 +30,7 @@ from diagnosis_cases import CASES, record
 from make_recordings import ROUGH, TRUTH
 from planning import PlannedMovement
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording, SensorChannelGroup
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.diagnose import diagnose
@@ -125,7 +125,7 @@ def _row(words: str, solution: Solution) -> tuple[str, ...]:
 def pair(name: str, starts: int, share: float) -> None:
     case = CASES[name]
     case = replace(case, withheld=tuple(_share(effect, share) for effect in case.withheld))
-    run = load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    run = load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     nominal = build_problem(run)
     made = [record(case, 1, 401), record(case, 7, 402)]
     before = _diagnosed(nominal, made[:1], made[1:])

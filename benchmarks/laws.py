@@ -26,7 +26,7 @@ import numpy as np
 from make_recordings import TRAVEL, TRUTH
 
 from yid_ocp.arrays import Array
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
@@ -129,7 +129,7 @@ class Injected:
 
 
 def record(case: Case, motion_seed: int, noise_seed: int, noisy: bool) -> Recording:
-    system = build_system(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
+    system = build_system(load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME))
     posture = grasping_joint_angles(system, TRUTH)
     excitation = MultisineOptions(gripper_travel=TRAVEL[1])
     motion = random_multisine_motion(
@@ -169,7 +169,7 @@ def run(name: str, candidates: Any) -> dict[str, Any]:
     case = ALL_CASES[name]
     noisy = case.withheld is None and list(CASES).index(name) % 2 == 1
     estimate, held_out = (record(case, *pair, noisy) for pair in zip(MOTION_SEEDS, NOISE_SEEDS, strict=True))
-    nominal = build_problem(load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME))
+    nominal = build_problem(load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME))
     problem = EstimationProblem(nominal.step, [estimate], nominal.free, nominal.options)
     if case.withheld is not None:
         library = make_candidate_effects(problem.system, [estimate], candidates)

@@ -30,7 +30,7 @@ from yid_ocp.errors import DataError, YidError
 from yid_ocp.integrator.step import Step
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_inputs import resolve_recording_path
+from yid_ocp.workflow.run_inputs import resolve_default_recording
 
 Damage = Callable[[Recording], Recording]
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -286,7 +286,7 @@ def renamed(old: str, new: str) -> Damage:
 
 def other_arm(recording: Recording) -> Recording:
     """The right arm's recording under the left arm's names."""
-    other = read_recording(resolve_recording_path("default:dual_arm_vision_held_out.h5"))
+    other = read_recording(resolve_default_recording("default:dual_arm_vision_held_out.h5"))
     group = other.joints
     assert group is not None
     columns = [i for i, name in enumerate(group.names) if name.startswith("right")]
@@ -467,7 +467,7 @@ def clean_recording(case: Case) -> Path | None:
     """The recording that a case damages, None where it is not here."""
     if case.config in REAL:
         return _real(case.config) if _real(case.config).is_file() else None
-    return Path(resolve_recording_path(f"default:{case.config}_estimate.h5"))
+    return Path(resolve_default_recording(f"default:{case.config}_estimate.h5"))
 
 
 def prepared(case: Case, folder: Path) -> RunSettings:
@@ -506,8 +506,8 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
     causes = sorted({doubt.cause for doubt in doubts})
     found: list[str] = []
     wrong: list[str] = []
-    if solving and problem.options.no_data_issue_exceeds_warning:
-        outcome = solve(problem, run.solver, limits=run.diagnosis.null_test_residual_limits)
+    if solving and problem.options.has_no_data_issue_above_warning:
+        outcome = solve(problem, run.solver, limits=run.diagnosis.fit_excess_residual_criteria)
         verdicts = {name: entry for name, entry in outcome.parameters.items() if entry.verdict == "identifiable"}
         found = list(verdicts)
         truth = problem.episodes[0].recording.true_parameters
@@ -516,7 +516,7 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
         "outcome": "doubted" if doubts else "believed",
         "named": bool(set(causes) & set(case.causes)),
         "causes": causes,
-        "harmless": problem.options.no_data_issue_exceeds_warning and bool(doubts),
+        "harmless": problem.options.has_no_data_issue_above_warning and bool(doubts),
         "found": found,
         "wrong": wrong,
         "doubts": [f"{doubt.location_text}: {doubt.what}" for doubt in doubts],

@@ -24,8 +24,8 @@ from yid_ocp.diagnosis import law as gap_law
 from yid_ocp.effects.law import (
     TorqueLaw,
     TorqueLawTable,
+    torque_law_argument_along_rollout,
     torque_law_from_tables,
-    torque_law_quantity_values_along_rollout,
 )
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.integrator.step import compile_step_like
@@ -46,12 +46,12 @@ def visited(problem: EstimationProblem, solution: Solution, quantity: str) -> di
     """Values of a quantity in the fit's rollout of every recording."""
     found = {}
     for i, (episode, result) in enumerate(zip(problem.episodes, solution.evaluation.episode_predictions, strict=True)):
-        deviated, _ = problem.unpack_unknown_vector(solution.x, i)
+        deviated, _ = problem.unpack_episode_unknowns(solution.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, deviated)
         own = result.rollout
         nodes = {"state": own.state, "torque": own.torque, "multipliers": own.multipliers}
         nodes["time_step"] = np.array(episode.grid.time_step)
-        values = torque_law_quantity_values_along_rollout(problem.system, JOINT, quantity, theta, nodes).ravel()
+        values = torque_law_argument_along_rollout(problem.system, JOINT, quantity, theta, nodes).ravel()
         found[episode.name] = values[np.isfinite(values)]
     return found
 
@@ -109,7 +109,7 @@ def main() -> int:
     run = load_config(CONFIG)
     friction = FrictionLawSettings(law=arguments.friction, joints=None)
     model = replace(run.model, friction=friction)
-    base = ladder.problem_estimating_on_held_out_too(build_problem(replace(run, model=model)))
+    base = ladder.problem_estimating_from_all_recordings(build_problem(replace(run, model=model)))
     kinds, solution = ladder.recording_names_by_name_stem(base), solve(base, run.solver, restarts=False)
     print("| law of | error on kinds left out [rad] | " + " | ".join(n for own in kinds.values() for n in own) + " |")
     for quantity in (None, *arguments.quantities):

@@ -101,9 +101,9 @@ model:
   effects:
     - {kind: kelvin_voigt, location: T1, values: {tau: 0.02}}
 """,
-    "model.bodies_missing_from_urdf": """\
+    "model.surfaces_missing_from_urdf": """\
 model:
-  bodies_missing_from_urdf:
+  surfaces_missing_from_urdf:
     - {mesh_file: gripper.stl, parent_frame: left_hand}
     - {box_size: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
 """,
@@ -227,7 +227,7 @@ track:
     "track.options.skeleton": """\
 track:
   options:
-    skeleton: {neighbour_radius: 0.05, points_per_segment: 30}     # [m]
+    skeleton: {neighbour_radius: 0.05, max_cloud_points_per_node: 30}     # [m]
 """,
     "track.options.shape_fit": """\
 track:

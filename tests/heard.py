@@ -15,5 +15,5 @@ class Heard(Progress):
     def report_parts_done(self, done, total, text):
         self.parts.append((done, total, text))
 
-    def report_table(self, rows):
+    def renew_results_table(self, rows):
         self.table = rows

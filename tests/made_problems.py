@@ -65,7 +65,7 @@ class MadeUp:
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.unknown_scales = np.abs(self.initial_unknowns) if scales is None else np.array(scales, float)
         self.options = SimpleNamespace(
-            no_data_issue_exceeds_warning=True,
+            has_no_data_issue_above_warning=True,
             weighting=weighting,
             prior_stds=dict(priors or {}),
             known_initial_states={},
@@ -106,7 +106,7 @@ class MadeUp:
     def residual_rows(self) -> ResidualVectorLayout:
         return ResidualVectorLayout.from_episodes(self.episodes, self._stated, self._weak)
 
-    def unpack_unknown_vector(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    def unpack_episode_unknowns(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         theta = self.theta.copy()
         theta[len(theta) - len(x) :] = x[::-1]
         return theta, np.zeros(0)

@@ -14,7 +14,7 @@ def assert_nothing_impossible_is_said(finding: DiagnosisResult, text: str) -> No
     assert not re.search(r"\b(nan|inf)\b", text), text
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     if "The gap is real" in text and finding.screening.candidate_scores:
-        assert residuals_exceed_noise(tests, finding.thresholds.null_test_limits), text
+        assert residuals_exceed_noise(tests, finding.thresholds.null_test_excess_criteria), text
     if finding.verdict in ("no_gap", "insufficient_data"):
         assert "The gap is real" not in text
         assert not finding.accepted_effects

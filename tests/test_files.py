@@ -149,7 +149,7 @@ OPENED_ELSEWHERE = {
     "solvers.nonlinear_program.available_memory_bytes": "/proc",
     **{f"vision.frame_folder._read_{suffix}": "`_read_cloud` has looked" for suffix in ("npz", "xyz", "pcd", "ply")},
     "vision.frame_folder.write_frame_folder": "writes",
-    "virtual.mjcf.model_aspect_table": "a table that comes with the package",
+    "virtual.mjcf.format_elements_by_model_aspect": "a table that comes with the package",
     "workflow.run_folder.atomic_run_folder": "writes",
     "workflow.run_inputs.load_plugins": "a package that the user installed",
 }

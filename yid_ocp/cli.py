@@ -492,7 +492,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
         if isinstance(run, str):
             gc.disable()  # imports leave nothing to collect, and looking for it takes a tenth of their time
             try:
-                run = import_module(f"yid_ocp.workflow.{run}").run_from_arguments
+                run = import_module(f"yid_ocp.workflow.{run}").run_and_return_exit_code
                 gc.freeze()  # nor do later collections look through modules
             finally:
                 gc.enable()

@@ -98,7 +98,7 @@ class Progress:
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Report that `done` of `total` parts of the stage are finished. `text` names the last or next part."""
 
-    def report_table(self, rows: Sequence[Sequence[str]]) -> None:
+    def renew_results_table(self, rows: Sequence[Sequence[str]]) -> None:
         """Report a table of all results so far: header first, then the best result. It replaces the previous table."""
 
 
@@ -133,4 +133,4 @@ class PartsDoneCounter:
             self._count += 1
             self._progress.report_parts_done(self._count, self._total, text)
             if table is not None:
-                self._progress.report_table(table())
+                self._progress.renew_results_table(table())

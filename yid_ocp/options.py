@@ -82,7 +82,7 @@ def split_annotated(hint: Any) -> tuple[Any, list[Any]]:
     return hint, markers
 
 
-def union_members(hint: Any) -> tuple[Any, ...]:
+def non_none_union_members(hint: Any) -> tuple[Any, ...]:
     """Member types of a union, without None. For another type, the type itself."""
     bare, _ = split_annotated(hint)
     if get_origin(bare) in (Union, types.UnionType):
@@ -92,7 +92,7 @@ def union_members(hint: Any) -> tuple[Any, ...]:
 
 def mapping_value_type(hint: Any) -> Any:
     """Value type of a mapping type; None for other types."""
-    found = (split_annotated(member)[0] for member in union_members(hint))
+    found = (split_annotated(member)[0] for member in non_none_union_members(hint))
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
@@ -108,7 +108,7 @@ def describe_type(hint: Any) -> str:
     bare, markers = split_annotated(hint)
     unit = next((marker.unit for marker in markers if isinstance(marker, OptionInfo) and marker.unit), "")
     limits = [f"{word} {limit:g}" for limit, _, word in _bounds(markers)]
-    text = " or ".join(dict.fromkeys(map(_words, union_members(bare))))
+    text = " or ".join(dict.fromkeys(map(_words, non_none_union_members(bare))))
     least = [f", {marker.min_length} at least" for marker in markers if isinstance(marker, annotated_types.Len)]
     return " ".join([text, *limits]) + "".join(least) + (f" [{unit}]" if unit else "")
 
@@ -146,7 +146,7 @@ def _within(hint: Any, value: Any) -> bool:
         return entries is None or all(_within(entries, entry) for entry in value)
     if not isinstance(value, (int, float)):
         return True
-    markers = [marker for part in (hint, *union_members(hint)) for marker in split_annotated(part)[1]]
+    markers = [marker for part in (hint, *non_none_union_members(hint)) for marker in split_annotated(part)[1]]
     return all(is_within(value, limit) for limit, is_within, _ in _bounds(markers))
 
 

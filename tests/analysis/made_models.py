@@ -57,14 +57,14 @@ class Formula(MadeUp):
         self.local_parameters = tuple(dict.fromkeys(name.split("[")[0] for name in self.free if "[" in name))
         kinds, whole = dict(units or {}), dict.fromkeys(name.split("[")[0] for name in names)
         self.system.parameters = Parameters(Parameter(name, 1.0, kinds.get(name, "N m/rad")) for name in whole)
-        self.theta, _ = self.unpack_unknown_vector(self.initial_unknowns, 0)
+        self.theta, _ = self.unpack_episode_unknowns(self.initial_unknowns, 0)
 
     @property
     def points(self) -> list[tuple[float, ...]]:
         """Where it was evaluated."""
         return [tuple(x) for x, *_ in self.asked]
 
-    def unpack_unknown_vector(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    def unpack_episode_unknowns(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         values = dict(zip((name.split("[")[0] for name in self.unknown_names), np.asarray(x, float), strict=True))
         return np.array([values[name] for name in self.system.parameters.names]), np.zeros(0)
 

@@ -20,7 +20,7 @@ from yid_ocp.analysis.estimation import (
     _worse_than_baseline_issues,
     channels_worse_than_naive_prediction,
     choose_cable_memory_fit,
-    prediction_errors_and_units,
+    prediction_errors_units_and_fit_errors,
 )
 from yid_ocp.cli import main
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
@@ -349,7 +349,7 @@ class Means:
         start = None if speed is None else SimpleNamespace(fitted_parameters={INITIAL_RMS_SPEED_PARAMETER: speed})
         return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
 
-    def unpack_unknown_vector(self, x, i):
+    def unpack_episode_unknowns(self, x, i):
         return float(x[0]) + (0.0 if "a.memory" in self.unknown_names else self.off), None
 
     def evaluate(self, x, equilibrium_guesses=None):
@@ -469,7 +469,7 @@ def test_errors_of_held_out_and_fitted_recordings_leave_out_what_fixed_the_start
     made = EstimationProblem(step, [taken(step, 1)], ("elbow.stiffness",), options, None, [taken(step, 2)])
     evaluation, held_out = made.evaluate(made.initial_unknowns, False), made.predict_held_out(made.initial_unknowns)
     fit = SimpleNamespace(evaluation=evaluation, episode_predictions=evaluation.episode_predictions)
-    entries, units, residuals = prediction_errors_and_units(made, fit, held_out)
+    entries, units, residuals = prediction_errors_units_and_fit_errors(made, fit, held_out)
     assert [entry["recording"] for entry in entries] == ["run_2", "run_1"]
     assert units == dict.fromkeys(residuals, "m")
     [k] = [i for i, s in enumerate(made.episodes[0].measurements) if s.sensor.group_name == "points_camera"]
@@ -479,13 +479,13 @@ def test_errors_of_held_out_and_fitted_recordings_leave_out_what_fixed_the_start
     assert later.all() == (start == "equilibrium")
     assert entries[1]["rmse"]["points_camera"] == pytest.approx(math.sqrt(np.nanmean(square[later])))
     assert entries[1]["rmse"]["points_camera.tip"] == pytest.approx(math.sqrt(np.nanmean(square[:, 1])))
-    unfitted, nothing, _ = prediction_errors_and_units(made, SimpleNamespace(evaluation=None), held_out)
+    unfitted, nothing, _ = prediction_errors_units_and_fit_errors(made, SimpleNamespace(evaluation=None), held_out)
     assert ([entry["recording"] for entry in unfitted], nothing) == (["run_2"], {})
 
 
 def test_the_error_to_expect_is_that_of_the_sensors_and_of_torques_as_wrong_as_stated(urdf_folder):
     step = pendulum_step(urdf_folder, driven=("shoulder",))
-    how = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
+    how = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 
     def expected(size):
         recordings = [taken(step, seed) for seed in (3, 4)]

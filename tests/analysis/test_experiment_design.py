@@ -17,7 +17,7 @@ from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
     ExperimentVariantSensitivityBuilder,
-    SinglePointObservationSchedule,
+    PointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
     measurable_points,
@@ -56,7 +56,7 @@ def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
         (made.camera_point_group_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_point_group_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.arm_point_group_with_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -105,7 +105,7 @@ def sloped():
 
 def view(times, std, frame="a"):
     stds = np.array(std, float) * np.ones((len(times), 3))
-    return SinglePointObservationSchedule("camera", frame, np.array(times), stds)
+    return PointObservationSchedule("camera", frame, np.array(times), stds)
 
 
 TIMES = [(0.0, {0: 1.0}), (0.5, {1: 1.0}), (0.75, {1: 0.5, 2: 0.5}), (1.6, {3: 0.8, 4: 0.2}), (2.0, {4: 1.0})]
@@ -287,8 +287,8 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
     builder, made = built(held_tube, "weld")
     (grasp,), free = made.problem.system.grasps, builder.position_sensitivities_of_variant(frozenset())
     assert grasp.kind == "weld"
-    start = free.problem.initial_state_of_episode(
-        free.problem.episodes[0], *free.problem.unpack_unknown_vector(free.x, 0)
+    start = free.problem.initial_state_and_derivative(
+        free.problem.episodes[0], *free.problem.unpack_episode_unknowns(free.x, 0)
     )
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
     tree = system.numeric_mechanism()
@@ -379,7 +379,7 @@ def drawn_motion(monkeypatch):
             row[:, feedback.state_indices] -= s.state_by_torque @ gain
         return [(np.stack(rows), None)]
 
-    monkeypatch.setattr(propagation, "next_state_derivatives", maps)
+    monkeypatch.setattr(propagation, "next_state_and_effort_derivatives", maps)
     monkeypatch.setattr(
         propagation, "applied_torque_derivative_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )
@@ -524,19 +524,16 @@ def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_fo
     levels = {"effort_std": 0.3, "effort_bias_std": 0.2, "position_std": 0.0}
     made = replace(made, joints=replace(made.joints, **levels))
     options = ProblemOptions(
-        path_cutoff=math.inf,
-        arm_tracking_feedback=feedback,
-        arm_tracking_feedback_gains=(9.0,),
-        initial_state="equilibrium",
+        path_cutoff=math.inf, arm_tracking_feedback=feedback, arm_proportional_gains=(9.0,), initial_state="equilibrium"
     )
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), options)
     x, [episode] = problem.initial_unknowns, problem.episodes
-    slopes, _ = propagation.sensitivities_with_input_errors(problem, problem.evaluate(x), x, 0, {tip.name: 1e-6})
+    slopes, _ = propagation.sensitivities_and_information(problem, problem.evaluate(x), x, 0, {tip.name: 1e-6})
     [found] = (own[:, :, len(x) :].reshape(-1, own.shape[2] - len(x)) for own in slopes.values())
 
     def seen(change):
         moved = replace(episode, torque=episode.torque + change[:, None], input_errors=None)
-        result = problem.predictor.predict_episode(moved, *problem.unpack_unknown_vector(x, 0), False)
+        result = problem.predictor.predict_episode(moved, *problem.unpack_episode_unknowns(x, 0), False)
         return result.predicted_outputs[0].ravel()
 
     count, size = len(episode.torque), 1e-4

@@ -14,7 +14,7 @@ from small_problems import joints, measured, pendulum_step, points, recording, s
 from yid_ocp.analysis.clock_checks import (
     _by_clock,
     _clock_error,
-    clock_drift_and_overstated_noise_issues,
+    clock_and_noise_issues_from_residuals,
     clock_offset_drift_and_rms_distance,
 )
 from yid_ocp.analysis.estimation import _baselines
@@ -669,7 +669,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0):
         options = replace(options, sensors={**options.sensors, group.name: own})
     made = EstimationProblem(problem.step, [replace(recording, points=(moved,))], problem.free, options)
     solution = solve(made, run.solver)
-    return clock_drift_and_overstated_noise_issues(solution.problem or made, solution.x, solution.evaluation)
+    return clock_and_noise_issues_from_residuals(solution.problem or made, solution.x, solution.evaluation)
 
 
 def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a_diagnosis(springs):
@@ -695,7 +695,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
     problem = EstimationProblem(step, [replace(made, points=(moved,))], ["elbow.stiffness"])
     solution = solve(problem, GaussNewton(), restarts=False)
     assert solution.problem.has_process_noise
-    (doubt,) = clock_drift_and_overstated_noise_issues(solution.problem, solution.x, solution.evaluation)
+    (doubt,) = clock_and_noise_issues_from_residuals(solution.problem, solution.x, solution.evaluation)
     assert (doubt.cause, doubt.group) == ("clock_drift", "points_camera")
     assert "its clock runs 20 ± 0.4 parts per thousand too fast" in doubt.what
 

@@ -27,7 +27,7 @@ def symbols(urdf_folder):
 def point(symbols):
     rng = np.random.default_rng(3)
     values = rng.uniform(0.2, 0.6, len(symbols.all_variable_names))
-    span = symbols.block_slice("theta")
+    span = symbols.row_or_column_block_slice("theta")
     values[span] = symbols.equations.system.parameters.vector() + 0.1
     values[symbols.all_variable_names.index("h")] = 0.02
     return values
@@ -57,10 +57,10 @@ def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
     expected = value(symbols, ca.vertcat(e.momentum_balance, e.internal_residual, e.constraint_residual, e.p1), at)
     np.testing.assert_array_equal(value(symbols, symbols._row_expressions, at), expected)
     for block in (*symbols.row_blocks, *symbols.column_blocks):
-        span = symbols.block_slice(block.name)
+        span = symbols.row_or_column_block_slice(block.name)
         assert span.stop - span.start == len(block.labels) == block.expressions.numel()
-    assert symbols.all_variable_names.index("q1[T1_0_x]") == symbols.block_slice("q1").start + 2
-    assert symbols.row_names.index("p1[elbow]") == symbols.block_slice("p1").start + 1
+    assert symbols.all_variable_names.index("q1[T1_0_x]") == symbols.row_or_column_block_slice("q1").start + 2
+    assert symbols.row_names.index("p1[elbow]") == symbols.row_or_column_block_slice("p1").start + 1
     for name in ("lam[hand.tilt_y]", "T1.bend", "h", "u[shoulder]"):
         assert symbols.all_variable_names[symbols.all_variable_names.index(name)] == name
 

@@ -53,7 +53,7 @@ def test_a_solve_waits_for_no_library_that_it_does_not_run():
 def test_every_command_is_a_function_of_workflow_and_prints_json():
     for row in COMMANDS:
         if isinstance(row.run, str):
-            assert callable(importlib.import_module(f"yid_ocp.workflow.{row.run}").run_from_arguments)
+            assert callable(importlib.import_module(f"yid_ocp.workflow.{row.run}").run_and_return_exit_code)
             made = argparse.ArgumentParser()
             row.add_arguments(made)
             assert {"--json", "--quiet", "--verbose"} <= set(made._option_string_actions), row.name
@@ -170,7 +170,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
     def broken(arguments):
         raise ZeroDivisionError("no good")
 
-    monkeypatch.setattr("yid_ocp.workflow.check.run_from_arguments", broken)
+    monkeypatch.setattr("yid_ocp.workflow.check.run_and_return_exit_code", broken)
     bug = cli("check", pendulum, "--json")
     said = json.loads(bug.out)
     assert (bug.code, said["exit_code"], said["kind"], said["what"]) == (3, 3, "bug", "ZeroDivisionError: no good")
@@ -179,7 +179,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
     def stopped(arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("yid_ocp.workflow.check.run_from_arguments", stopped)
+    monkeypatch.setattr("yid_ocp.workflow.check.run_and_return_exit_code", stopped)
     ended = cli("check", pendulum, "--json")
     assert (ended.code, json.loads(ended.out)["exit_code"]) == (130, 130)
 
@@ -190,7 +190,7 @@ def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
             logging.getLogger("yid_ocp.model").warning(text)
         return 0
 
-    monkeypatch.setattr("yid_ocp.workflow.check.run_from_arguments", noted)
+    monkeypatch.setattr("yid_ocp.workflow.check.run_and_return_exit_code", noted)
     for _ in range(2):
         assert cli("check", pendulum).err == "notice: a coupling is not modelled\nnotice: another thing\n"
 

@@ -158,14 +158,14 @@ def test_letters_that_the_terminal_lacks_are_shown_as_escapes(pendulum, tmp_path
 @pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
 def test_a_signal_that_a_library_swallows_still_ends_the_command(cli, pendulum, left_nothing, monkeypatch):
     """As an import does that tries what there is."""
-    made = simulate_module.run_from_arguments
+    made = simulate_module.run_and_return_exit_code
 
     def swallow(*arguments, **named):
         with contextlib.suppress(BaseException):
             os.kill(os.getpid(), signal.SIGTERM)
         return made(*arguments, **named)
 
-    monkeypatch.setattr(simulate_module, "run_from_arguments", swallow)
+    monkeypatch.setattr(simulate_module, "run_and_return_exit_code", swallow)
     assert cli("simulate", pendulum, "--quiet").code == 143
     left_nothing()
 

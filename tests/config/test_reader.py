@@ -10,7 +10,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp import options
-from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DEFAULT_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.schema import section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
@@ -20,9 +20,9 @@ RENAMED = "find its new name in the table of CHANGELOG.md"
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
-    embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT_CONFIG_FILE_NAME
-    assert embedded.read_bytes() == (repository / "configs" / DEFAULT_CONFIG_FILE_NAME).read_bytes()
-    assert load_config() == dataclasses.replace(load_config(repository / "configs" / DEFAULT_CONFIG_FILE_NAME))
+    embedded = repository / "yid_ocp" / "data" / "defaults" / SHIPPED_DEFAULT_CONFIG_FILE_NAME
+    assert embedded.read_bytes() == (repository / "configs" / SHIPPED_DEFAULT_CONFIG_FILE_NAME).read_bytes()
+    assert load_config() == dataclasses.replace(load_config(repository / "configs" / SHIPPED_DEFAULT_CONFIG_FILE_NAME))
 
 
 def test_numbers_as_in_yaml_1_2(written):
@@ -101,7 +101,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("model:\n  arms: {joints: left_s0}\n", ["a list"]),
         ("problem:\n  duration: true\n", ["a number"]),
         ("problem:\n  time_step: '0.01'\n", ["a number"]),
-        ("problem:\n  arm_tracking_feedback_gains: []\n", ["problem.arm_tracking_feedback_gains"]),
+        ("problem:\n  arm_proportional_gains: []\n", ["problem.arm_proportional_gains"]),
         ("description: 2024-01-01\n", ["description"]),
         ("sensors:\n  points: {std: 0}\n", ["above 0"]),
         # unknown keys: the nearest one, and the sections that have it
@@ -243,7 +243,7 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
             yield from numbers(named.variants_for_entry(name, "").classes[""], within(wrap, name), (*path, name))
     elif values is not None:
         yield from numbers(values, within(wrap, "NAME"), (*path, "NAME"), option)
-    for member in options.union_members(hint):
+    for member in options.non_none_union_members(hint):
         entries, (bare, markers) = options.variadic_tuple_entry_type(member), options.split_annotated(member)
         if entries is not None:
             yield from numbers(entries, lambda value: wrap([value]), path, option)

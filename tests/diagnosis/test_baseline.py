@@ -10,7 +10,7 @@ from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import DiagnosisBaseline, _estimated_without, add_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, _estimated_without, add_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -52,7 +52,7 @@ def swing(folder, name, seed, effects="[]"):
     problem = build_problem(run)
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
     values = problem.named_values(problem.unknown_vector({**TRUTH, **start}))
-    theta, offset = problem.unpack_unknown_vector(problem.unknown_vector(values), 0)
+    theta, offset = problem.unpack_episode_unknowns(problem.unknown_vector(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
     made = recording_from_prediction(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)
@@ -116,7 +116,7 @@ def test_the_world_without_effects_is_estimated_on_its_own_recordings(beam):
 
 
 def test_without_earlier_runs_there_is_nothing_to_differ():
-    none = DiagnosisBaseline.from_run_estimates([], ())
+    none = EarlierRunsBaseline.from_run_estimates([], ())
     assert (none.combined_estimates, none.between_runs_p_value) == (None, 1.0)
 
 
@@ -131,7 +131,7 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
     both = refit_with_effects(AllCandidatesProblem(add_baseline_prior(problem, known), (), False), (), {})
-    baseline = DiagnosisBaseline.from_run_estimates([known], ())
+    baseline = EarlierRunsBaseline.from_run_estimates([known], ())
     [shift] = baseline.parameter_shifts_of_fit(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:

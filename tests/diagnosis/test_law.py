@@ -12,14 +12,14 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.law import (
     TorqueLawTable,
     read_torque_law_tables,
+    torque_law_argument_along_rollout,
     torque_law_from_tables,
-    torque_law_quantity_values_along_rollout,
     torque_law_tables_csv,
 )
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MotorModelOptions, ServoModelOptions
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MotorKindAndPreset, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow.build import build_system
@@ -112,7 +112,7 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
 
 
 def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
-    servos = ServoModelOptions(motor=MotorModelOptions("dc"))
+    servos = ServoModelOptions(motor=MotorKindAndPreset("dc"))
     plain = pendulum_step(urdf_folder, driven=JOINTS, servos=servos)
     law = torque_law_from_tables("elbow", plain.system, tables(quantities=("command",)))
     with_law = compile_step(plain.system.with_effects([law]), H, use_compiler=False)
@@ -124,7 +124,7 @@ def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
     assert np.abs(runs[1].state[40] - runs[0].state[40]).max() > 1e-4
     nodes = {"state": runs[1].state, "torque": commands, "multipliers": np.zeros((40, 0)), "time_step": np.array(H)}
     theta = with_law.system.parameters.vector()
-    seen = torque_law_quantity_values_along_rollout(with_law.system, "elbow", "command", theta, nodes)
+    seen = torque_law_argument_along_rollout(with_law.system, "elbow", "command", theta, nodes)
     assert np.isnan(seen[:20]).all()
     motor = torque_function(plain, {})
     middle, rate = (runs[1].state[21:, :2] + runs[1].state[20:-1, :2]) / 2, np.diff(runs[1].state[20:, :2], axis=0) / H

@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.pulse_detection import (
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import benjamini_hochberg_mask
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 
 T = 0.1 * np.arange(80)
 NOISE = 0.02
@@ -107,7 +107,7 @@ def test_the_likeliest_forces_are_those_measured_in_whatever_unit(unit):
 
 
 def test_windows_longer_than_a_history_are_not_looked_at():
-    made = history(wobble()).subset_at_indices(np.arange(20))
+    made = history(wobble()).subset_at_time_indices(np.arange(20))
     tries = [detect_force_pulses(made, Thresholds(max_event_duration=longest))[1] for longest in (1.9, 5.0, 50.0)]
     assert tries[0] == tries[1] == tries[2] > 1
 
@@ -116,7 +116,7 @@ def test_a_filter_widens_what_is_seen_and_not_what_is_told():
     fine = np.arange(0, 8, 0.005)
     cutoff = 3.0
     narrow = 0.8 * np.where((fine > 4) & (fine < 4.3), np.sin(np.pi * (fine - 4) / 0.3) ** 2, 0)
-    seen = np.interp(T, fine, LowPassFilter(cutoff)(fine, narrow[:, None])[:, 0])
+    seen = np.interp(T, fine, ZeroPhaseLowPassFilter(cutoff)(fine, narrow[:, None])[:, 0])
     (pulse,) = sure(history(seen, noise=0.005, filter_cutoff=cutoff, model_error_std=0.01 + 0 * T))
     assert pulse.end_time - pulse.start_time < 0.5
     assert pulse.impulse == pytest.approx(0.8 * 0.15, rel=0.15)

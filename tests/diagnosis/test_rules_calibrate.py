@@ -19,7 +19,7 @@ from yid_ocp.diagnosis.blind_scores import (
     _recommended_settings,
     calibrate_thresholds,
     score_blind_case,
-    thresholds_accepting_best_candidate,
+    thresholds_always_accepting_best_candidate,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.virtual.injected import InjectedEffect
@@ -158,7 +158,7 @@ def test_cases_that_could_not_be_fitted_do_not_count() -> None:
 
 def test_every_rule_is_of_a_threshold() -> None:
     assert all(hasattr(Thresholds(), rule.setting) for rule in _CALIBRATION_RULES.values())
-    wide = thresholds_accepting_best_candidate(Thresholds(n_refit_per_round=3))
+    wide = thresholds_always_accepting_best_candidate(Thresholds(n_refit_per_round=3))
     assert wide.n_refit_per_round == 3
     assert wide.significance_level > 1 > Thresholds().significance_level
 
@@ -172,7 +172,7 @@ def test_defaults_are_those_that_it_advises_and_follow_from_its_samples_by_the_r
     settings = [rule.setting for rule in _CALIBRATION_RULES.values()]
     assert kept["format"] == _CALIBRATION_FORMAT
     assert kept["settings"] == {setting: getattr(DEFAULT_THRESHOLDS, setting) for setting in settings}
-    least = DEFAULT_THRESHOLDS.null_test_limits.min_excess_chi2_per_dof
+    least = DEFAULT_THRESHOLDS.null_test_excess_criteria.min_excess_chi2_per_dof
     assert least == kept["settings"]["min_excess_chi2_per_dof"]
     rules = kept["rules"]
     assert set(rules) == set(_CALIBRATION_RULES)

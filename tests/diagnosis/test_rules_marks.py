@@ -11,7 +11,7 @@ from factories import added, amplitude, cases, effect, finding, fit, loss, place
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.blind import CaseGroundTruth, UnlabelledCase, labels_json_and_sha256, open_sealed_labels
 from yid_ocp.diagnosis.blind_scores import (
-    detection_and_false_alarm_rates,
+    blind_case_score_summary,
     diagnosis_evidence_to_dict,
     rejudge_diagnosis_evidence,
     score_blind_case,
@@ -152,7 +152,7 @@ def marked(category, **changed):
 
 
 def test_rates_are_over_the_cases_that_they_speak_of():
-    found = detection_and_false_alarm_rates(
+    found = blind_case_score_summary(
         [
             marked("null", gap=True),
             marked("null", gap=False),
@@ -188,9 +188,9 @@ def test_rates_are_over_the_cases_that_they_speak_of():
     assert {name: found[name] for name in rates} == pytest.approx(rates), (
         "an effect that is named alone is a set of one"
     )
-    named = detection_and_false_alarm_rates([marked("null", experiment=name) for name in "abb"])["experiments"]
+    named = blind_case_score_summary([marked("null", experiment=name) for name in "abb"])["experiments"]
     assert {name: own["cases"] for name, own in named.items()} == {"a": 1, "b": 2}
-    none = detection_and_false_alarm_rates([])
+    none = blind_case_score_summary([])
     assert (none["cases"], {none[name] for name in rates}) == (0, {None})
     assert all(entry["rate"] is None for entry in none["intervals"].values())
     assert none["confusion"]["counts"] == []

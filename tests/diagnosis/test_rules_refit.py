@@ -320,7 +320,7 @@ def predicting(monkeypatch):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)
         return SimpleNamespace(residual=np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs]))
 
-    usual = {"whitened_held_out_prediction_residual": rows, "has_process_noise": False, "options": ProblemOptions()}
+    usual = {"whitened_held_out_residual_and_jacobian": rows, "has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": (), "unknown_names": (), "initial_unknowns": np.zeros(0)}
 
     def made(*pairs):

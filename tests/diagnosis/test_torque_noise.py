@@ -22,7 +22,7 @@ from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_smoother_unknowns
-from yid_ocp.inference.uncertainty import noise_only_covariance_factor
+from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_with_reestimated_held_out_torque_biases,
@@ -72,7 +72,7 @@ def recorded(step: Step, seed: int, offset: float | None = None, friction: float
 
 def problem_of(step: Step, recordings: list[Recording], held_out: list[Recording] | None = None) -> EstimationProblem:
     options = ProblemOptions(
-        initial_state="equilibrium", arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,)
+        initial_state="equilibrium", arm_tracking_feedback="proportional", arm_proportional_gains=(9.0,)
     )
     return EstimationProblem(step, recordings, FREE, options, None, held_out or [])
 
@@ -122,7 +122,8 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     there, then = (problem_with_sensor_noise_only(own).evaluate(at) for own, at in ((moved, x), (wide, frozen)))
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
     pairs = ((moved, x), (wide, frozen))
-    own, nominal = (p.whitened_held_out_prediction_residual(0, *p.predict_held_out(at)[0]).residual for p, at in pairs)
+    predicted = ((p, p.predict_held_out(at)[0]) for p, at in pairs)
+    own, nominal = (p.whitened_held_out_residual_and_jacobian(0, *found).residual for p, found in predicted)
     assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
     # and to first order the rows are those of a filter that is worked out there
     again = problem_with_whitening_at(moved, x)
@@ -149,7 +150,7 @@ def test_candidates_of_other_places_are_left_out_of_a_refit(step):
         own = hypotheses.relinearize_held_out_filters(own, [friction], at)
         x = own.unknown_vector(at)
         evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
-        rows = own.whitened_held_out_prediction_residual(0, *held).residual
+        rows = own.whitened_held_out_residual_and_jacobian(0, *held).residual
         found.append((own.unknown_names, evaluation.residual, evaluation.jacobian, rows))
     names, values = zip(*((own[0], own[1:]) for own in found), strict=True)
     assert names[0] == names[1]
@@ -185,7 +186,7 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
     made = composed(step, True)
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
-    spread = noise_only_covariance_factor(fit.problem, fit.evaluation)
+    spread = noise_only_covariance_sqrt(fit.problem, fit.evaluation)
     off = fit.problem.unknown_vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     moved = replace(fit, values=fit.problem.named_values(off))
     assert _held_out_null_test_and_spread(moved)[0].p_value < 1e-12
@@ -263,9 +264,7 @@ def geared(step) -> Step:
 
 def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> EstimationProblem:
     free = (*FREE, *(name for effect in geared.system.effects for name in effect.parameters.names))
-    options = ProblemOptions(
-        initial_state="equilibrium", arm_tracking_feedback=feedback, arm_tracking_feedback_gains=(9.0,)
-    )
+    options = ProblemOptions(initial_state="equilibrium", arm_tracking_feedback=feedback, arm_proportional_gains=(9.0,))
     problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
     return problem_with_whitening_at(problem, problem.initial_unknowns, rounds=3)
 
@@ -294,7 +293,7 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
     episode = problem_with_whitening_at(problem, at, rounds=3).episodes[0]
     errors = episode.input_errors
-    [theta, later] = [problem.unpack_unknown_vector(x, 0)[0] for x in (at, near)]
+    [theta, later] = [problem.unpack_episode_unknowns(x, 0)[0] for x in (at, near)]
     assert np.max(np.abs(errors.torque_noise)) > WHITE
     acting, more = (problem.predictor.corrected_inputs(episode, own, ()).torque for own in (theta, later))
     np.testing.assert_allclose(acting, inverse * episode.torque - errors.recorded_minus_true_torque, atol=1e-12)

@@ -63,7 +63,7 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert told["carried"] == pytest.approx(
         abs(apart.estimation_value - apart.held_out_value) / np.hypot(apart.estimation_std, apart.held_out_std)
     )
-    damping = finding.nominal_changes["elbow.damping"]
+    damping = finding.nominal_parameters_before_and_after["elbow.damping"]
     assert damping["before"] > damping["after"], "friction hides in the damping until it is named"
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
 

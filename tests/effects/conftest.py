@@ -20,7 +20,7 @@ from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_ob
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import CableOptions, clamped_cable_system
-from yid_ocp.sensors import PointSensor, PrescribedJointEffortSensor, Sensor, sensor_reading_function
+from yid_ocp.sensors import PointSensor, PrescribedJointEffortSensor, Sensor, sensor_function_with_jacobians
 
 POSTURE = np.array([0.3, 0.8, 0.9])
 H = 0.01
@@ -127,7 +127,7 @@ class Bench:
     def reading(self, run: Run, sensor: Sensor) -> np.ndarray:
         """What a sensor reads at every node but the last."""
         n, rollout, system = run.step.sizes["n"], run.rollout, run.step.system
-        function = sensor_reading_function(system, sensor, ())
+        function = sensor_function_with_jacobians(system, sensor, ())
         effort = np.zeros((len(rollout.state) - 1, n))
         effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
         effort[:, list(system.actuated_coordinate_indices)] = rollout.torque

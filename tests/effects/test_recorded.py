@@ -16,8 +16,8 @@ from yid_ocp.errors import DataError, ModelError, SolverError
 from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.recorded_inputs import available_signal_kinds
-from yid_ocp.sensors import measuring_camera_pose, sensor_reading_function
+from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
+from yid_ocp.sensors import measuring_camera_pose, sensor_function_with_jacobians
 from yid_ocp.solvers import MultipleShooting
 
 H, STEPS = 0.01, 24
@@ -73,7 +73,7 @@ def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options)
     effects, step = effects_and_step(bench, tuple(kinds), neutral)
     names = tuple(name for effect in effects for name in effect.parameters.names)
     gains = (20.0, 20.0, 10.0)
-    settings = ProblemOptions(**OPEN, arm_tracking_feedback=feedback, arm_tracking_feedback_gains=gains, **options)
+    settings = ProblemOptions(**OPEN, arm_tracking_feedback=feedback, arm_proportional_gains=gains, **options)
     return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
 
 
@@ -156,7 +156,7 @@ def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     assert late.predicted_outputs[1 - at] == pytest.approx(now.predicted_outputs[1 - at], abs=1e-9)
     position = np.maximum(moved.node + moved.fraction - 3.0, 0.0)
     n = driven.system.n_coordinates
-    function = sensor_reading_function(task.system, sensors.camera, ())
+    function = sensor_function_with_jacobians(task.system, sensors.camera, ())
     states = now.rollout.state
     nodes = np.array([np.array(function(q=s[:n], theta=task.theta)["y"]).ravel() for s in states])
     for k in range(6):
@@ -173,22 +173,20 @@ def test_a_gear_needs_recorded_effort(prescribed) -> None:
 
 def test_what_a_recording_holds(driven) -> None:
     full = recording(driven)
-    assert available_signal_kinds([full]) == {"joints.position", "joints.effort", "camera"}
-    assert available_signal_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
+    assert signal_kinds_for_effects([full]) == {"joints.position", "joints.effort", "camera"}
+    assert signal_kinds_for_effects([recording(driven, effort=False, camera=False)]) == {"joints.position"}
     arm, camera = full.points
     assert measuring_camera_pose(arm) is None
     assert measuring_camera_pose(camera) is not None
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
     assert measuring_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
-    assert "nominal_clock" in available_signal_kinds([Recording(points=(unposed,))])
+    assert "nominal_clock" in signal_kinds_for_effects([Recording(points=(unposed,))])
 
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     layout, made, system = cable
     options = ProblemOptions(
-        **OPEN,
-        initial_state="fitted_to_points",
-        clamp_pose_definitions_from_points=layout.clamp_pose_definitions_from_points,
+        **OPEN, initial_state="fitted_to_points", clamp_pose_point_names=layout.clamp_pose_point_names
     )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
@@ -274,7 +272,7 @@ def test_readings_have_exact_slopes(which, prescribed, all_effects, sensors) -> 
     effects = all_effects(prescribed.system)
     system = prescribed.system.with_effects(effects)
     names = tuple(name for effect in effects for name in effect.parameters.names)
-    function = sensor_reading_function(system, getattr(sensors, which), names)
+    function = sensor_function_with_jacobians(system, getattr(sensors, which), names)
     values = {}
     for effect in effects:
         values |= somewhere(effect)
@@ -329,8 +327,8 @@ def test_the_clock_of_any_group_of_points_may_be_late_or_early(driven):
     [camera] = [group for group in recording(driven).points if group.name.endswith("camera")]
     mocap = replace(camera, name="points_mocap", sensor_name="mocap", camera_pose=None)
     made = replace(recording(driven, camera=False), points=(*recording(driven, camera=False).points, mocap))
-    assert "points:points_mocap" in available_signal_kinds([made])
-    found = candidate_kinds_and_locations(driven.system, available_signal_kinds([made]))
+    assert "points:points_mocap" in signal_kinds_for_effects([made])
+    found = candidate_kinds_and_locations(driven.system, signal_kinds_for_effects([made]))
     assert [place for kind, place in found if kind == "camera_latency"] == ["points_mocap"]
     late = make_effect("camera_latency", "points_mocap", driven.system)
     assert late.parameters["camera_latency@points_mocap.delay"].lower < 0

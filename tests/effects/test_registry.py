@@ -12,7 +12,7 @@ from yid_ocp.effects import base as places
 from yid_ocp.effects.base import EffectBase
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import FlexibleSegment, System, flexible_object
-from yid_ocp.model.servos_and_springs import MotorModelOptions, ServoModelOptions
+from yid_ocp.model.servos_and_springs import MotorKindAndPreset, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
@@ -53,7 +53,7 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     table = {row[0]: row for row in rows[2:]}
     described = {kind.strip() for name in table for kind in name.split(",")}
     assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
-    system, options = baxter_foam_y_system(1), ServoModelOptions(motor=MotorModelOptions("dc", "sts3215"))
+    system, options = baxter_foam_y_system(1), ServoModelOptions(motor=MotorKindAndPreset("dc", "sts3215"))
     servos = System.build(system.mechanism, driven=system.driven, servos=options, grasps=system.grasps)
     places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, SIGNALS)}
     places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, SIGNALS)}
@@ -189,6 +189,6 @@ def test_names_and_places_survive_added_joints(one_arm) -> None:
 def test_how_much_stiffening_to_expect_depends_on_how_far_joints_turn() -> None:
     effect = make_effect("cubic_stiffness", "T1", baxter_foam_y_system(1))
     low, high = effect.prior_ranges["cubic_stiffness@T1.k3"]
-    told = effect.with_prior_ranges_scaled_to_angles({"T1": 0.25, "T2": 1.0})
+    told = effect.with_prior_ranges_for_largest_angles({"T1": 0.25, "T2": 1.0})
     assert told.prior_ranges["cubic_stiffness@T1.k3"] == pytest.approx((4 * low, 4 * high))
-    assert effect.with_prior_ranges_scaled_to_angles({"T2": 0.1}) is effect
+    assert effect.with_prior_ranges_for_largest_angles({"T2": 0.1}) is effect

@@ -14,14 +14,14 @@ from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
     max_torque_bias_change_in_stds,
     problem_with_whitening_at,
-    torque_bias_estimates_by_recording,
+    torque_biases_and_stds_per_recording,
 )
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
-TRACKED = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
+TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 
 
 def problem_of(
@@ -55,7 +55,7 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
         feedback = replace(feedback, reference=feedback.reference + reference)
     torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
     changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
-    result = problem.predictor.predict_episode(changed, *problem.unpack_unknown_vector(x, 0), False)
+    result = problem.predictor.predict_episode(changed, *problem.unpack_episode_unknowns(x, 0), False)
     return _sensor_whitened_residual(changed.measurements, result).residual
 
 
@@ -119,7 +119,7 @@ def test_a_step_without_a_measurement_adds_no_likelihood_and_lets_the_state_go_o
     assert log_determinant == 0.0
     whole = np.vstack([map_, [0.0, 0.5]])
     np.testing.assert_allclose(after, whole @ covariance @ whole.T)
-    white, mean = step.normalized_innovations_and_final_mean(np.array([[1.0], [2.0]]), np.zeros((0, 1)))
+    white, mean = step.normalized_innovations_and_next_mean(np.array([[1.0], [2.0]]), np.zeros((0, 1)))
     assert white.shape == (0, 1)
     np.testing.assert_allclose(mean[:, 0], whole @ [1.0, 2.0])
 
@@ -145,7 +145,7 @@ def test_compiled_filters_do_what_plain_ones_do(urdf_folder, monkeypatch, how):
         monkeypatch.setattr(kalman, "_library", lambda library=library: library)
         weighted = problem_with_whitening_at(problem, x, rounds=2)
         own = weighted.evaluate(x)
-        found.append((own.residual[rows], own.jacobian[rows], *torque_bias_estimates_by_recording(weighted, x)[0]))
+        found.append((own.residual[rows], own.jacobian[rows], *torque_biases_and_stds_per_recording(weighted, x)[0]))
     for compiled, plain in zip(*found, strict=True):
         np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
 
@@ -155,7 +155,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     """Encoders are measurements and the filter only says where to linearise: gains move chi2 by what is not linear."""
     costs = []
     for g in (9.0, gain):
-        feedback = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (g,)}
+        feedback = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
         weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
         rows = problem.residual_rows.data
@@ -175,7 +175,7 @@ def small_gap(problem, size=1.0):
     truth = replace(episode, torque=episode.torque + 0.3 * size * TORQUE * rng.standard_normal(episode.torque.shape))
     truth = replace(truth, tracking_feedback=None)
     result = problem.predictor.predict_episode(
-        truth, *problem.unpack_unknown_vector(problem.initial_unknowns, 0), False
+        truth, *problem.unpack_episode_unknowns(problem.initial_unknowns, 0), False
     )
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     samples = tuple(replace(s, value=y + s.std * rng.standard_normal(y.shape)) for s, y in pairs)
@@ -203,7 +203,7 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     episode = problem.episodes[0]
     problem = problem.with_episodes([replace(episode, torque=episode.torque + 0.35)], [])
     weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
-    ((value, std),) = torque_bias_estimates_by_recording(weighted, problem.initial_unknowns)
+    ((value, std),) = torque_biases_and_stds_per_recording(weighted, problem.initial_unknowns)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
     again = problem_with_whitening_at(weighted, problem.initial_unknowns)
@@ -211,9 +211,9 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     moved = max_torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
     assert moved == pytest.approx(value[0] / BIAS)
     assert max_torque_bias_change_in_stds(weighted.whitening_filters, [None]) == 0.0
-    ((settled, _),) = torque_bias_estimates_by_recording(again, problem.initial_unknowns)
+    ((settled, _),) = torque_biases_and_stds_per_recording(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
-    assert torque_bias_estimates_by_recording(problem, problem.initial_unknowns) == [None]
+    assert torque_biases_and_stds_per_recording(problem, problem.initial_unknowns) == [None]
 
 
 @pytest.mark.parametrize("feedback", [TRACKED, {"arm_tracking_feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
@@ -229,7 +229,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     other = replace(again, input_errors=episode.input_errors)
     found = []
     for each in (episode, other):
-        result = weighted.predictor.predict_episode(each, *problem.unpack_unknown_vector(x, 0), False)
+        result = weighted.predictor.predict_episode(each, *problem.unpack_episode_unknowns(x, 0), False)
         found.append(estimate_episode_torque_bias(each, result, whitening)[0])
     seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05
@@ -287,7 +287,7 @@ class _OvershootingFilter:
 
     input_error_model: _Errors
 
-    def whiten_and_estimate_torque_bias(self, rows, push):
+    def whiten_residuals_and_estimate_torque_bias(self, rows, push):
         apart = self.input_error_model.torque_bias[:, None] - 1.0
         return apart, 1.0 - 3.0 * apart
 

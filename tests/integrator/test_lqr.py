@@ -10,8 +10,8 @@ from yid_ocp.effects.bodies import system_with_link_mass_factors
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import (
-    EffectMomentumShift,
-    JointMotionAndTorqueSensitivities,
+    EffectMomentumCalculator,
+    JointMotionAndTorqueWithSensitivities,
     lqr_tracking_feedback,
     proportional_tracking_feedback,
 )
@@ -139,7 +139,7 @@ def moved(step, values=None, remembered=0.6):
     start = np.concatenate([[0.3, -0.2, 0.0, 0.0], internal])
     swung = simulate(step, theta, start, STEPS, torque)
     assert swung.status.is_converged
-    return step, theta, (swung.state, torque, internal), EffectMomentumShift(step)
+    return step, theta, (swung.state, torque, internal), EffectMomentumCalculator(step)
 
 
 @pytest.mark.parametrize("names", EFFECTS.values(), ids=EFFECTS)
@@ -148,8 +148,8 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     """A filter that follows them pulls at nothing; the first node is stood at before the reference begins."""
     step, theta, (state, torque, internal), shift = moved(step_with(plain, names))
     read = torque + misread
-    loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
-    recorded, true = (JointMotionAndTorqueSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
+    loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.parameter_values_without_effects(theta))
+    recorded, true = (JointMotionAndTorqueWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
     value, _ = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     if names or misread:
@@ -160,8 +160,8 @@ def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(pla
     step = compile_step(system_with_link_mass_factors(plain, "mass_scale"), TIME_STEP, use_compiler=False)
     names = {"shoulder.mass_scale": 1.1, "elbow.mass_scale": 0.8, "elbow.damping": 0.4}
     step, theta, (state, torque, internal), shift = moved(step, names)
-    loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.theta_without_effects(theta))
-    recorded = JointMotionAndTorqueSensitivities(state[:, ANGLES], torque, internal)
+    loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.parameter_values_without_effects(theta))
+    recorded = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], torque, internal)
     value, slopes = shift.effect_momentum_shifts_and_sensitivities(recorded, recorded, theta, tuple(names))
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     assert np.all(np.max(np.abs(slopes), axis=(0, 1)) > 1e-4)
@@ -172,8 +172,8 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     _, theta, (state, torque, none), shift = moved(step_with(plain, ()))
     assert set(shift.parameter_names) == OWN
     by_torque = np.stack([torque, 0 * torque], axis=2)
-    recorded = JointMotionAndTorqueSensitivities(state[:, ANGLES], torque, none)
-    true = JointMotionAndTorqueSensitivities(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
+    recorded = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], torque, none)
+    true = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
     value, slope = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, ("gain", "other"))
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
@@ -190,14 +190,14 @@ def test_derivatives_are_those_of_differences(plain, names):
     d, rng = len(wanted) + 2, np.random.default_rng(1)
     by_angles, by_torque = (0.01 * rng.normal(size=(*x.shape, d)) for x in (state[:, ANGLES], torque))
     by_internal = 0.1 * rng.normal(size=(len(internal), d))
-    recorded = JointMotionAndTorqueSensitivities(state[:, ANGLES], torque, internal)
+    recorded = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], torque, internal)
 
     def at(move):
         """The shift after a move along each of d directions; parameters move by the first ones."""
         own = theta.copy()
         own[[step.system.parameters.index(name) for name in wanted]] += move[: len(wanted)]
         parts = (state[:, ANGLES] + by_angles @ move, torque + by_torque @ move, internal + by_internal @ move)
-        true = JointMotionAndTorqueSensitivities(*parts, by_angles, by_torque, by_internal)
+        true = JointMotionAndTorqueWithSensitivities(*parts, by_angles, by_torque, by_internal)
         return shift.effect_momentum_shifts_and_sensitivities(recorded, true, own, wanted)
 
     value, slopes = at(np.zeros(d))
@@ -209,10 +209,10 @@ def test_derivatives_are_those_of_differences(plain, names):
 
 def test_an_effect_away_from_neutral_or_sought_shifts_the_momentum(plain):
     step = step_with(plain, EFFECTS["armature"])
-    shift = EffectMomentumShift(step)
+    shift = EffectMomentumCalculator(step)
     [name] = set(shift.parameter_names) - OWN
     theta = step.system.parameters.vector()
-    neutral = shift.theta_without_effects(theta)
+    neutral = shift.parameter_values_without_effects(theta)
     assert neutral[step.system.parameters.index(name)] == 0.0
     assert not shift.is_active(neutral, ())
     assert shift.is_active(theta, ())

@@ -6,14 +6,14 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.discrete import discrete_equations, nlp_step_constraints
+from yid_ocp.integrator.discrete import discrete_equations, one_step_nlp_constraints
 from yid_ocp.model import System, forward_kinematics
 from yid_ocp.model.kinematics import lagrangian_first_derivatives
 
 
 @pytest.fixture(scope="module")
 def made(case):
-    return nlp_step_constraints(case.step.equations, case.step.time_step)
+    return one_step_nlp_constraints(case.step.equations, case.step.time_step)
 
 
 def inputs_of(made):

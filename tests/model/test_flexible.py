@@ -263,7 +263,7 @@ def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
     run = load_config(tmp_path / "run.yaml")
     system = build_system(run, link_division=2)
     assert system.parameters["rod.taper"].value == 0.4
-    assert len(system.segment_layout("rod").link_joints) == 8
+    assert len(system.layout_of_segment("rod").link_joints) == 8
     assert divided_joint_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
     given = {"length": LENGTH, "mass": MASS, "radius": 0.006, "tip_radius": 0.003}
     made = init_object_templates()["tapered_rod"].build(given, 4)

@@ -11,7 +11,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.step import simulate
 from yid_ocp.planning.joint_paths import FramePositionEvaluator
 from yid_ocp.workflow.plan import run_plan
-from yid_ocp.workflow.run_inputs import resolve_recording_path
+from yid_ocp.workflow.run_inputs import resolve_default_recording
 
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {
@@ -90,7 +90,7 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     assert outcome.result["swing"] < run.plan.point_rest_speed_tolerance
     found = outcome.output
     # it begins where the recording does, and both arms take part
-    recorded = read_recording(resolve_recording_path(run.recordings.estimate[0])).joints
+    recorded = read_recording(resolve_default_recording(run.recordings.estimate[0])).joints
     first = recorded.position[0, [recorded.names.index(name) for name in found.joint_names]]
     np.testing.assert_allclose(found.joint_positions[0], first, atol=5e-3)
     travel = dict(zip(found.joint_names, np.ptp(found.joint_positions, axis=0), strict=True))
@@ -122,14 +122,14 @@ def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit,
 def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):
     file = repository / "configs" / "deft_bdlo1.yaml"
     run = load_config(file)
-    if not resolve_recording_path(run.recordings.estimate[0]).is_file():
+    if not resolve_default_recording(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, point_target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
     fewer = (
         "child_branch_vertex_names={}",
-        "branch_density_and_damping={}",
+        "branch_properties_by_name={}",
         "main_branch_vertex_names=[p0, p1, p4, p6, p8, p11, p12]",
-        "branch_density_and_damping={parent: {has_separate_twist_damping: true, linear_density: 0.05}}",
+        "branch_properties_by_name={parent: {has_separate_twist_damping: true, linear_density: 0.05}}",
     )
     coarse = [f"model.object.{entry}" for entry in fewer]
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", "problem.use_compiler=false", *coarse, way)

@@ -13,16 +13,16 @@ from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (
-    CableBranchRigidityAndLinearDensity,
+    CableBranchRigidityDampingAndDensity,
     CableOptions,
     clamped_cable_system,
-    parameters_from_edge_lengths,
+    length_parameters_from_edges,
     read_vertex_positions_by_name,
 )
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.solvers import GaussNewton, solve
 
 PARENT = tuple(f"p{i}" for i in range(7))
@@ -94,7 +94,7 @@ def twin(cable, clamps):
     """The compiled step of a cable, and a recording made with it at known values, from rest."""
     t, held = clamps
     options = CableOptions(
-        default_branch=CableBranchRigidityAndLinearDensity(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4),
+        default_branch=CableBranchRigidityDampingAndDensity(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4),
         has_edge_lengths_per_recording=False,
     )
     stub = as_recording(cable, t, held)
@@ -103,7 +103,7 @@ def twin(cable, clamps):
     )
     step = compile_step(system, PERIOD)
     path = prescribed_coordinates_at_nodes(
-        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_pose_definitions_from_points
+        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), ZeroPhaseLowPassFilter(np.inf), cable.clamp_pose_point_names
     )
     theta = system.parameters.vector(TRUTH)
     rest = EquilibriumSolver(step).solve(path[0], theta)
@@ -209,7 +209,7 @@ def test_edges_are_as_long_as_measured(cable):
     lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
     assert lengths["c1", "c2"] == pytest.approx(expected)
-    values = parameters_from_edge_lengths(cable, typical_point_pair_distances(cable.edge_vertex_names, [recording], 2))
+    values = length_parameters_from_edges(cable, typical_point_pair_distances(cable.edge_vertex_names, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
     assert set(values) <= set(
         clamped_cable_system(typical_point_pair_distances(cable.edge_vertex_names, [recording]), cable).parameters.names

@@ -17,9 +17,9 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
     _estimated_constant_errors,
-    subtract_estimated_biases,
+    subtract_estimated_bias_and_clock_errors,
     whiten_against_sensor_biases,
-    whitened_sensitivities_to_sensor_errors,
+    whitened_measurement_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
@@ -113,7 +113,7 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
     _, x = least(spelt, spelt.initial_unknowns)
     found = problem.evaluate(problem.initial_unknowns, derivatives=False)
     for i, (episode, result) in enumerate(zip(problem.episodes, found.episode_predictions, strict=True)):
-        corrected = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
+        corrected = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
         pairs = zip(episode.measurements, corrected, strict=True)
         [(before, after)] = [pair for pair in pairs if pair[0].sensor.effort_joints]
         offsets = [x[spelt.unknown_names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
@@ -124,10 +124,10 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
 def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
-    counted = problem.whitened_held_out_prediction_residual(0, episode, result).residual
+    counted = problem.whitened_held_out_residual_and_jacobian(0, episode, result).residual
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     plain = np.concatenate([samples.residual_and_jacobian(y).residual for samples, y in pairs])
-    slopes = whitened_sensitivities_to_sensor_errors(episode.measurements)
+    slopes = whitened_measurement_sensitivities_to_sensor_errors(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

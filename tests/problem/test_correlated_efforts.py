@@ -17,8 +17,8 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
+from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, solve
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
@@ -112,7 +112,7 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
     np.testing.assert_allclose(problem.cost_and_gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
     program = transcribe(problem)
-    arguments, theta = program.solver_arguments, program.named_block("theta").index.ravel()
+    arguments, theta = program.solver_arguments, program.variable_or_parameter_block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9})
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
@@ -151,8 +151,8 @@ def test_a_gear_does_not_give_way_to_the_noise_of_an_effort_that_is_compared(urd
         arm(step, path, made, angle=0.0, free=(name,)).episodes[0]
         for made in (effort, effort + 0.3 * rng.standard_normal(effort.shape), effort + 2.0)
     )
-    inner, gain = slice(50, -50), LowPassFilter(CUTOFF).noise_gains_of_value_and_rates(0.01)[0]
-    smooth = LowPassFilter(CUTOFF)(clean.grid.node_times, effort)
+    inner, gain = slice(50, -50), ZeroPhaseLowPassFilter(CUTOFF).noise_gains_of_value_and_rates(0.01)[0]
+    smooth = ZeroPhaseLowPassFilter(CUTOFF)(clean.grid.node_times, effort)
     np.testing.assert_allclose(clean.joint_loads[inner], smooth[inner], atol=0.02)
     assert np.std((noisy.joint_loads - clean.joint_loads)[inner]) < 0.5 * 0.3 * gain
     # what the model does not know of a load is measured all the same
@@ -278,7 +278,7 @@ def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(efforts_of,
 def test_settings_say_what_recorded_efforts_are(urdf_folder, kind):
     step = pendulum_step(urdf_folder, driven=PENDULUM)
     recorded, free = taken(step, 1), ["shoulder.damping"]
-    stated = ProblemOptions(sensors={JOINT_EFFORT_GROUP_NAME: SensorOptions(effort_sampling_kind=kind)})
+    stated = ProblemOptions(sensors={JOINT_EFFORT_SENSOR_KEY: SensorOptions(effort_sampling_kind=kind)})
     [said] = EstimationProblem(step, [recorded], free, stated).episodes
     [held] = EstimationProblem(step, [recorded.with_effort_sampling_kind(kind)], free, ProblemOptions()).episodes
     assert said.recording.joints.effort_kind == kind

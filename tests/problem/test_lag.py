@@ -105,6 +105,6 @@ def test_derivatives_agree_with_differences(form, size) -> None:
 def test_a_pull_comes_back_by_the_transpose(size) -> None:
     pull = np.random.default_rng(5).normal(size=(N, 2))
     _, slope = lag(size).lagged_node_values(VALUE, SLOPE)
-    back, direct = lag(size).lagged_node_values_gradients(VALUE, pull)
+    back, direct = lag(size).lagged_node_values_adjoint(VALUE, pull)
     total = np.einsum("kn,knd->d", back, SLOPE) + direct
     np.testing.assert_allclose(total, np.einsum("kn,knd->d", pull, slope), rtol=1e-12)

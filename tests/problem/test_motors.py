@@ -21,7 +21,7 @@ from yid_ocp.data.recording import validated_recording
 from yid_ocp.effects import candidate_kinds_and_locations
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import input_or_servo_torques_of_rollout, simulate
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorModelOptions, ServoModelOptions
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorKindAndPreset, ServoModelOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
 
@@ -30,8 +30,8 @@ VALUES = {
     "shoulder.servo_gain_factor": 100.0, "elbow.servo_gain": 0.25, "elbow.servo_damping": 1.5,
     "elbow.servo_torque_limit": 3.0, "elbow.servo_gain_factor": 100.0,
 }  # fmt: skip
-DC = ServoModelOptions(motor=MotorModelOptions("dc"))
-FIRMWARE = ServoModelOptions(motor=MotorModelOptions("dc", "mx64"), extra_controller_terms=("derivative", "dead_band"))
+DC = ServoModelOptions(motor=MotorKindAndPreset("dc"))
+FIRMWARE = ServoModelOptions(motor=MotorKindAndPreset("dc", "mx64"), extra_controller_terms=("derivative", "dead_band"))
 INTEGRATING = replace(FIRMWARE, extra_controller_terms=("integral", "derivative", "dead_band"))
 TERMS = {"integral": 3.0, "derivative": 0.7, "dead_band": 0.02}
 FIRMWARE_VALUES = VALUES | {f"{joint}.servo_{term}": value for joint in PENDULUM for term, value in TERMS.items()}
@@ -125,7 +125,7 @@ def problem_of(step, group, free=("shoulder.servo_gain",), values=None, **option
 
 def test_a_preset_belongs_to_a_dc_motor() -> None:
     with pytest.raises(ConfigError, match="kind: ideal and the preset 'xl330'"):
-        MotorModelOptions(preset="xl330")
+        MotorKindAndPreset(preset="xl330")
 
 
 def test_recordings_state_the_gain_of_the_firmware_once_for_all_joints_or_for_each(step) -> None:

@@ -260,7 +260,7 @@ def driven(urdf_folder):
 
 
 def sprung(step, recording, **options):
-    made = ProblemOptions(arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,), **options)
+    made = ProblemOptions(arm_tracking_feedback="proportional", arm_proportional_gains=(9.0,), **options)
     return EstimationProblem(step, [recording], ("elbow.stiffness",), made)
 
 

@@ -10,19 +10,19 @@ from scipy.spatial.transform import Rotation
 from small_problems import joints, recording, seen
 
 from yid_ocp.errors import DataError
-from yid_ocp.model.objects.base import ClampPoseDefinition
+from yid_ocp.model.objects.base import ClampPoseFromTwoPoints
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,
-    available_signal_kinds,
     mean_step_input_delay_derivative,
     mean_step_inputs,
     prescribed_coordinates_at_nodes,
+    signal_kinds_for_effects,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, zero_phase_effort_filter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
 
-PLAIN = LowPassFilter(math.inf)
+PLAIN = ZeroPhaseLowPassFilter(math.inf)
 
 
 def driven(effort, t=None, kind="command"):
@@ -136,10 +136,11 @@ def test_loads_are_smoothed_and_interpolated():
     effort = np.stack([np.ones(200), 3 * t + np.sin(2 * np.pi * 40 * t)], axis=1)
     made = recording(joints(["a", "b"], t, np.zeros((200, 2)), effort=effort))
     grid = TimeGrid(0.5, 0.025, 20)
-    found = smoothed_joint_efforts(made, ("b", "a"), grid, LowPassFilter(5.0))
+    found = smoothed_joint_efforts(made, ("b", "a"), grid, ZeroPhaseLowPassFilter(5.0))
     np.testing.assert_allclose(found[:, 0], 3 * grid.node_times, atol=1e-3)
     np.testing.assert_allclose(found[:, 1], 1.0, atol=1e-9)
-    later = smoothed_joint_efforts(made.with_effort_sampling_kind("mean"), ("b", "a"), grid, LowPassFilter(5.0))
+    low_pass, made = ZeroPhaseLowPassFilter(5.0), made.with_effort_sampling_kind("mean")
+    later = smoothed_joint_efforts(made, ("b", "a"), grid, low_pass)
     np.testing.assert_allclose(later[1:, 0], found[1:, 0] - 3 * np.diff(t)[0] / 2, atol=1e-3)
     for without in (recording(joints(["a"], t, np.zeros((200, 1)))), pointed()):
         with pytest.raises(DataError, match="elastic gears of the model need joint efforts"):
@@ -158,9 +159,9 @@ RECORDED = {
 
 @pytest.mark.parametrize(("made", "expected"), RECORDED.values(), ids=RECORDED)
 def test_sensors_are_known_by_what_was_recorded(made, expected):
-    assert available_signal_kinds([made]) == expected
+    assert signal_kinds_for_effects([made]) == expected
     with_efforts, both = RECORDED["efforts"]
-    assert available_signal_kinds([with_efforts, made]) == expected | both
+    assert signal_kinds_for_effects([with_efforts, made]) == expected | both
 
 
 def moving(*names):
@@ -189,7 +190,7 @@ def clamped(origin, towards, t=None):
 
 
 def path_of(made, grid):
-    return prescribed_coordinates_at_nodes(made, moving(*AXES), grid, PLAIN, (ClampPoseDefinition("end", "o", "d"),))
+    return prescribed_coordinates_at_nodes(made, moving(*AXES), grid, PLAIN, (ClampPoseFromTwoPoints("end", "o", "d"),))
 
 
 AXES = tuple(f"end_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
@@ -239,7 +240,7 @@ def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
     t = 0.01 * np.arange(300)
     line = np.stack([t, 2 * t, 0 * t], axis=1) + 0.1 * np.sin(2 * np.pi * 45 * t)[:, None]
     made = recording(None, seen(["o"], t, line[:, None]))
-    found = _smoothed_point_path(made, "o", TimeGrid(0.5, 0.1, 20), LowPassFilter(5.0))
+    found = _smoothed_point_path(made, "o", TimeGrid(0.5, 0.1, 20), ZeroPhaseLowPassFilter(5.0))
     np.testing.assert_allclose(found, np.outer(TimeGrid(0.5, 0.1, 20).node_times, [1.0, 2.0, 0.0]), atol=2e-3)
     held = _smoothed_point_path(made, "o", TimeGrid(2.9, 0.1, 3), PLAIN)
     np.testing.assert_allclose(held[2], held[3])
@@ -249,7 +250,7 @@ def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
 def test_the_filter_is_butterworths_of_order_four_forth_and_back(frequency):
     step, cutoff = 0.002, 5.0
     t = step * np.arange(10001)
-    found = LowPassFilter(cutoff)(t, np.sin(2 * np.pi * frequency * t)[:, None])[:, 0]
+    found = ZeroPhaseLowPassFilter(cutoff)(t, np.sin(2 * np.pi * frequency * t)[:, None])[:, 0]
     # bilinear transformation: frequencies are warped
     ratio = math.tan(math.pi * frequency * step) / math.tan(math.pi * cutoff * step)
     middle = slice(3000, 7000)
@@ -263,7 +264,7 @@ def test_it_begins_and_ends_steadily_as_signal_processing_has_it(columns):
     values = np.cumsum(rng.standard_normal((200, columns)), axis=0)
     sections = scipy.signal.butter(4, 7.0 * 2 * 0.01, output="sos")
     expected = scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=42)
-    np.testing.assert_allclose(LowPassFilter(7.0)(t, values), expected, atol=1e-9)
+    np.testing.assert_allclose(ZeroPhaseLowPassFilter(7.0)(t, values), expected, atol=1e-9)
 
 
 def test_without_a_cutoff_values_are_as_they_were():
@@ -275,19 +276,19 @@ def test_without_a_cutoff_values_are_as_they_were():
 def test_an_uneven_clock_is_resampled_in_between():
     t = np.sort(np.concatenate([0.01 * np.arange(400), [1.003, 2.5042]]))
     line = np.stack([2 + 3 * t], axis=1)
-    np.testing.assert_allclose(LowPassFilter(5.0)(t, line), line, atol=2e-4)
+    np.testing.assert_allclose(ZeroPhaseLowPassFilter(5.0)(t, line), line, atol=2e-4)
 
 
 def test_smoothed_values_tell_something_new_twice_a_period():
     for cutoff, step, stride in ((5.0, 0.01, 10), (5.0, 0.02, 5), (10.0, 0.01, 5), (30.0, 0.05, 1), (7.0, 0.01, 7)):
-        assert LowPassFilter(cutoff).decorrelation_stride(step) == stride
+        assert ZeroPhaseLowPassFilter(cutoff).decorrelation_stride(step) == stride
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 5.0])
 def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     """The slowest poles' response has fallen to a thousandth then."""
     step = 0.002
-    settling = LowPassFilter(cutoff).end_distortion_duration
+    settling = ZeroPhaseLowPassFilter(cutoff).end_distortion_duration
     sections = scipy.signal.butter(4, cutoff * 2 * step, output="sos")
     impulse = np.zeros(5000)
     impulse[0] = 1.0
@@ -298,7 +299,7 @@ def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     assert settling == pytest.approx(math.log(1e3) / np.abs(poles.real).min(), rel=1e-2)
 
 
-@pytest.mark.parametrize("low_pass", [LowPassFilter(4.0), LowPassFilter(4.0, 2), LowPassFilter(9.0)])
+@pytest.mark.parametrize("low_pass", [ZeroPhaseLowPassFilter(*args) for args in ((4.0,), (4.0, 2), (9.0,))])
 def test_at_some_nodes_it_is_the_same_filter(low_pass):
     t, rng = 0.01 * np.arange(301), np.random.default_rng(1)
     values, nodes = rng.standard_normal((301, 2)), np.array([3, 120, 150, 299])
@@ -314,7 +315,7 @@ def test_at_some_nodes_it_is_the_same_filter(low_pass):
 
 def test_two_passes_are_one_after_the_other():
     t, values = 0.01 * np.arange(301), np.random.default_rng(1).standard_normal((301, 2))
-    once, twice = LowPassFilter(5.0), zero_phase_effort_filter(5.0)
+    once, twice = ZeroPhaseLowPassFilter(5.0), zero_phase_effort_filter(5.0)
     np.testing.assert_allclose(twice(t, values)[80:-80], once(t, once(t, values))[80:-80], atol=1e-3)
     assert (once.end_distortion_duration, twice.end_distortion_duration) == pytest.approx((0.574, 0.768), abs=1e-3)
     assert (twice.cutoff, twice.passes) == (5.0, 2)
@@ -326,22 +327,22 @@ def test_gains_turn_white_noise_into_that_of_value_rate_and_second_rate(cutoff):
     step = 0.01
     impulse = np.zeros((4001, 1))
     impulse[2000] = 1.0
-    value = LowPassFilter(cutoff)(step * np.arange(4001), impulse)[:, 0]
+    value = ZeroPhaseLowPassFilter(cutoff)(step * np.arange(4001), impulse)[:, 0]
     rate = (value[2:] - value[:-2]) / (2 * step)
     second = (value[2:] - 2 * value[1:-1] + value[:-2]) / step**2
     expected = [np.linalg.norm(x) for x in (value, rate, second)]
-    np.testing.assert_allclose(LowPassFilter(cutoff).noise_gains_of_value_and_rates(step), expected, rtol=1e-4)
+    np.testing.assert_allclose(ZeroPhaseLowPassFilter(cutoff).noise_gains_of_value_and_rates(step), expected, rtol=1e-4)
 
 
 def test_a_cutoff_lies_between_zero_and_half_the_sampling_rate():
     t = 0.01 * np.arange(300)
     for cutoff in (0.0, -1.0, 50.0, 51.0):
         with pytest.raises(DataError, match="path_cutoff"):
-            LowPassFilter(cutoff)(t, np.zeros((300, 1)))
-    assert LowPassFilter(49.9)(t, np.ones((300, 1))) == pytest.approx(1.0)
+            ZeroPhaseLowPassFilter(cutoff)(t, np.zeros((300, 1)))
+    assert ZeroPhaseLowPassFilter(49.9)(t, np.ones((300, 1))) == pytest.approx(1.0)
 
 
 def test_short_records_are_padded_as_far_as_they_go():
     for count in (5, 20, 40):
         t = 0.01 * np.arange(count)
-        np.testing.assert_allclose(LowPassFilter(3.0)(t, np.ones((count, 1))), 1.0, atol=1e-9)
+        np.testing.assert_allclose(ZeroPhaseLowPassFilter(3.0)(t, np.ones((count, 1))), 1.0, atol=1e-9)

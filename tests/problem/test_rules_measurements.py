@@ -143,19 +143,19 @@ LATE = {
 
 @pytest.mark.parametrize(("node", "fraction", "steps", "late_node", "late_fraction"), LATE.values(), ids=LATE)
 def test_a_late_sample_is_that_of_before_within_the_span(node, fraction, steps, late_node, late_fraction):
-    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).shifted_earlier_by_steps(np.array([steps]))
+    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).shifted_earlier_by_delays(np.array([steps]))
     assert made.node.tolist() == [[late_node]]
     np.testing.assert_allclose(made.fraction, [[late_fraction]], atol=1e-12)
 
 
 def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
     made = measured(efforts("a", "b"), [5, 6], [0.5, 0.0], np.zeros((2, 2)), span=(0, 10))
-    made = made.shifted_earlier_by_steps(np.array([0.25, 2.0]))
+    made = made.shifted_earlier_by_delays(np.array([0.25, 2.0]))
     assert made.node.tolist() == [[5, 3], [5, 4]]
     np.testing.assert_allclose(made.fraction, [[0.25, 0.5], [0.75, 0.0]])
     assert made.evaluation_nodes.tolist() == [2, 3, 4, 5, 6]
     for node, nodes in ((0, [0, 1]), (3, [1, 2, 3])):
-        near_an_end = measured(efforts("a"), [node], [0.0], [[1.0]], span=(0, 3)).shifted_earlier_by_steps(np.zeros(1))
+        near_an_end = measured(efforts("a"), [node], [0.0], [[1.0]], span=(0, 3)).shifted_earlier_by_delays(np.zeros(1))
         assert near_an_end.evaluation_nodes.tolist() == nodes
     at_nodes = np.array([[k, 10 * k] for k in made.evaluation_nodes], float)
     np.testing.assert_allclose(made.interpolate_to_samples(at_nodes), [[5.25, 35.0], [5.75, 40.0]])
@@ -176,19 +176,19 @@ RATES = {
 @pytest.mark.parametrize(("node", "fraction", "steps", "rate"), RATES.values(), ids=RATES)
 def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node, fraction, steps, rate):
     plain = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8))
-    late = plain.shifted_earlier_by_steps(np.array([steps]))
+    late = plain.shifted_earlier_by_delays(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in late.evaluation_nodes])
     np.testing.assert_allclose(late.prediction_change_per_step(at_nodes, plain, np.array([steps])), [[rate]])
     # others beside it make no difference
     several = measured(efforts("a"), [2, node, 8], [0.25, fraction, 0.0], np.ones((3, 1)), span=(2, 8))
-    all_late = several.shifted_earlier_by_steps(np.array([steps]))
+    all_late = several.shifted_earlier_by_delays(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in all_late.evaluation_nodes])
     np.testing.assert_allclose(all_late.prediction_change_per_step(at_nodes, several, np.array([steps]))[1], [rate])
 
 
 def test_late_samples_of_which_a_short_piece_holds_none_change_by_nothing():
     none = measured(efforts("a"), np.zeros(0, int), np.zeros(0), np.zeros((0, 1)), span=(2, 8))
-    late = none.shifted_earlier_by_steps(np.array([0.5]))
+    late = none.shifted_earlier_by_delays(np.array([0.5]))
     assert late.prediction_change_per_step(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
     assert late.interpolate_to_samples(np.zeros((0, 1, 3))).shape == (0, 1, 3)
 

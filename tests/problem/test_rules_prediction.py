@@ -25,7 +25,7 @@ DELAYED = (("effort_delay", "gripper", {"delay": 0.0137}), ("effort_offset", "sh
 SOFT = (("joint_coulomb", "elbow", {"tau_c": 0.05}), ("gravity_tilt", "world", {"rx": 0.03, "ry": 0.02}))
 STICKING = (("joint_presliding", "shoulder", {"tau_c": 0.3, "yield_angle": 0.02}),)
 
-TRACKED = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
+TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 FILTERED = {"arm_tracking_feedback": "lqr"}
 CASES = {
     "free": ((), {}, {}),
@@ -191,7 +191,7 @@ def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
 def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_folder):
     problem = problem_of(urdf_folder, "driven and prescribed", seeds=(1,))
     rollout = problem.evaluate(problem.initial_unknowns, False).episode_predictions[0].rollout
-    effort = problem.predictor.state_values_at_nodes(rollout).load
+    effort = problem.predictor.rollout_node_values(rollout).load
     assert effort.shape == (STEPS + 1, 2)
     np.testing.assert_array_equal(effort[:-1, 0], rollout.effort[:, 0])
     np.testing.assert_array_equal(effort[:-1, 1], rollout.torque[:, 0])
@@ -202,7 +202,7 @@ def test_readings_along_a_trajectory_are_those_of_its_rollout(urdf_folder):
     problem = problem_of(urdf_folder, "free", seeds=(1,))
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x, False)
-    state, theta = evaluation.episode_predictions[0].rollout.state, problem.unpack_unknown_vector(x, 0)[0]
+    state, theta = evaluation.episode_predictions[0].rollout.state, problem.unpack_episode_unknowns(x, 0)[0]
     by_state = np.zeros((STEPS + 1, 4, len(x)))
     for k, samples in enumerate(problem.episodes[0].measurements):
         along, slopes = problem.predictor.readings_and_sensitivities(samples, state, by_state, theta)

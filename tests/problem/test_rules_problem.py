@@ -62,12 +62,12 @@ def test_blocks_and_values_find_their_places():
 def test_a_recording_has_its_own_values_and_start(make):
     problem = make(local_parameters=("elbow.rest",), initial_state="estimated")
     x = np.arange(1.0, 1 + len(problem.unknown_names))
-    theta, offset = problem.unpack_unknown_vector(x, 1)
+    theta, offset = problem.unpack_episode_unknowns(x, 1)
     names = problem.system.parameters.names
     assert [theta[names.index(name)] for name in ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")] == [1, 2, 8]
     assert offset.tolist() == [9, 10, 11, 12]
     assert theta[names.index("elbow.damping")] == 0.2
-    assert problem.unpack_unknown_vector(x, 0)[1].tolist() == [4, 5, 6, 7]
+    assert problem.unpack_episode_unknowns(x, 0)[1].tolist() == [4, 5, 6, 7]
     assert problem.theta[names.index("elbow.rest")] == 0.1
     assert (problem.shared_parameters, problem.local_parameters) == (FREE[:2], FREE[2:])
 
@@ -204,7 +204,7 @@ def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
     evaluation = problem.evaluate(x, derivatives=False)
     assert evaluation.jacobian is None
     result = evaluation.episode_predictions[0]
-    theta, _ = problem.unpack_unknown_vector(x, 0)
+    theta, _ = problem.unpack_episode_unknowns(x, 0)
     state = result.equilibrium.state
     np.testing.assert_allclose(result.rollout.state, roll(free_step, theta, state[:2], state[2:], 24).state, atol=1e-12)
 
@@ -274,7 +274,7 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
     problem = make(held_out=held, **options)
     x = problem.initial_unknowns
     short = truncate_episode(problem.held_out[1], 20)
-    theta, _ = problem.unpack_unknown_vector(x, 0)
+    theta, _ = problem.unpack_episode_unknowns(x, 0)
 
     std = problem.initial_state_prior_std
 
@@ -305,7 +305,7 @@ def test_a_held_out_part_of_a_recording_shares_its_start_and_local_parameters(ma
     part = replace(problem.episodes[1], initial_state_shared_with=1)
     split = problem.with_episodes(problem.episodes, [part])
     x = problem.unknown_vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
-    assert split.held_out_prediction_inputs(x)[0][2].tolist() == problem.unpack_unknown_vector(x, 1)[1].tolist()
+    assert split.held_out_prediction_inputs(x)[0][2].tolist() == problem.unpack_episode_unknowns(x, 1)[1].tolist()
     np.testing.assert_array_equal(
         split.predict_held_out(x)[0][1].predicted_outputs[0],
         problem.evaluate(x, False).episode_predictions[1].predicted_outputs[0],

@@ -20,7 +20,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.episode_prediction import _MAX_RESTING_TIME
 from yid_ocp.problem.initial_state_fit import InitialStateFitter, _speed
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
-from yid_ocp.sensors import sensor_reading_function
+from yid_ocp.sensors import sensor_function_with_jacobians
 from yid_ocp.sensors.points import PointSensor
 
 NAN = math.nan
@@ -207,7 +207,7 @@ def test_known_starts_and_values_are_taken_as_they_are(step):
     theta = problem.predictor.theta_with_episode_values(problem.episodes[0], problem.theta)
     assert theta[problem.system.parameters.index("elbow.rest")] == 0.5
     assert problem.theta[problem.system.parameters.index("elbow.rest")] == 0.1
-    start = problem.initial_state_of_episode(problem.episodes[0], problem.theta)
+    start = problem.initial_state_and_derivative(problem.episodes[0], problem.theta)
     np.testing.assert_array_equal(start.state, state)
     assert (start.state_sensitivity.shape, start.equilibrium, start.failure_message) == ((4, 1), None, "")
     assert not start.state_sensitivity.any()
@@ -223,7 +223,7 @@ def test_an_estimated_start_is_offset_from_a_known_one(step):
     offset = np.array([0.01, 0.02, 0.003, 0.004])
     rollout = problem.evaluate(np.concatenate([[3.0], offset]), False).episode_predictions[0].rollout
     np.testing.assert_allclose(rollout.state[0], state + offset)
-    start = problem.initial_state_of_episode(problem.episodes[0], problem.theta, offset)
+    start = problem.initial_state_and_derivative(problem.episodes[0], problem.theta, offset)
     np.testing.assert_allclose(start.state, state + offset)
     np.testing.assert_array_equal(start.state_sensitivity, np.hstack([np.zeros((4, 1)), np.eye(4)]))
 
@@ -232,7 +232,7 @@ def test_a_start_at_rest_that_does_not_exist_is_said(step):
     problem = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
     theta = problem.system.parameters.vector() * 1.0
     theta[problem.system.parameters.index("elbow.rest")] = 1e8
-    start = problem.initial_state_of_episode(problem.episodes[0], theta)
+    start = problem.initial_state_and_derivative(problem.episodes[0], theta)
     assert start.failure_message.startswith("run_4: no equilibrium")
     assert start.state_sensitivity.shape == (4, 1)
     assert not start.equilibrium.is_converged
@@ -306,7 +306,7 @@ def rod_problem(step, state, first=0.1, std=1e-3, **options):
     """A recording of the rod at rest, its middle seen from `first` seconds on."""
     n, t = step.system.n_coordinates, 0.01 * np.arange(int(100 * (first + 0.3)))
     sensor = PointSensor("points_camera", (MIDDLE,), (MIDDLE,), None)
-    function = sensor_reading_function(step.system, sensor, ())
+    function = sensor_function_with_jacobians(step.system, sensor, ())
     place = np.array(function(q=state[:n], theta=step.system.parameters.vector())["y"])
     late = t[t >= first - 1e-9]
     place = np.tile(place.ravel(), (len(late), 1, 1))

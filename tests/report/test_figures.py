@@ -335,7 +335,8 @@ def test_long_curves_are_thinned_and_gaps_stay():
     t = np.linspace(0.0, 10.0, 50_000)
     measured = np.sin(t)
     measured[:10_000] = np.nan
-    plots = figures.prediction_and_residual_plot_data("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)})
+    predicted, plot_data = {"predicted": np.sin(t)}, figures.channel_prediction_and_residual_plot_data
+    plots = plot_data("x", "m", t, measured, 0 * t + 1e-3, predicted)
     figure = go.Figure(figures.time_plots_figure(plots))
     assert max(len(trace.x) for trace in figure.data) <= figures._MAX_CURVE_POINTS
     assert np.isnan(figure.data[0].y[0])

@@ -212,7 +212,7 @@ def test_every_verdict_has_its_chapters(found, verdict, left_out, tmp_path):
 
 def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     finding = found["effect"]
-    (name, values) = next(iter(finding.nominal_changes.items()))
+    (name, values) = next(iter(finding.nominal_parameters_before_and_after.items()))
     before = finding.nominal_model.values | {name: values["after"] / 2}
     moved = replace(finding, nominal_model=replace(finding.nominal_model, values=before))
     text = text_of(page_of(moved, tmp_path))

@@ -22,8 +22,8 @@ from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.recorded_inputs import available_signal_kinds
-from yid_ocp.sensors import sensor_reading_function
+from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
+from yid_ocp.sensors import sensor_function_with_jacobians
 from yid_ocp.sensors.mounted import _Accelerometer, _Gyroscope
 from yid_ocp.sensors.wrist import _WristForceSensor, _WristTorqueSensor
 from yid_ocp.solvers import GaussNewton, solve
@@ -82,7 +82,7 @@ def test_a_sensor_reads_what_mujoco_reads(urdf: Path) -> None:
     order = [model.joint(name).qposadr[0] for name in system.mechanism.joint_names]
     for frame in ("wrist", "tool"):
         for kind, sensor in KINDS.items():
-            read = sensor_reading_function(system, sensor((frame,), (1.0,), (frame,), "any"), ())
+            read = sensor_function_with_jacobians(system, sensor((frame,), (1.0,), (frame,), "any"), ())
             data.qpos[:], data.qvel[:], data.qfrc_applied[:] = rng.uniform(-1, 1, (3, 4)) * [[1], [2], [2]]
             mujoco.mj_forward(model, data)
             at = {"q": data.qpos[order], "v": data.qvel[order], "a": data.qacc[order]}
@@ -112,24 +112,24 @@ def holding(urdf: Path, kind: str = "point", effects: Mapping[str, dict[str, flo
 def recorded(urdf: Path) -> Recording:
     """A motion of arm and rod in MuJoCo, with its own sensors on the lower link and at the rod's end, without noise."""
     mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install 'yid-ocp[blind]'")
+    from yid_ocp.virtual import mujoco_simulation as engine
     from yid_ocp.virtual.joint_motion import MultisineMotion
     from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml
-    from yid_ocp.virtual.mujoco_simulation import MujocoModelAndState, TrackingController, settled_holding_torques
 
     system, step = holding(urdf, driven=ARM), 2e-4
     own = "".join(f"<{kind} name='{site}{kind}' site='{site}'/>" for site in ("lower", "w_T1") for kind in KINDS)
     text = mujoco_xml(system, time_step=step).replace("</mujoco>", f"<sensor>{own}</sensor></mujoco>")
     model = mujoco_model_from_mjcf_text(text)
-    scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
+    scene = engine.MujocoModelAndState.from_compiled_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[[model.joint(name).id for name in ARM]] = list(START.values())
     waves = (np.array([[0.05], [0.06]]), np.array([[1.1], [1.7]]), np.zeros((2, 1)), 0.3)
-    controller = TrackingController(
-        scene, MultisineMotion(ARM, *waves), settled_holding_torques(scene, model.dof_damping.copy())
+    controller = engine.TrackingController(
+        scene, MultisineMotion(ARM, *waves), engine.settle_and_return_holding_torques(scene, model.dof_damping.copy())
     )
     q, read = [], {site + kind: list[Array]() for site in ("lower", "w_T1") for kind in KINDS}
     for tick in range(6001):
-        controller.apply_input_to_scene(tick * step)
+        controller.apply_and_return_input(tick * step)
         if tick % 50 == 0:
             mujoco.mj_forward(model, scene.data)
             q.append(scene.data.qpos[scene.joint_ids][:2])
@@ -206,7 +206,7 @@ def test_slopes_with_effects_are_those_of_differences(urdf: Path, recorded: Reco
         np.testing.assert_allclose(evaluation.jacobian[rows, i], numeric, atol=2e-6 * np.abs(numeric).max() + 4e-5)
     gradient = made.cost_and_gradient(x)[1]
     np.testing.assert_allclose(gradient, evaluation.jacobian.T @ evaluation.residual, rtol=1e-9)
-    with_sensors = candidate_kinds_and_locations(system, available_signal_kinds([recorded]))
+    with_sensors = candidate_kinds_and_locations(system, signal_kinds_for_effects([recorded]))
     places = {place for kind, place in with_sensors if kind == "sensor_bias"}
     assert places == {"wrist:lower", "imu:lower", "imu:w_T1"}
 
@@ -222,7 +222,7 @@ def test_unknown_forces_of_the_smoother_move_these_readings_as_an_effect_does(
     [model] = residual_models_with_smoother_unknowns(
         made, made.initial_unknowns, made.evaluate(made.initial_unknowns), interval=0.2
     )
-    bent = [link[0] for link in curved.segment_layout("T1").link_joints]
+    bent = [link[0] for link in curved.layout_of_segment("T1").link_joints]
     moment = 4.0 * np.isin(model.unknown_names, bent) / model.reference_std
     state, products = model.initial_state_jacobian @ moment, np.zeros(3)
     for part in model.intervals:

@@ -23,9 +23,9 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.sensors import (
     PointSensor,
     PrescribedJointEffortSensor,
-    RecordedChannelKind,
+    RecordedChannelSpec,
     Sensor,
-    sensor_reading_function,
+    sensor_function_with_jacobians,
 )
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
@@ -51,7 +51,7 @@ def system() -> System:
 def read(system: System, sensor: Sensor, q=None, effort=None) -> np.ndarray:
     """Outputs at the parameters' nominal values."""
     n = system.n_coordinates
-    function = sensor_reading_function(system, sensor, ())
+    function = sensor_function_with_jacobians(system, sensor, ())
     at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
     return np.array(ca.densify(function(**at, theta=system.parameters.vector())["y"])).ravel()
 
@@ -81,17 +81,17 @@ def whole(system: System) -> System:
 
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])
 def test_outputs_have_a_row_for_every_reading(whole: System, sensor: Sensor) -> None:
-    function = sensor_reading_function(whole, sensor, NAMES)
+    function = sensor_function_with_jacobians(whole, sensor, NAMES)
     rows = sensor.outputs_per_channel * len(sensor.channel_names)
     n = whole.n_coordinates
     assert [function.size_out(i) for i in range(8)] == [(rows, size) for size in (1, n, 0, 0, 1, n, 0, len(NAMES))]
-    assert sensor_reading_function(whole, sensor, ()).size_out(7) == (rows, 0)
+    assert sensor_function_with_jacobians(whole, sensor, ()).size_out(7) == (rows, 0)
 
 
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])
 def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> None:
     rng = np.random.default_rng(1)
-    function = sensor_reading_function(whole, sensor, NAMES)
+    function = sensor_function_with_jacobians(whole, sensor, NAMES)
     n = whole.n_coordinates
     at = {"q": rng.uniform(-0.6, 0.6, n), "z": np.array([0.4]), "load": rng.uniform(-1, 1, n)}
     at["theta"] = whole.parameters.vector()
@@ -112,7 +112,7 @@ def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None
     a, b = (whole.mechanism.joint_index(name) for name in ("left_a", "left_b"))
     effort[a], effort[b] = 2.0, 3.0
     assert a == 0
-    function = sensor_reading_function(whole, EFFORT, ())
+    function = sensor_function_with_jacobians(whole, EFFORT, ())
     read = np.array(function(z=0.5, load=effort, theta=whole.parameters.vector())["y"]).ravel()
     drift = 0.2 * (0.25 + np.sin(2.0))
     assert read == pytest.approx([2.0 + drift, 0.8 * 3.0 + drift])
@@ -166,7 +166,7 @@ def test_a_joint_or_frame_that_is_not_there_is_refused(sensor: Sensor, system: S
 class Hand(Sensor):
     """How fast the elbow turns, how that changes and what holds the hand: what a node has beside its coordinates."""
 
-    channel = RecordedChannelKind("hand", "touch", "1")
+    channel = RecordedChannelSpec("hand", "touch", "1")
     group_name: str = "hand.touch"
     frame_names = point_names = ()
 

@@ -12,7 +12,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
     is_stationary_point,
-    predicted_cost_reduction,
+    predicted_cost_reduction_by_step,
     projected_gradient_norm,
     size_limited_damped_step,
 )
@@ -413,7 +413,7 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
     def known(ok):
         found = SimpleNamespace(ok=ok, episode_predictions=("plain a", "plain b") if ok else ())
         how = {
-            "unpack_unknown_vector": lambda x, i: (f"theta {'ab'[i]}", "offset"),
+            "unpack_episode_unknowns": lambda x, i: (f"theta {'ab'[i]}", "offset"),
             "evaluate": lambda x, derivatives, warm: found,
         }
         plain = SimpleNamespace(episodes=("a", "b"), predictor=SimpleNamespace(predict_episode=run), **how)
@@ -572,7 +572,7 @@ def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost_and_nothing_w
     jacobian, residual, step = np.array([[1.0, 2.0], [0.5, -1.0]]), np.array([3.0, -1.0]), np.array([0.2, -0.4])
     after = residual + jacobian @ step
     fall = 0.5 * (residual @ residual - after @ after)
-    assert predicted_cost_reduction(jacobian, residual, step) == pytest.approx(fall)
+    assert predicted_cost_reduction_by_step(jacobian, residual, step) == pytest.approx(fall)
     none = MadeUp(linear(np.zeros((2, 0)), [3.0, 3.0]), ())
     assert is_stationary_point(none, np.zeros(0), none.evaluate(np.zeros(0)))
 

@@ -26,7 +26,7 @@ from yid_ocp.solvers.nonlinear_program import (
 )
 from yid_ocp.solvers.symbolic_transcription import problem_unknowns_from_program, transcribe
 
-TRACKED = {"arm_tracking_feedback": "proportional", "arm_tracking_feedback_gains": (9.0,)}
+TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 CASES = {
     "free": ((), {}, {}),
     "robust": ((), {}, {"huber_threshold": 0.8}),
@@ -131,9 +131,9 @@ def test_its_reduced_gradient_is_the_problems(problem):
         # the program holds the first state where the problem holds its offset from rest, which moves with theta
         count = len(problem.shared_parameters)
         for i, episode in enumerate(problem.episodes):
-            by = problem.initial_state_of_episode(episode, problem.unpack_unknown_vector(x, i)[0]).state_sensitivity[
-                rows
-            ]
+            by = problem.initial_state_and_derivative(
+                episode, problem.unpack_episode_unknowns(x, i)[0]
+            ).state_sensitivity[rows]
             at = problem.unknowns.unknown_indices_affecting_recording(i)[len(problem.unknowns.free_parameter_names) :]
             expected[:count] -= by[:, :count].T @ expected[at]
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
@@ -232,7 +232,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     assert problem_with_sensor_noise_only(problem).evaluate(x).cost > 3 * expected
     program = transcribe(problem)
     arguments = program.solver_arguments
-    theta = program.named_block("theta").index.ravel()
+    theta = program.variable_or_parameter_block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
     found = solver(**arguments)
@@ -242,7 +242,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     exact = not encoders and feedback["arm_tracking_feedback"] != "lqr"
     assert float(found["f"]) == pytest.approx(expected, rel=1e-4 if exact else 4e-3)
     assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["arm_tracking_feedback"] != "none")
-    assert program.named_block("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
+    assert program.variable_or_parameter_block("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
 
 
 def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):

@@ -35,7 +35,7 @@ from yid_ocp.virtual.mujoco_simulation import (
     MujocoModelAndState,
     SimulationOptions,
     SimulationResult,
-    settled_holding_torques,
+    settle_and_return_holding_torques,
     simulate_in_mujoco,
 )
 
@@ -178,7 +178,7 @@ def test_grippers_beside_what_they_hold_close_at_a_short_step_too(tmp_path: Path
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log where it is
     system = SYSTEMS[2]
     scene = grippers_beside(system, TRUTH, 5e-5, system)
-    balance = settled_holding_torques(scene, np.array(scene.model.dof_damping))
+    balance = settle_and_return_holding_torques(scene, np.array(scene.model.dof_damping))
     scene.data.qfrc_applied[scene.moved_joint_ids] = balance
     mujoco.mj_forward(scene.model, scene.data)
     for grasp in system.grasps:

@@ -17,11 +17,11 @@ from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.friction import effect_with_sign_smoothing_speed
 from yid_ocp.errors import ModelError
-from yid_ocp.export.models import export_support_by_effect, export_support_by_parameter
+from yid_ocp.export.models import export_support_by_effect, support_in_export_format_by_parameter
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform
-from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorModelOptions, ServoModelOptions
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorKindAndPreset, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
@@ -239,7 +239,7 @@ def test_both_engines_move_alike(servo_arm: System, recording: Recording) -> Non
 
 def test_both_engines_move_a_direct_current_motor_alike() -> None:
     """At its duty's limit a motor gives the limit less its counter-voltage, which a clip of the whole would not."""
-    servos = {kind: ServoModelOptions(motor=MotorModelOptions(kind)) for kind in ("dc", "ideal")}
+    servos = {kind: ServoModelOptions(motor=MotorKindAndPreset(kind)) for kind in ("dc", "ideal")}
     systems = {kind: moved_by(own, point_frames=[]) for kind, own in servos.items()}
     limited = ("servo_saturation", "lift", {"limit": 1.3})
     made = played(systems["dc"], InjectedEffect(*limited))
@@ -277,7 +277,7 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
     said = export_support_by_effect(system, values, "mjcf")
     assert [said[f"{kind}@{place}"].status for kind, place, _ in effects] == ["native"] * 3 + ["not representable"]
     for form, status in (("mjcf", "native"), ("urdf", "not representable"), ("sdf", "not representable")):
-        own = export_support_by_parameter(system, export_support_by_effect(system, values, form), form)
+        own = support_in_export_format_by_parameter(system, export_support_by_effect(system, values, form), form)
         names = ("gain", "damping", "delay", "torque_limit")
         assert {own[f"wrist_flex.servo_{name}"].status for name in names} == {status}
     kept = servo_arm.with_effects([make_effect(kind, place, servo_arm, values) for kind, place, values in effects[:3]])
@@ -291,7 +291,7 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
 
 def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_limit_are_not() -> None:
     system = moved_by(
-        ServoModelOptions(motor=MotorModelOptions("dc", "sts3215"), extra_controller_terms=("derivative", "dead_band"))
+        ServoModelOptions(motor=MotorKindAndPreset("dc", "sts3215"), extra_controller_terms=("derivative", "dead_band"))
     )
     values = VALUES | {"pan.servo_derivative": 0.3}
     pan = mujoco.MjModel.from_xml_string(mujoco_xml(system, values)).actuator("pan")

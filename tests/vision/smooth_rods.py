@@ -135,7 +135,7 @@ def filmed(object_: SmoothY, frames, things=lambda k: [], *, seed=0, rate=4.0, b
 def measured(alone, sequence, truth, extra=(), empty=None, **options):
     """A track of a filmed sequence, and its errors [m]."""
     chosen = vision.TrackOptions(tracked_points=alone.point_frames, **options)
-    scene = vision.SceneDescription(alone, bodies_missing_from_urdf=extra)
+    scene = vision.SceneDescription(alone, surfaces_missing_from_urdf=extra)
     found = track_object(scene, None, sequence, chosen, empty=empty)
     good = [frame.index for frame in found.frame_reports if frame.is_good]
     order = [("w_T1", "w_T2", "w_T3").index(name) for name in found.point_names]

@@ -22,7 +22,7 @@ from yid_ocp.vision.camera_registration import (
     DEPTH_SCALE_INDEX,
     TRANSLATION_SLICE,
     ArmSurface,
-    CalibrationState,
+    CameraState,
     StampedCloud,
     _CalibrationEquations,
     robust_gradient_and_hessian,
@@ -104,7 +104,7 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
         arm_of(robot, motion), seen, pose, rng, ArmBasedCameraCalibrationOptions(**options), clock
     )
     about = found.camera_state.clock_reference_stamp
-    return found, CalibrationState(POSE, 1 / scale, 0.0, latency + drift * (about - latency), drift, about)
+    return found, CameraState(POSE, 1 / scale, 0.0, latency + drift * (about - latency), drift, about)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def std_of(found, index=CLOCK_OFFSET_INDEX):
 
 def test_slopes_of_the_state_are_derivatives():
     rng = np.random.default_rng(0)
-    state = CalibrationState(POSE, 1.03, 0.02, 0.1, 1e-3, 5.0)
+    state = CameraState(POSE, 1.03, 0.02, 0.1, 1e-3, 5.0)
     seen = state.world_to_measured_points(POINTS)
     assert np.allclose(state.measured_to_world_points(seen), POINTS, atol=1e-12)
     slopes = state.world_point_jacobian_by_pose_and_depth(POINTS)
@@ -144,7 +144,7 @@ def test_slopes_of_the_state_are_derivatives():
 def test_slopes_of_the_rows_are_derivatives(robot):
     rng = np.random.default_rng(1)
     [cloud] = clouds(robot, [1.7], rng)
-    state, arm = CalibrationState(POSE, clock_reference_stamp=1.2), arm_of(robot)
+    state, arm = CameraState(POSE, clock_reference_stamp=1.2), arm_of(robot)
     points = state.measured_to_world_points(cloud)
     glimpse = StampedCloud(1.7, cloud[arm.near_moving_surface_off_grasps_mask(points, 1.7, 0.02)][::7])
     rows = arm.linearized_surface_distances(state, glimpse, 0.1, along=True)

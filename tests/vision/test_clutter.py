@@ -9,7 +9,7 @@ from yid_ocp.vision import CloudFilterOptions, ExtraMesh, FrameSequence, look_at
 from yid_ocp.vision.point_cloud import wanted_colour_mask
 from yid_ocp.vision.sequence_calibration import BackgroundPoints, foreign_objects_from_clusters
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
-from yid_ocp.vision.surface_meshes import extra_meshes_by_joint
+from yid_ocp.vision.surface_meshes import extra_meshes_by_joint_index
 
 FRAMES = 2
 TABLE = [0.6, 0.5, -0.2], [0.6, 0.8, 0.04]
@@ -85,7 +85,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
 
     for place, moving, link, help_ in (
         (lambda t: [0.5, 0.5, 0.5], False, "", "background"),
-        (lambda t: [t + 0.1, 0.0, 0.2], True, "hand", "bodies_missing_from_urdf"),
+        (lambda t: [t + 0.1, 0.0, 0.2], True, "hand", "surfaces_missing_from_urdf"),
         (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
         (lambda t: [3.0, 0.3 * t, 0.5], True, "", "box_lower and box_upper"),
     ):
@@ -107,7 +107,7 @@ def test_extra_meshes_hang_on_links(system):
         ExtraMesh(parent_frame="left_gripper", box_size=(0.1, 0.1, 0.1)),
         ExtraMesh(sphere_radius=0.2, xyz=(1, 2, 3)),
     ]
-    made = extra_meshes_by_joint(extra, tree)
+    made = extra_meshes_by_joint_index(extra, tree)
     assert set(made) == {-1, tree.frames["left_gripper"].joint_index}
     assert made[-1][0].vertices.mean(axis=0) == pytest.approx([1, 2, 3], abs=0.01)
     for wrong, error, message in (
@@ -116,7 +116,7 @@ def test_extra_meshes_hang_on_links(system):
         (ExtraMesh(mesh_file="nowhere.stl"), ModelError, "no mesh"),
     ):
         with pytest.raises(error, match=message):
-            extra_meshes_by_joint([wrong], tree)
+            extra_meshes_by_joint_index([wrong], tree)
 
 
 def test_colours_in_light_and_shade_and_clouds_without_any(alone):

@@ -9,7 +9,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.vision import SceneDescription, TrackOptions
-from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CalibrationState
+from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
 from yid_ocp.vision.track import FrameTracker, track_object
 
 MILLIMETRE = 1e-3
@@ -69,7 +69,7 @@ def test_the_camera_and_its_clock_are_found(clean):
     camera, made = clean.track.camera_calibration, clean.made.sequence
     assert camera.n_frames == CALIBRATION_FRAMES
     std = np.sqrt(np.diag(camera.state_covariance))
-    true = CalibrationState(
+    true = CameraState(
         made.camera_pose, clock_offset=LATENCY, clock_reference_stamp=camera.camera_state.clock_reference_stamp
     )
     assert (np.abs(camera.camera_state.difference_from(true)) < 4 * std).all()

@@ -10,7 +10,7 @@ from PIL import Image
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
-from yid_ocp.diagnosis.blind_scores import BlindCaseScore, detection_and_false_alarm_rates
+from yid_ocp.diagnosis.blind_scores import BlindCaseScore, blind_case_score_summary
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import InlineExecutor
@@ -232,7 +232,7 @@ MARKS = [
 
 @pytest.mark.parametrize("marks", [MARKS, MARKS[8:], []], ids=["all", "clean", "none"])
 def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
-    result = to_json_types(detection_and_false_alarm_rates(marks)) | {"seed": 1, "purpose": "report", "versions": {}}
+    result = to_json_types(blind_case_score_summary(marks)) | {"seed": 1, "purpose": "report", "versions": {}}
     files = draw_blind_results(tmp_path, result)
     assert [file.name for file in files] == ["detection.png", "confusion.png", "calibration.png"]
     for file in files:
@@ -249,7 +249,7 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
 
 
 def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
-    lines = blind_tables_markdown(to_json_types(detection_and_false_alarm_rates(MARKS)))
+    lines = blind_tables_markdown(to_json_types(blind_case_score_summary(MARKS)))
     assert "| false alarms on clean data | 0 % (0 of 5, 0 % to 52 %) |" in lines
     assert f"| 3 | 8 | {' | '.join([*2 * ['75 % (6 of 8, 35 % to 97 %)'], '50 % (4 of 8, 16 % to 84 %)'])} |" in lines
     assert "| two | 5 | 0 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines

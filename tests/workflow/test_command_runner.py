@@ -155,7 +155,7 @@ def test_a_terminal_renews_one_line_of_iterations_and_a_table_of_results(monkeyp
         progress.begin_stage("solving", ahead=60.0)
         for _ in range(2):
             progress.report_iterate(ENTRY)
-        progress.report_table([("effects", "chi2/n"), *((f"a{k}@x", str(k)) for k in range(30))])
+        progress.renew_results_table([("effects", "chi2/n"), *((f"a{k}@x", str(k)) for k in range(30))])
         progress.report_iterate(ENTRY)
     said = sys.stderr.getvalue()
     assert "\x1b" in said
@@ -203,7 +203,7 @@ def test_lines_have_no_control_characters(capsys, clock):
         progress.begin_stage("solving", 2.0, 60.0)
         progress.report_iterate(ENTRY)
         progress.report_parts_done(1, 2, "frame 1")
-        progress.report_table([("effects", "chi2/n"), ("a@x", "1")])
+        progress.renew_results_table([("effects", "chi2/n"), ("a@x", "1")])
     assert set(capsys.readouterr().err) <= {*map(chr, range(32, 127)), "\n"}
 
 

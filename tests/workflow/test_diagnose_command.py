@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, StoredFit
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.whitening import problem_with_whitening_at, torque_bias_estimates_by_recording
+from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -142,7 +142,7 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
-    embedded = load_config(None, (), EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    embedded = load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     for settings, command in ((changed, "yid-ocp diagnose 'runs/a b/config.yaml'"), (embedded, "yid-ocp diagnose")):
         with atomic_run_folder(settings, tmp_path / "runs" / "a b") as folder:
             folder.record_run_start(settings, "diagnose")
@@ -228,7 +228,7 @@ def test_errors_of_torques_shrink_like_all_other_noise(problem_of, encoders):
     assert all(made.whitening_filters[0] is not None for made in both)
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
-    (value, std), (smaller_value, smaller_std) = (torque_bias_estimates_by_recording(made, x)[0] for made in both)
+    (value, std), (smaller_value, smaller_std) = (torque_biases_and_stds_per_recording(made, x)[0] for made in both)
     np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
 

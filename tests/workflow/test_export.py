@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import config_yaml_with_defaults
 from yid_ocp.virtual.mujoco_simulation import replay_mismatch_by_channel
 from yid_ocp.workflow.build import build_system
@@ -41,7 +41,7 @@ def written_run(folder, effects, run, recorded=True):
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    run = load_config(None, ["problem.duration=1.5"], default=EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    run = load_config(None, ["problem.duration=1.5"], default=SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     return written_run(tmp_path_factory.mktemp("found") / "run", {"kelvin_voigt@T1.tau": 0.05}, run)
 
 
@@ -93,7 +93,7 @@ def test_the_embedded_diagnosis_in_mujoco(cli, found, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_what_a_diagnosis_found_in_mujoco(tmp_path, exported) -> None:
-    run = load_config(None, default=EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    run = load_config(None, default=SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     run_diagnose(replace(run, output=replace(run.output, write_report=False)), tmp_path / "run")
     gate_holds(exported(tmp_path / "run", tmp_path / "y.xml")["gate"])
 
@@ -140,7 +140,7 @@ def test_sdf_has_springs_too(found, tmp_path, exported) -> None:
 def test_what_cannot_be_said_is_left_out_and_listed(tmp_path, exported) -> None:
     effects = {"hysteresis@T2.stiffness": 0.4, "hysteresis@T2.yield_angle": 0.1, "kelvin_voigt@T1.tau": 0.05}
     effects |= {"junction_compliance@w_T1.compliance": 0.02, "joint_coulomb@left_e1.tau_c": 0.5}
-    coarse = load_config(None, ["model.object.links=1"], EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    coarse = load_config(None, ["model.object.links=1"], SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     manifest = exported(written_run(tmp_path / "both", effects, coarse, False), tmp_path / "both.xml")
     assert {label: entry["status"] for label, entry in manifest["effects"].items()} == {
         "hysteresis@T2": "not representable",

@@ -20,7 +20,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data import JointGroup, PointGroup, Recording, SensorChannelGroup, read_recording, write_recording
-from yid_ocp.model.servos_and_springs import MotorModelOptions
+from yid_ocp.model.servos_and_springs import MotorKindAndPreset
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.workflow.build import build_system, free_parameter_names
 
@@ -292,7 +292,7 @@ def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, r
     lerobot_dataset(bench / "arm", made.joints)
     assert main(["init", "package:so101", "arm", "--units", "deg", "--out", "run.yaml"]) == 0
     run = load_config("run.yaml")
-    assert run.model.arms.servo.motor == MotorModelOptions("dc", "sts3215")
+    assert run.model.arms.servo.motor == MotorKindAndPreset("dc", "sts3215")
     assert run.model.friction is not None
     assert (run.model.friction.law, run.model.friction.joints) == ("load", made.joint_names[:5])  # the gripper is shut
     assert run.parameters["*.servo_gain_factor"].initial == 16

@@ -104,14 +104,14 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
     """A pendulum under torques that are 0.3 N m too large, in one recording to estimate on and one held out."""
     t = 0.01 * np.arange(STEPS + 1)
     torque = np.sin(6 * t)[:, None]
-    options = options or ProblemOptions(arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,))
+    options = options or ProblemOptions(arm_tracking_feedback="proportional", arm_proportional_gains=(9.0,))
     stated = {"effort_std": white, "effort_bias_std": bias, "position_std": ANGLE, "effort_kind": "command"}
     joints = JointGroup(("shoulder",), t, np.zeros((STEPS + 1, 1)), effort=torque, **stated)
     first = Recording(joints, (), name="first")
-    bare = replace(options, arm_tracking_feedback="none", arm_tracking_feedback_gains=None)
+    bare = replace(options, arm_tracking_feedback="none", arm_proportional_gains=None)
     made = EstimationProblem(step, [first], ("elbow.stiffness",), bare)
     episode = made.episodes[0]
-    swept = made.predictor.predict_episode(episode, *made.unpack_unknown_vector(made.initial_unknowns, 0), False)
+    swept = made.predictor.predict_episode(episode, *made.unpack_episode_unknowns(made.initial_unknowns, 0), False)
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
     recordings = [replace(first, joints=joints, name=name) for name in ("first", "second")]
     apart = recordings[1:] if held_out else ()
@@ -120,9 +120,9 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
 
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
     problem = problem_of(step)
-    assert prediction_outputs.estimated_torque_offsets(problem, problem.initial_unknowns) == {}
+    assert prediction_outputs.torque_offsets_by_recording(problem, problem.initial_unknowns) == {}
     weighted = problem_with_whitening_at(problem, problem.initial_unknowns, rounds=2)
-    found = prediction_outputs.estimated_torque_offsets(weighted, problem.initial_unknowns)
+    found = prediction_outputs.torque_offsets_by_recording(weighted, problem.initial_unknowns)
     assert list(found) == ["first", "second"]
     for entry in found.values():
         own = entry["shoulder"]
@@ -130,9 +130,9 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
     alone = problem_with_whitening_at(problem_of(step, held_out=False), problem.initial_unknowns)
-    assert list(prediction_outputs.estimated_torque_offsets(alone, problem.initial_unknowns)) == ["first"]
+    assert list(prediction_outputs.torque_offsets_by_recording(alone, problem.initial_unknowns)) == ["first"]
     unbiased = problem_with_whitening_at(problem_of(step, bias=0.0), problem.initial_unknowns)
-    assert prediction_outputs.estimated_torque_offsets(unbiased, problem.initial_unknowns) == {}
+    assert prediction_outputs.torque_offsets_by_recording(unbiased, problem.initial_unknowns) == {}
 
 
 def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
@@ -153,7 +153,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
 def simulated(problem, seeds):
     episode = problem.episodes[0]
     outcome = problem.predictor.predict_episode(
-        episode, *problem.unpack_unknown_vector(problem.initial_unknowns, 0), False
+        episode, *problem.unpack_episode_unknowns(problem.initial_unknowns, 0), False
     )
     known = (problem.predictor, episode, outcome, problem.theta)
     return [recording_from_prediction(*known, seed).joints for seed in seeds]
@@ -169,7 +169,7 @@ def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
         assert (group.effort_std, group.effort_bias_std, group.position_std) == (WHITE, OFFSET, ANGLE)
     # settings come before what the recording says
     sensors = {"joints.effort": SensorOptions(std={"shoulder": 0.4}, bias_std=0.7)}
-    options = ProblemOptions(arm_tracking_feedback="proportional", arm_tracking_feedback_gains=(9.0,), sensors=sensors)
+    options = ProblemOptions(arm_tracking_feedback="proportional", arm_proportional_gains=(9.0,), sensors=sensors)
     [made] = simulated(problem_of(step, options=options), [1])
     assert (made.effort_std, made.effort_bias_std) == (0.4, 0.7)
 
@@ -283,39 +283,40 @@ def test_a_spring_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder)
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(robot, springs={"elbow": RobotJointSpring(3.0, 0.2)})
     theta = system.parameters.vector({"elbow.stiffness": 4.0})
-    problem = SimpleNamespace(system=system, unpack_unknown_vector=lambda x, i: (theta, None))
+    problem = SimpleNamespace(system=system, unpack_episode_unknowns=lambda x, i: (theta, None))
     found = {"elbow.stiffness": ParameterEstimate(4.0, 0.1, "N m/rad", 3.0, 0.0, np.inf, True, "identifiable")}
-    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
+    told = prediction_outputs.estimate_texts_by_format(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
     [line] = told["mjcf"]
     joint = line.replace("<joint ", '<joint axis="0 0 1" ')
     body = f'<body><geom size="1"/>{joint}</body>'
     model = mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>')
     assert (model.joint("elbow").stiffness[0], model.qpos_spring[0]) == (4.0, pytest.approx(0.2))
     lost = {"shoulder.mass": replace(found["elbow.stiffness"], verdict="identifiable")}
-    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=lost), "runs/a")
+    told = prediction_outputs.estimate_texts_by_format(problem, SimpleNamespace(x=None, parameters=lost), "runs/a")
     assert told["mjcf"] == []
 
 
 def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     system = build_system(load_config(None))
     theta = system.parameters.vector({"T1.bend": 22.0})
-    problem = SimpleNamespace(system=system, unpack_unknown_vector=lambda x, i: (theta, None))
+    problem = SimpleNamespace(system=system, unpack_episode_unknowns=lambda x, i: (theta, None))
 
     def estimate(value, verdict):
         return ParameterEstimate(value, 0.5, "N m/rad", 3.0, 0.0, np.inf, True, verdict)
 
     found = {"T1.bend": estimate(22.0, "identifiable"), "T1.twist": estimate(7.0, "not_identifiable")}
-    told = prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=found), "my runs/a")
+    told = prediction_outputs.estimate_texts_by_format(problem, SimpleNamespace(x=None, parameters=found), "my runs/a")
     assert told["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
     small = {"T1.bend": replace(found["T1.bend"], value=2.2e-5, std=5e-7)}
-    told_small = prediction_outputs.copyable_estimate_texts(
+    told_small = prediction_outputs.estimate_texts_by_format(
         problem, SimpleNamespace(x=None, parameters=small), "runs/a"
     )
     assert told_small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & N m/rad \\"]
     assert told["export"] == "yid-ocp export 'my runs/a' --out model.xml"
     lost = {"T1.twist": found["T1.twist"]}
-    assert prediction_outputs.copyable_estimate_texts(problem, SimpleNamespace(x=None, parameters=lost), "runs/a") == {}
+    nothing = SimpleNamespace(x=None, parameters=lost)
+    assert prediction_outputs.estimate_texts_by_format(problem, nothing, "runs/a") == {}

@@ -253,9 +253,7 @@ def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[Estima
     return problem, issues
 
 
-def clock_drift_and_overstated_noise_issues(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation
-) -> list[Issue]:
+def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
     """Find drifting clocks and overstated noise in the residuals of a fit.
 
     Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has
@@ -290,7 +288,7 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             columns[at, 1:] = _by_clock(t[at], speed, span)
             whitening = problem.whitening_filters[i]
             if whitening is not None:
-                columns = whitening.whiten_and_estimate_torque_bias(columns, None)[0]
+                columns = whitening.whiten_residuals_and_estimate_torque_bias(columns, None)[0]
             jacobian = evaluation.jacobian[own] * problem.unknown_scales
             error = _clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
             limit = _offset_tolerance(joints, group)
@@ -302,15 +300,14 @@ def _by_lateness(
     problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction
 ) -> Array:
     """Whitened prediction minus measurement per second of lateness of the stamps, shape (M, k)."""
-    shared, _ = problem.unpack_unknown_vector(x, i)
+    shared, _ = problem.unpack_episode_unknowns(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     state = result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameter_names)))
     steps = np.ones(samples.value.shape[1])
-    ahead, behind = (
-        problem.predictor.readings_and_sensitivities(samples.shifted_earlier_by_steps(s * steps), state, none, theta)[0]
-        for s in (-1.0, 1.0)
-    )
+    read = problem.predictor.readings_and_sensitivities
+    moved = (samples.shifted_earlier_by_delays(s * steps) for s in (-1.0, 1.0))
+    ahead, behind = (read(own, state, none, theta)[0] for own in moved)
     return np.asarray(samples.weight * (ahead - behind) / (2 * problem.step.time_step))
 
 

@@ -22,7 +22,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.inference.whitening import problem_without_input_errors
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import EpisodeAndPrediction
+from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
@@ -41,7 +41,7 @@ class _MethodResult:
     method: str
     solution: Solution
     whitened_cost: float
-    held_out_predictions: list[EpisodeAndPrediction]
+    held_out_predictions: list[PredictedEpisodeOrFailure]
     wall_seconds: float
     cpu_seconds: float
     peak_memory_mib: float

@@ -83,7 +83,7 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
     """For each divided joint of the coarse model, the names of the fine joints that replace it."""
     found = {}
     for segment in coarse.segment_layouts:
-        links = fine.segment_layout(segment.name).link_joints
+        links = fine.layout_of_segment(segment.name).link_joints
         times = len(links) // len(segment.link_joints)
         for i, joints in enumerate(segment.link_joints if times > 1 else ()):
             for axis, joint in enumerate(joints):
@@ -153,7 +153,7 @@ def predicted_refit_residual_at_finer_step(
     return fitted.residual if fitted.ok and fitted.cost < before.cost else made[1]
 
 
-def problem_without_error_of_links(
+def problem_corrected_for_few_links(
     problem: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
 ) -> EstimationProblem | None:
     """Subtract from all data, held-out ones included, what twice the links change in the predictions of a fit.
@@ -246,11 +246,11 @@ class _CoarseWeights:
     input_error_model: TorqueAndAngleErrorModel
     ratio: int
 
-    def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+    def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten as the coarser filter; see `ProcessNoiseWhitener`."""
         if push is not None:
             push = np.mean(push.reshape(-1, self.ratio, *push.shape[1:]), axis=1)
-        return self.coarse.whiten_and_estimate_torque_bias(rows, push)
+        return self.coarse.whiten_residuals_and_estimate_torque_bias(rows, push)
 
 
 def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> EstimationProblem:
@@ -429,7 +429,7 @@ def min_gap_by_grasp_at_robot_posture(
     full = np.zeros(system.n_coordinates)
     full[known] = list(configuration.values())
     with CASADI_LOCK:
-        (q, kinematics), inner = system.symbolic_kinematics, system.effect_internal_coordinate_symbols.values()
+        (q, kinematics), inner = system.symbols_and_kinematics, system.effect_internal_coordinate_symbols.values()
         phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps))
         # a small stiffness prevents the search from winding up the object
         rows = ca.densify(ca.vertcat(phi, 1e-4 * q[free]))
@@ -532,9 +532,9 @@ def alternating_error_growth_of_worst_recording(problem: EstimationProblem, x: A
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)
     for i, episode in enumerate(problem.episodes):
-        shared, offset = problem.unpack_unknown_vector(x, i)
+        shared, offset = problem.unpack_episode_unknowns(x, i)
         theta = predictor.theta_with_episode_values(episode, shared)
-        begin = predictor.initial_state_of_episode(episode, theta, offset, ())
+        begin = predictor.initial_state_and_derivative(episode, theta, offset, ())
         if begin.failure_message:
             continue
         inputs = predictor.corrected_inputs_with_effect_momentum(episode, theta, (), begin.state)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis import discretisation
-from yid_ocp.analysis.clock_checks import clock_drift_and_overstated_noise_issues
+from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
@@ -24,9 +24,9 @@ from yid_ocp.inference.uncertainty import (
     typical_parameter_magnitudes,
 )
 from yid_ocp.model.objects.base import CableTopology
-from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER
+from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodeAndPrediction, EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_and_count_by_channel
@@ -130,13 +130,13 @@ def _with_discretisation_errors(
 
 
 def _checked_solution_and_issues(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
 ) -> tuple[Solution, tuple[Issue, ...]]:
     """The solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit."""
     if solution.evaluation is None:
         return solution, problem.options.data_issues
-    errors, units, _ = prediction_errors_and_units(problem, solution, held_out)
-    found = clock_drift_and_overstated_noise_issues(problem, solution.x, solution.evaluation)
+    errors, units, _ = prediction_errors_units_and_fit_errors(problem, solution, held_out)
+    found = clock_and_noise_issues_from_residuals(problem, solution.x, solution.evaluation)
     found += _worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
@@ -218,7 +218,7 @@ def choose_cable_memory_fit(
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
     """Return the problem with the cable's shape memory fractions (`SEGMENT.memory`) fixed at zero."""
     memory = _memory_parameters(problem)
-    free = tuple(name for name in problem.free if name not in (*memory, SHAPE_MEMORY_HALVING_SPEED_PARAMETER))
+    free = tuple(name for name in problem.free if name not in (*memory, INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER))
     return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))
 
 
@@ -242,7 +242,7 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
         own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.residual_rows.measurements[i]])
         kept = np.setdiff1d(np.arange(len(fitted.residual)), own)
         step = size_limited_damped_step(problem, solution.x, fitted.jacobian[kept], fitted.residual[kept], 1e-10)
-        parts = problem.unpack_unknown_vector(np.clip(solution.x + step, *problem.bounds), i)
+        parts = problem.unpack_episode_unknowns(np.clip(solution.x + step, *problem.bounds), i)
         found = problem.predictor.predict_episode(problem.episodes[i], *parts, False)
         if isinstance(found, str):
             return np.inf
@@ -261,8 +261,8 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
-def prediction_errors_and_units(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
+def prediction_errors_units_and_fit_errors(
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
     """Prediction and baseline errors of all recordings (held-out first), units and fit errors by channel."""
     residuals: Mapping[str, Any] = {}
@@ -298,10 +298,10 @@ def _prediction_error_entry(
 
 def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
-) -> tuple[list[EpisodeAndPrediction], dict[str, dict[str, float]]]:
+) -> tuple[list[PredictedEpisodeOrFailure], dict[str, dict[str, float]]]:
     """Predictions of held-out recordings, and the errors that sensor and torque noise cause, by channel."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
-    pairs: list[EpisodeAndPrediction] = []
+    pairs: list[PredictedEpisodeOrFailure] = []
     expected: dict[str, dict[str, float]] = {}
     for episode, theta, offset in problem.held_out_prediction_inputs(x):
         outcome = predict(episode, theta, offset, False)
@@ -361,7 +361,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
 def channels_worse_than_naive_prediction(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Find channels that a baseline predicts clearly better than the model, from `prediction_errors_and_units`."""
+    """Channels that a baseline predicts clearly better than the model, of `prediction_errors_units_and_fit_errors`."""
     worse = []
     for entry in entries:
         for channel in entry["rmse"]:

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from yid_ocp.analysis.identifiability import InitialStateKnowledge, free_starts_and_grasps, transfer_unknowns_by_name
-from yid_ocp.analysis.torque_error_propagation import sensitivities_with_input_errors
+from yid_ocp.analysis.identifiability import InitialStateKnowledge, free_starts_and_grasps, unknowns_of_other_problem
+from yid_ocp.analysis.torque_error_propagation import sensitivities_and_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -30,7 +30,7 @@ from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.sensors import measuring_camera_pose
 from yid_ocp.sensors.base import missing_noise_level_error
 from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_GROUP_NAME,
+    JOINT_EFFORT_SENSOR_KEY,
     JOINT_POSITION_GROUP_NAME,
     PositionSensor,
     is_point_group_measured_by_arm,
@@ -49,7 +49,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 
 @dataclass(frozen=True)
-class SinglePointObservationSchedule:
+class PointObservationSchedule:
     """Sample times and standard deviations of one frame that a point group observes."""
 
     point_group: str
@@ -71,7 +71,7 @@ class UnchangedExperiment:
     @property
     def parameter_values(self) -> dict[str, float]:
         """Values of all model parameters at `x`."""
-        theta, _ = self.problem.unpack_unknown_vector(self.x, 0)
+        theta, _ = self.problem.unpack_episode_unknowns(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
@@ -79,7 +79,7 @@ class UnchangedExperiment:
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: measuring_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_point_group_with_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Points measured by arms (None without), sample times [s] and typical std [m], or their defaults."""
         t = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor_name == "arm", t, _DEFAULT_ARM_POINT_STD)
@@ -91,7 +91,7 @@ class UnchangedExperiment:
             return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
         return None, times, std
 
-    def existing_point_observation_schedules(self, episode: Episode) -> list[SinglePointObservationSchedule]:
+    def existing_point_observation_schedules(self, episode: Episode) -> list[PointObservationSchedule]:
         """Observation schedule of every point measured in a recording."""
         found = []
         for group in _used_point_groups(self.problem, episode):
@@ -102,7 +102,7 @@ class UnchangedExperiment:
                 if self.problem.system.mechanism.has_frame(frame):
                     at = group.names.index(point)
                     seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                    found.append(SinglePointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
+                    found.append(PointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def _std(self, group: PointGroup) -> Array:
@@ -179,7 +179,7 @@ class VariantPositionSensitivities:
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
     with respect to the nx unknowns and to the episode's q torque-error unknowns (see
-    `sensitivities_with_input_errors`).
+    `sensitivities_and_information`).
     """
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
@@ -192,7 +192,7 @@ class VariantPositionSensitivities:
     feasibility_notes: tuple[str, ...] = ()  # obstacles on a real robot, such as joint limits
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
-    def fisher_information_with_prior(self, views: Sequence[Sequence[SinglePointObservationSchedule]]) -> Array:
+    def fisher_information_with_prior(self, views: Sequence[Sequence[PointObservationSchedule]]) -> Array:
         """Fisher information (nx, nx) of observations plus that of the prior. `views` has one list per recording."""
         total = self.prior_information.copy()
         nx = len(total)
@@ -206,7 +206,7 @@ class VariantPositionSensitivities:
                 total -= own[:nx, nx:] @ scipy.linalg.solve(own[nx:, nx:], own[nx:, :nx], assume_a="pos")
         return total
 
-    def _of(self, episode: int, grid: TimeGrid, view: SinglePointObservationSchedule) -> Array:
+    def _of(self, episode: int, grid: TimeGrid, view: PointObservationSchedule) -> Array:
         key = (episode, view.point_group, view.frame, view.times.tobytes(), view.std.tobytes())
         if key not in self._known:
             inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)
@@ -273,7 +273,7 @@ class ExperimentVariantSensitivityBuilder:
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}
         nuisances = [name for name in wide.free if name not in base.free]
         problem = EstimationProblem(step, dense, (*base.free, *nuisances), options, values)
-        x = transfer_unknowns_by_name(setting.x, base.unknown_names, problem)
+        x = unknowns_of_other_problem(setting.x, base.unknown_names, problem)
         evaluation = problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message)
@@ -282,7 +282,7 @@ class ExperimentVariantSensitivityBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = sensitivities_with_input_errors(problem, evaluation, x, i, finest, encoders)
+            points, by_joints[i] = sensitivities_and_information(problem, evaluation, x, i, finest, encoders)
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
@@ -300,13 +300,13 @@ class ExperimentVariantSensitivityBuilder:
             joints = self.setting.problem.episodes[0].recording.joints
             said = None if joints is None else joints.effort_std
             stated = said is not None and bool(np.all(np.asarray(said) > 0))
-            sensors[JOINT_EFFORT_GROUP_NAME] = SensorOptions(std=None if stated else ASSUMED_TORQUE_NOISE_STD)
+            sensors[JOINT_EFFORT_SENSOR_KEY] = SensorOptions(std=None if stated else ASSUMED_TORQUE_NOISE_STD)
         return sensors
 
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Smallest standard deviation of the points of each group in a recording [m]."""
         finest = {}
-        samplings = self.setting.camera_point_group_times_and_std, self.setting.arm_point_group_times_and_std
+        samplings = self.setting.camera_point_group_times_and_std, self.setting.arm_point_group_with_times_and_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
@@ -376,8 +376,8 @@ class ExperimentVariantSensitivityBuilder:
         if isinstance(layout, str):
             raise failed_rollout_error(layout)
         problem, n = layout.problem, system.n_coordinates
-        theta, offset = problem.unpack_unknown_vector(layout.x, 0)
-        start = problem.initial_state_of_episode(problem.episodes[0], theta, offset)
+        theta, offset = problem.unpack_episode_unknowns(layout.x, 0)
+        start = problem.initial_state_and_derivative(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise failed_rollout_error(start.failure_message)
         q, parameters = ca.SX.sym("q", n), problem.system.parameters
@@ -427,7 +427,7 @@ class ExperimentVariantSensitivityBuilder:
         for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
         camera = setting.camera_point_group_times_and_std(episode)[0]
-        arm = setting.arm_point_group_times_and_std(episode)[0]
+        arm = setting.arm_point_group_with_times_and_std(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.effects.law import torque_law_quantity_values_along_rollout
+from yid_ocp.effects.law import torque_law_argument_along_rollout
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.solvers import GaussNewton, Solution
 
 _MAX_FOLD_ITERATIONS = 15
@@ -143,9 +143,9 @@ def measured_and_predicted_friction_torques(
     for i, episode in enumerate(problem.episodes):
         joints = episode.recording.joints
         assert joints is not None
-        low_pass = LowPassFilter(problem.options.path_cutoff)
+        low_pass = ZeroPhaseLowPassFilter(problem.options.path_cutoff)
         path = smoothed_joint_angles_at_nodes(joints, driven, episode.grid, episode.name, low_pass)
-        theta, _ = problem.unpack_unknown_vector(solution.x, i)
+        theta, _ = problem.unpack_episode_unknowns(solution.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, theta)
         inputs = problem.predictor.corrected_inputs(episode, theta, ())
         shift = inputs.driven_angles - episode.measured_driven_angles
@@ -159,7 +159,7 @@ def measured_and_predicted_friction_torques(
         nodes["time_step"] = np.array(step.time_step)
         for name, found in parts.items():
             at = system.mechanism.joint_index(name)
-            load = torque_law_quantity_values_along_rollout(system, name, "load", theta, nodes)[:, 0]
+            load = torque_law_argument_along_rollout(system, name, "load", theta, nodes)[:, 0]
             mean_load = (load[:-1] + load[1:]) / 2
             found.append(np.stack([speed[:, at], mean_load, -lacking[:, at], (given - lacking)[:, at]]))
     clouds = []
@@ -195,7 +195,7 @@ def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[
     return found
 
 
-def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
+def problem_estimating_from_all_recordings(problem: EstimationProblem) -> EstimationProblem:
     """Return the problem with its held-out recordings among the recordings for estimation."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)

@@ -15,7 +15,7 @@ from yid_ocp.analysis.profile import (
     ParameterProfileLikelihood,
     compute_profile_likelihood_interval,
     evaluate_for_each_parameter_at_optimum,
-    mark_unidentifiable_near_zero_estimate,
+    mark_near_zero_estimate_unidentifiable,
 )
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprMixin, ReprTexts, count_with_noun
@@ -147,7 +147,7 @@ def identifiability(
         raise ConfigError(f"'{name}' is not a free parameter", where="intervals", **said)
     given = unknown_vector_from_solution(problem, solution)
     wide = free_starts_and_grasps(problem, start, grasp_std)
-    x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
+    x = unknowns_of_other_problem(given, problem.unknown_names, wide)
     # the matrices are small: threads of the linear algebra library cost more than they gain
     with threadpoolctl.threadpool_limits(1):
         as_solved, wide = wide is problem, problem_with_whitening_at(wide, x, rounds=2)
@@ -189,7 +189,7 @@ def _profiles(
     ) -> tuple[ParameterProfileLikelihood, uncertainty.ParameterEstimate]:
         index, size, entry = problem.unknown_names.index(name), sizes[name.split("[")[0]], judged[name]
         found = compute_profile_likelihood_interval(problem, best, index, float(entry.std), there)
-        said = mark_unidentifiable_near_zero_estimate(problem, best, index, entry, size, there)
+        said = mark_near_zero_estimate_unidentifiable(problem, best, index, entry, size, there)
         if said.verdict == entry.verdict:
             said = uncertainty.apply_profile_interval(entry, found.interval, size)
         return found, said
@@ -215,7 +215,7 @@ def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution 
     if solution is None:
         return problem.initial_unknowns
     if isinstance(solution, Solution):
-        return transfer_unknowns_by_name(solution.x, solution.unknown_names, problem)
+        return unknowns_of_other_problem(solution.x, solution.unknown_names, problem)
     x = np.array(solution, float)
     if x.shape != (len(problem.unknown_names),):
         shape = f"({len(problem.unknown_names)},), as problem.unknown_names"
@@ -254,7 +254,7 @@ def free_starts_and_grasps(
     return EstimationProblem(problem.step, recordings, (*problem.free, *grasps), changed, nominal)
 
 
-def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
+def unknowns_of_other_problem(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
     """Transfer values of `x` by name to the unknown vector of `other`. Its other entries keep their initial values."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])

@@ -20,11 +20,11 @@ from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_deriva
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import expand_to_joint_values
 from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_GROUP_NAME,
+    JOINT_EFFORT_SENSOR_KEY,
     JOINT_POSITION_GROUP_NAME,
     is_noise_std_stated,
     joint_angle_noise_std,
@@ -116,7 +116,7 @@ class RecordedJointsModel:
 
     @cached_property
     def _effort(self) -> ca.Function:
-        (q, kinematics), tree, count = self.system.symbolic_kinematics, self.system.mechanism, len(self.joint_names)
+        (q, kinematics), tree, count = self.system.symbols_and_kinematics, self.system.mechanism, len(self.joint_names)
         if self._has_no_unknown_descendants and self.system_configuration_indices == tuple(range(count)):
             frames = {name: frame for name, frame in tree.frames.items() if frame.joint_index < count}
             moved = replace(tree, joints=tree.joints[:count], frames=frames, link_chains={})
@@ -162,7 +162,7 @@ def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMot
     if len(t) < 30 or step <= 0 or t[-1] - t[0] > 1e5 * step:
         return None
     columns = [joints.names.index(name) for name in names]
-    low_pass = LowPassFilter(min(_MOTION_BANDWIDTH_HZ, 0.2 / step))
+    low_pass = ZeroPhaseLowPassFilter(min(_MOTION_BANDWIDTH_HZ, 0.2 / step))
     course = scipy.interpolate.CubicSpline(t, low_pass(t, joints.position[:, columns]), axis=0)
     end = max(5, min(len(t) // 10, round(0.3 / step)))
     kept = slice(end, len(t) - end, max(1, len(t) // _MAX_MOTION_SAMPLES))
@@ -261,7 +261,7 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
     """White noise (k,) of efforts as stated or, if not stated, as measured [N m]."""
     given = effort.std if effort.std is not None else joints.effort_std
     if given is not None:
-        return expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
+        return expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_SENSOR_KEY}.std")
     assert joints.effort is not None
     return np.array([white_noise_std(joints.t, joints.effort[:, joints.names.index(name)]) for name in names])
 

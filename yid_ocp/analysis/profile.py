@@ -98,7 +98,7 @@ def solution_with_profile_intervals(
     """Return a solution in which weakly determined parameters have profile-likelihood intervals and matching verdicts.
 
     The cost of such a parameter is not quadratic, so that a standard deviation does not describe it. The same holds for
-    a stiffness that is small compared with its typical size (`mark_unidentifiable_near_zero_estimate`). The solution is
+    a stiffness that is small compared with its typical size (`mark_near_zero_estimate_unidentifiable`). The solution is
     returned unchanged if the problem is too large for profiles.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
@@ -116,7 +116,7 @@ def solution_with_profile_intervals(
 
     def judged(name: str, best: Array, there: Evaluation) -> ParameterEstimate:
         index, size = problem.unknown_names.index(name), asked[name]
-        entry = mark_unidentifiable_near_zero_estimate(problem, best, index, solution.parameters[name], size, there)
+        entry = mark_near_zero_estimate_unidentifiable(problem, best, index, solution.parameters[name], size, there)
         if entry.verdict != "not_identifiable" and not needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
             entry = apply_profile_interval(entry, profile.interval, size)
@@ -147,7 +147,7 @@ def evaluate_for_each_parameter_at_optimum(
     return dict(zip(names, map_with_merged_calls(one, names), strict=True))
 
 
-def mark_unidentifiable_near_zero_estimate(
+def mark_near_zero_estimate_unidentifiable(
     problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
 ) -> ParameterEstimate:
     """Mark a stiffness that is estimated near zero `not_identifiable` if the data allow its typical size too (99.9 %).

@@ -16,7 +16,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepResidualsAndJacobians
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.sensors import sensor_reading_function
+from yid_ocp.sensors import sensor_function_with_jacobians
 
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def parameter_equations_and_responses(
     reading changes within `_RESPONSE_STEPS` steps. `symbols` are the named equations and `stages` their linearisation
     at `state`. `episode` provides the sensors and the tracking filter; without it only equations are listed.
     """
-    names, parameters, at = symbols.row_names, step.system.parameters, symbols.block_slice("theta")
+    names, parameters, at = symbols.row_names, step.system.parameters, symbols.row_or_column_block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
     for row, column in zip(*symbols.full_jacobian_sparsity_pattern.get_triplet(), strict=True):
         if at.start <= column < at.stop:
@@ -123,7 +123,7 @@ def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_
         if np.any(np.isfinite(known)):
             used = np.any(samples.positive_weight_mask, axis=0)
             std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
-            function = sensor_reading_function(system, samples.sensor, system.parameters.names)
+            function = sensor_function_with_jacobians(system, samples.sensor, system.parameters.names)
             by = {name: np.array(ca.densify(x)) / std[:, None] for name, x in function(**at).items()}
             by_state = np.hstack([by["by_q"], np.zeros_like(by["by_q"]), by["by_z"]])
             found.append(_WhitenedSensor(samples.sensor.group_name, by_state, by["by_load"], by["by_theta"]))
@@ -237,7 +237,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
     joints = system.mechanism.joint_names
 
     def block(row: str, column: str) -> BoolArray:
-        return whole[symbols.block_slice(row), symbols.block_slice(column)]
+        return whole[symbols.row_or_column_block_slice(row), symbols.row_or_column_block_slice(column)]
 
     def by(*columns: str) -> BoolArray:
         """Residual's rows by columns."""
@@ -264,7 +264,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
     before, after = _blocks(symbols, "q0", "p0", "z0"), _blocks(symbols, "q1", "p1", "z1")
     every = [(block.name, block.labels) for block in symbols.row_blocks]
     torque, theta = _blocks(symbols, "u"), _blocks(symbols, "theta")
-    by_theta = whole[:, symbols.block_slice("theta")]
+    by_theta = whole[:, symbols.row_or_column_block_slice("theta")]
     found = (
         _pattern("dR_dy", "residual of a step by its unknowns", by_unknown, residual, unknowns),
         _pattern("A", "A: state after a step by the state before it", response("q0", "p0", "z0"), after, before),

@@ -252,7 +252,7 @@ class NamedStepEquations(ReprMixin):
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.all_variable_symbols)
         return found
 
-    def block_slice(self, block: str) -> slice:
+    def row_or_column_block_slice(self, block: str) -> slice:
         """Index range of a block among all rows or columns."""
         blocks = self.row_blocks if any(entry.name == block for entry in self.row_blocks) else self.column_blocks
         names = [entry.name for entry in blocks]
@@ -284,7 +284,7 @@ class NamedStepEquations(ReprMixin):
         """Names of columns by index. A block with many of them is abbreviated, such as `24 of q0`."""
         chosen, names, words = set(places), self.all_variable_names, []
         for block in self.column_blocks:
-            span = self.block_slice(block.name)
+            span = self.row_or_column_block_slice(block.name)
             inside = [names[i] for i in range(span.start, span.stop) if i in chosen]
             words += inside if len(inside) <= _MAX_LISTED_SYMBOLS else [f"{len(inside)} of {block.name}"]
         return tuple(words)

@@ -17,7 +17,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
-from yid_ocp.integrator.step import next_state_derivatives
+from yid_ocp.integrator.step import next_state_and_effort_derivatives
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
@@ -29,7 +29,7 @@ _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a read
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
-def sensitivities_with_input_errors(
+def sensitivities_and_information(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -60,12 +60,12 @@ def sensitivities_with_input_errors(
             shown.append((samples.sensor, block.reshape(len(samples.value), -1, len(x))))
         else:
             told.append(block)
-    theta, _ = problem.unpack_unknown_vector(x, i)
+    theta, _ = problem.unpack_episode_unknowns(x, i)
     course = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
     units = [finest[sensor.group_name] for sensor, block in shown for _ in range(block.shape[1])]
     by_state = []
     for sensor, _ in shown:
-        read = course.model_functions.compiled_sensor_function(sensor)(course.state_values_at_nodes, course.theta)
+        read = course.model_functions.compiled_sensor_function(sensor)(course.rollout_node_values, course.theta)
         by_state.append(np.concatenate([read.by_q, np.zeros_like(read.by_q), read.by_z], axis=2))
     if driving.input_errors is None:
         blur = np.zeros((len(result.rollout.state), len(units), 0))
@@ -145,7 +145,7 @@ class _Motion:
             known = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
             pulled = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         inputs = np.concatenate([known, pulled], axis=2)
-        for state, _ in next_state_derivatives(step, course.theta, course.rollout, inputs, feedback):
+        for state, _ in next_state_and_effort_derivatives(step, course.theta, course.rollout, inputs, feedback):
             self.by_state += [*state[:, :, : -2 * nu]]
             self.by_torque += [*state[:, :, -2 * nu : -nu]]
             self.by_angles += [*state[:, :, -nu:]]

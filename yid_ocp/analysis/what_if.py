@@ -15,7 +15,7 @@ from yid_ocp.analysis.experiment_design import (
     CAMERA_GROUP,
     SETUP_CHANGE_DESCRIPTIONS,
     ExperimentVariantSensitivityBuilder,
-    SinglePointObservationSchedule,
+    PointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
     measurable_points,
@@ -196,7 +196,7 @@ class _Outcomes:
         """All single changes that apply to the experiment."""
         setting, episode = self.setting, self.setting.problem.episodes[0]
         camera = setting.camera_point_group_times_and_std(episode)[0]
-        arm = setting.arm_point_group_times_and_std(episode)[0]
+        arm = setting.arm_point_group_with_times_and_std(episode)[0]
         views = setting.existing_point_observation_schedules(episode)
         groups = ("" if group is None else group.name for group in (camera, arm))
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
@@ -245,17 +245,17 @@ class _Outcomes:
 
     def _views(
         self, episode: Episode, changes: Sequence[ExperimentChange], layout: VariantPositionSensitivities
-    ) -> list[SinglePointObservationSchedule]:
+    ) -> list[PointObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_point_group_times_and_std(episode)
-        arm, arm_times, arm_std = setting.arm_point_group_times_and_std(episode)
+        arm, arm_times, arm_std = setting.arm_point_group_with_times_and_std(episode)
         looking, feeling = CAMERA_GROUP if camera is None else camera.name, ARM_GROUP if arm is None else arm.name
         rate = next((change.camera_rate for change in changes if change.camera_rate is not None), None)
         if rate is not None:
             times = uniform_sample_times(episode.grid, rate)
 
-        def look(frame: str) -> SinglePointObservationSchedule:
-            return SinglePointObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
+        def look(frame: str) -> PointObservationSchedule:
+            return PointObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
 
         # a point that the second arm holds is measured by that arm
         held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
@@ -267,7 +267,7 @@ class _Outcomes:
         views += [look(change.camera_frame) for change in changes if change.camera_frame]
         feels = [*sorted(held - before), *(change.arm_frame for change in changes if change.arm_frame)]
         felt = np.full((len(arm_times), 3), arm_std)
-        return views + [SinglePointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
+        return views + [PointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
 
 
 def _relative_stds_and_gain(layout: VariantPositionSensitivities, information: Array) -> tuple[dict[str, float], float]:

@@ -28,8 +28,8 @@ from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.files import read_input_text
 
 _KeyPath = tuple[str | int, ...]
-DEFAULT_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
-EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
+SHIPPED_DEFAULT_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
+SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
 _ALIAS_COST = 40  # in entries: merging an alias compares its mapping with all others
@@ -37,7 +37,7 @@ _ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
 
 
 def load_config(
-    path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT_CONFIG_FILE_NAME
+    path: str | Path | None = None, overrides: Sequence[str] = (), default: str = SHIPPED_DEFAULT_CONFIG_FILE_NAME
 ) -> RunSettings:
     """Read and check the settings of a configuration file. Without `path`, the embedded file `default` is read.
 
@@ -202,7 +202,7 @@ def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_Ke
         for known in [known for known in places if known[: len(path)] == path]:
             del places[known]
         return value
-    keys = {} if sections is None else sections.variant_options(sections.selected_variant_name({**before, **value}))
+    keys = {} if sections is None else sections.options_of_variant(sections.selected_variant_name({**before, **value}))
     for name, entry in value.items():
         kind = keys[name].type_hint if name in keys else options.mapping_value_type(hint)
         before[name] = _merged(kind, before.get(name), entry, (*path, name), places)
@@ -217,7 +217,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
     sections, values = schema.section_variants_from_annotation(hint), options.mapping_value_type(hint)
     inner = schema.section_variants_from_annotation(values)
     if sections is not None:
-        known = sections.variant_options(sections.selected_variant_name(raw))
+        known = sections.options_of_variant(sections.selected_variant_name(raw))
         if name not in known:
             raise schema.unknown_key_error(name, known, origin)
         below = known[name].type_hint
@@ -227,7 +227,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
     elif inner is not None and inner.selector_key == "name":
         below = inner.variants_for_entry(name, origin).classes[""]
     else:
-        known = {} if inner is None else inner.variant_options()
+        known = {} if inner is None else inner.options_of_variant()
         cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
         if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and known:
             raise schema.unknown_key_error(parts[-1], known, origin)
@@ -273,14 +273,14 @@ class _Reader:
     def _section(self, sections: schema.SectionVariants, raw: Any, path: _KeyPath) -> Any:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
-            keys = list(sections.variant_options(sections.default_variant))
+            keys = list(sections.options_of_variant(sections.default_variant))
             what, hint = f"{self._name(path)} = {_shown(raw)} is not a section", _key_meant(self._name(path), keys)
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.selected_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:
             at = (*path, sections.selector_key) if sections.selector_key in raw else path
             raise sections.unknown_variant_error(word, self.where(at))
-        known, kind = sections.variant_options(word), sections.classes[word]
+        known, kind = sections.options_of_variant(word), sections.classes[word]
         for name in raw:
             if name not in known:
                 within = ".".join(map(str, path))
@@ -342,7 +342,8 @@ def _absolute(value: Any, hint: Any, base: Path) -> Any:
     if isinstance(value, tuple):
         entries = options.variadic_tuple_entry_type(hint)
         return value if entries is None else tuple(_absolute(entry, entries, base) for entry in value)
-    markers = [marker for part in (hint, *options.union_members(hint)) for marker in options.split_annotated(part)[1]]
+    parts = (hint, *options.non_none_union_members(hint))
+    markers = [marker for part in parts for marker in options.split_annotated(part)[1]]
     is_path = any(isinstance(marker, options.OptionInfo) and marker.is_path for marker in markers)
     if not isinstance(value, str) or not is_path or value.startswith(("package:", "default:")):
         return value

@@ -30,7 +30,7 @@ class SectionVariants:
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
-    def variant_options(self, word: Any = "") -> Mapping[str, options.Option]:
+    def options_of_variant(self, word: Any = "") -> Mapping[str, options.Option]:
         """Options, by key, of the settings class that `word` selects (default: the first class)."""
         known = isinstance(word, str) and word in self.classes
         own = options.options_by_key(self.classes[word] if known else next(iter(self.classes.values())))
@@ -65,7 +65,7 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
         registry = among.registry
         classes = {name: registry[name] for name in registry}
         return SectionVariants(classes, among.selector_key, among.default_name, registry.entry_noun, nullable)
-    kinds = [options.split_annotated(member)[0] for member in options.union_members(bare)]
+    kinds = [options.split_annotated(member)[0] for member in options.non_none_union_members(bare)]
     if len(kinds) != 1 or not all(map(dataclasses.is_dataclass, kinds)):
         return None
     return SectionVariants({"": kinds[0]}, is_nullable=nullable)
@@ -95,7 +95,7 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
     named = section_variants_from_annotation(values)
     below: dict[str, Any] = {}
     if sections is not None:
-        known = sections.variant_options(sections.selected_variant_name(raw))
+        known = sections.options_of_variant(sections.selected_variant_name(raw))
         below = {name: option.type_hint for name, option in known.items()}
     elif named is not None and named.selector_key == "name":
         below = dict(named.classes)

@@ -16,7 +16,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
-from yid_ocp.data.recording import RecordedOrNominalTimes
+from yid_ocp.data.recording import RecordedOrNominalClock
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.effects.law import TorqueLawQuantitiesName
@@ -188,7 +188,7 @@ class _ModelSettings:
     ] = None
     gravity: Annotated[_Vector3, OptionInfo("gravity in the world frame", "m/s^2")] = (0.0, 0.0, -9.81)
     measured_points: Annotated[_Names | None, OptionInfo("measured frames; T1:40%: at 40 % of T1; else tips")] = None
-    bodies_missing_from_urdf: Annotated[
+    surfaces_missing_from_urdf: Annotated[
         tuple[ExtraMesh, ...],
         OptionInfo("bodies that a camera sees and the URDF lacks, such as a table; `track` removes their points"),
     ] = ()
@@ -248,7 +248,7 @@ class ImportSettings:
     gear_ratios: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
     file_clock_offsets: Annotated[_Numbers, OptionInfo("several files: added to each one's times, by stem", "s")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
-    recorded_or_nominal_times: Annotated[RecordedOrNominalTimes | None, OptionInfo("table: kind of its times")] = None
+    recorded_or_nominal_times: Annotated[RecordedOrNominalClock | None, OptionInfo("table: kind of its times")] = None
     point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None
     point_frame: Annotated[str | None, OptionInfo("table or C3D file: frame of the points")] = None
 
@@ -306,9 +306,9 @@ class DiagnosisSettings(Thresholds):
     ] = ()
 
     @property
-    def null_test_residual_limits(self) -> ExcessResidualCriteria:
+    def fit_excess_residual_criteria(self) -> ExcessResidualCriteria:
         """Limits of the null test on the residual after a fit, in units of the sensors' stated standard deviations."""
-        return replace(self.null_test_limits, noise_fraction_of_stated_std=self.noise_fraction_of_stated_std)
+        return replace(self.null_test_excess_criteria, noise_fraction_of_stated_std=self.noise_fraction_of_stated_std)
 
 
 def _compared() -> dict[str, Solver]:
@@ -344,7 +344,7 @@ class _VirtualFramesSettings:
     seed: Annotated[int, Ge(0), OptionInfo("random seed of motion, noise and camera")] = 0
     duration: Annotated[float, Gt(0), Le(600), OptionInfo("duration of the experiment", "s")] = 5.0
     max_gripper_travel: Annotated[float, Gt(0), Le(1), OptionInfo("largest gripper distance from start", "m")] = 0.11
-    gripper_start_from_object_end: Annotated[
+    gripper_start_offset_from_object_end: Annotated[
         Mapping[str, _Vector3], OptionInfo("start relative to the end of the undeformed object, by grasp", "m")
     ] = field(default_factory=dict)
     camera_position: Annotated[_Vector3, OptionInfo("position of the camera", "m")] = (2.6, 0.0, 0.45)

@@ -16,7 +16,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.sensors import CHANNEL_KINDS, SensorOptions
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, quantization_step
+from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, NOISE_ESTIMATE_DIFFERENCE_ORDER, quantization_step
 
 _MAX_REPEATED_FRACTION = 0.1  # fraction of samples that may repeat the previous one
 _MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # change next to a rest over smallest and median change
@@ -167,7 +167,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsLookup) -> I
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
-def overstated_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
+def recording_overstated_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
     """Find channels whose noise is far below the noise that the recording states.
 
     Channels of equal stated noise are judged together. Noise stated in the settings (`options`) is not checked, because
@@ -183,7 +183,7 @@ def overstated_noise_issues(recording: Recording, options: SensorOptionsLookup) 
         stated = _stated(recording, options, group, channel)
         if stated <= 0 or said.std is not None or said.use is False:
             continue
-        if (commanded and sensor == JOINT_EFFORT_GROUP_NAME) or len(t) < 100 or not 0 < step <= _MAX_SAMPLE_PERIOD:
+        if (commanded and sensor == JOINT_EFFORT_SENSOR_KEY) or len(t) < 100 or not 0 < step <= _MAX_SAMPLE_PERIOD:
             continue
         columns = values.reshape(len(t), -1).T
         if np.mean(np.diff(columns, axis=1) == 0) > _MAX_REPEATED_FRACTION:

@@ -123,7 +123,7 @@ def recording_quality_issues(recording: Recording, options: SensorOptionsLookup)
         _velocities(recording),
         channel_checks.stuck_channel_issues(recording),
         channel_checks.excess_noise_issues(recording, options),
-        channel_checks.overstated_noise_issues(recording, options),
+        channel_checks.recording_overstated_noise_issues(recording, options),
         channel_checks.saturated_effort_issues(recording),
         _standstill(recording),
     )

@@ -255,7 +255,7 @@ OTHER_JOINT_MESSAGE_TYPES = (
 
 
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-ESTIMATED_WRENCH_GROUP_NAME = "wrist_estimated"
+ESTIMATED_WRENCH_RECORDING_GROUP = "wrist_estimated"
 """Group of a recording with the wrench that a driver estimates from joint torques, at the frame where it acts."""
 
 
@@ -279,7 +279,7 @@ def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
     return _values(content.joint_names, own | {"position_command": wanted.positions})
 
 
-def joint_values_at_field_paths(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
+def joint_values_from_message_fields(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
     """Read joint values from the decoded message `content`. `paths` maps each channel to the path of an array.
 
     Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or a path is missing or not numeric.

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.sensors.base import EffortSamplingKind, additional_sensor_channel_kinds
+from yid_ocp.sensors.base import EffortSamplingKind, additional_channel_kinds_of_group
 
-RecordedOrNominalTimes = Literal["recorded", "nominal"]
+RecordedOrNominalClock = Literal["recorded", "nominal"]
 
 JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position": "rad",
@@ -90,7 +90,7 @@ class JointGroup(ReprMixin):
     position_resolution: float | Array | None = None
     proportional_gain: float | Array | None = None
     effort_kind: EffortSamplingKind | None = None
-    clock: RecordedOrNominalTimes = "recorded"
+    clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -151,7 +151,7 @@ class PointGroup(ReprMixin):
     sensor_name: str = "unknown"
     frame: str = "world"
     camera_pose: Array | None = None
-    clock: RecordedOrNominalTimes = "recorded"
+    clock: RecordedOrNominalClock = "recorded"
     clock_offset_std: float | None = None
 
     def __post_init__(self) -> None:
@@ -197,7 +197,7 @@ class SensorChannelGroup(ReprMixin):
     t: Array
     values_by_quantity: Mapping[str, Array]
     noise_and_bias_stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
-    clock: RecordedOrNominalTimes = "recorded"
+    clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -470,7 +470,7 @@ def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
 
 def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    declared = {channel.quantity: channel for channel in additional_sensor_channel_kinds(group.name)}
+    declared = {channel.quantity: channel for channel in additional_channel_kinds_of_group(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
     allowed, hint = ", ".join(declared), "add a dataset of this name, or leave the group out"
@@ -532,7 +532,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         raise_data_error_unless(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
         raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
-    clocks, place = get_args(RecordedOrNominalTimes), f"{where}, attribute clock"
+    clocks, place = get_args(RecordedOrNominalClock), f"{where}, attribute clock"
     raise_data_error_unless(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))

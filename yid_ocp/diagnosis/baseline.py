@@ -101,7 +101,7 @@ def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> Es
 
 
 @dataclass(frozen=True)
-class DiagnosisBaseline:
+class EarlierRunsBaseline:
     """Combined estimates of earlier runs, and reference recordings made without the sought effect."""
 
     combined_estimates: RunEstimates | None  # all earlier runs together
@@ -109,12 +109,12 @@ class DiagnosisBaseline:
     reference_recordings: tuple[Recording, ...]
 
     @staticmethod
-    def from_run_estimates(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> DiagnosisBaseline:
+    def from_run_estimates(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> EarlierRunsBaseline:
         """Make a baseline from the estimates of several runs and from reference recordings `without` the effect."""
         if not runs:
-            return DiagnosisBaseline(None, 1.0, without)
+            return EarlierRunsBaseline(None, 1.0, without)
         known, chi2, degrees = pool_estimates_and_chi2(runs)
-        return DiagnosisBaseline(known, chi2_p_value(chi2, degrees), without)
+        return EarlierRunsBaseline(known, chi2_p_value(chi2, degrees), without)
 
     def parameter_shifts_of_fit(self, fit: RefittedModel, limits: Thresholds) -> ParameterShiftsSinceBaseline | None:
         """Compute the shifts of a fit's parameters from its baseline prior. None if there are no runs."""
@@ -140,14 +140,14 @@ class DiagnosisBaseline:
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
-    def fit_parameters_differ_significantly(self, fit: RefittedModel, limits: Thresholds) -> bool:
+    def fit_parameters_differ_from_baseline(self, fit: RefittedModel, limits: Thresholds) -> bool:
         """Whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
         found = self.parameter_shifts_of_fit(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
-    def prediction_errors_with_and_without_effects(
+    def errors_on_recordings_with_and_without_effects(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> ErrorsWithEffectsRemovedAndAdded | None:
+    ) -> CounterfactualErrorsOfFoundEffects | None:
         """Test found effects on recordings made with and without them, such as before and after a repair.
 
         Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
@@ -168,8 +168,8 @@ class DiagnosisBaseline:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return ErrorsWithEffectsRemovedAndAdded(removed, _nothing(present, error.what))
-        return ErrorsWithEffectsRemovedAndAdded(removed, _predicted(last, present, then, {**then, **effects}))
+            return CounterfactualErrorsOfFoundEffects(removed, _nothing(present, error.what))
+        return CounterfactualErrorsOfFoundEffects(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
@@ -219,7 +219,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class ErrorsWithEffectsRemovedAndAdded:
+class CounterfactualErrorsOfFoundEffects:
     """Prediction errors on reference recordings without the effects, and on diagnosed recordings with the effects."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model

@@ -166,7 +166,7 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
     return {"count": count, "of": total, "rate": count / total, "low": low, "high": high}
 
 
-def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
+def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """Rates over an ensemble, such as false alarms, detections and correct answers. A rate without cases is None.
 
     Cases that are not judged are excluded from all rates and counted as `not_judged`.
@@ -297,7 +297,7 @@ _Statistics = Mapping[str, Any]
 _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
-def thresholds_accepting_best_candidate(limits: Thresholds) -> Thresholds:
+def thresholds_always_accepting_best_candidate(limits: Thresholds) -> Thresholds:
     """Return thresholds with which every residual is a gap and the best candidate is always accepted."""
     sure = 1.0 + 1e-9
     return replace(
@@ -566,5 +566,5 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     where = case.located_gap
     if judged.accepted_selected_effects:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
-        where = gap_locations_from_effects_and_smoother(where, judged.closure_by_effect_location, rest, ())
+        where = gap_locations_from_effects_and_smoother(where, judged.accepted_effects_closure_by_location, rest, ())
     return judgement_to_dict(judged, case.evidence, where)

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step, problem_without_error_of_links
+from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step, problem_corrected_for_few_links
 from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline import DiagnosisBaseline, add_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import (
     DiagnosisResult,
     diagnosis_summary_text,
@@ -27,7 +27,7 @@ from yid_ocp.diagnosis.diagnosis_result import (
 )
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
-    FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP,
+    KEPT_FRACTIONS_BEFORE_FAILURE,
     AllCandidatesProblem,
     CandidateNamesOrAll,
     HeldOutTruncation,
@@ -41,8 +41,8 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     RefitStore,
     RefittedModel,
-    evaluate_in_all_candidates_step,
     held_out_loss,
+    reevaluate_refit_with_all_candidates,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import screen_candidates
@@ -53,11 +53,11 @@ from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.null_test import NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
-from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_factor
+from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.measurements import ResidualAndJacobian, subtract_estimated_biases
+from yid_ocp.problem.measurements import ResidualAndJacobian, subtract_estimated_bias_and_clock_errors
 from yid_ocp.solvers import GaussNewton, Solution, solve
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
@@ -74,7 +74,7 @@ def diagnose(
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
     progress: Progress = _LOG_PROGRESS,
     known_fits: NominalSolutionAndRefitStore = _NOTHING_KNOWN,
-    baseline: RunEstimates | Sequence[RunEstimates] | DiagnosisBaseline = (),
+    baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: whether it exists, where, its causes, and what closes it.
@@ -93,10 +93,10 @@ def diagnose(
         Recordings that no fit uses. Default: those of the problem. Without any, alternate blocks are held out.
     progress : Progress
         Default: the package's log.
-    baseline : RunEstimates or sequence of RunEstimates, or DiagnosisBaseline
+    baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
         Estimates of earlier runs of the same model (`read_estimates`), used as priors, so that changes since then are
         diagnosed. A problem that already has these priors (`add_baseline_prior`) is used as it is. An
-        `DiagnosisBaseline` can also hold reference recordings made without the sought effects; these are predicted
+        `EarlierRunsBaseline` can also hold reference recordings made without the sought effects; these are predicted
         with the found effects removed.
 
     Returns
@@ -107,7 +107,7 @@ def diagnose(
     with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         begun = time.perf_counter()
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
-        earlier = runs if isinstance(runs, DiagnosisBaseline) else DiagnosisBaseline.from_run_estimates(runs, ())
+        earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_run_estimates(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = add_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, progress)
@@ -152,7 +152,7 @@ def _examined(
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
     _end_stage(search, "events")
     angles = _largest_joint_angles(nominal)
-    effects = tuple(effect.with_prior_ranges_scaled_to_angles(angles) for effect in search.problem.candidate_effects)
+    effects = tuple(effect.with_prior_ranges_for_largest_angles(angles) for effect in search.problem.candidate_effects)
     held_out_test, spread = _held_out_null_test_and_spread(nominal, limits)
     tests = _estimation_null_test(nominal, limits), held_out_test
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
@@ -204,7 +204,7 @@ def _without_error_of_links(
     """Hypotheses and nominal fit on data without the error of the links, if half of the gap is closed there."""
     search.progress.begin_stage("trying twice the links", 1.0, 8.5)
     composed, x = search.problem.problem, fit.problem.unknown_vector(fit.values)
-    corrected = problem_without_error_of_links(composed, x, fit.evaluation, gap / 2)
+    corrected = problem_corrected_for_few_links(composed, x, fit.evaluation, gap / 2)
     if corrected is None:
         return None
     search = replace(search, problem=replace(search.problem, problem=corrected))
@@ -220,7 +220,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[HeldOutTruncation, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = {cut.recording: cut for cut in known}
-    for fraction in FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP:
+    for fraction in KEPT_FRACTIONS_BEFORE_FAILURE:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
@@ -262,7 +262,7 @@ def _without_events(
         nominal, before = _fitted_nominal_model(search, nominal.values, name), events
         # the smoother's result includes the events
         events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
-        if events.has_same_disturbances(before):
+        if events.has_same_force_and_fault_events(before):
             break
     return search, nominal, events, None if first.is_split_in_blocks else smoothed
 
@@ -308,10 +308,10 @@ def _excess_of(residual: Array) -> float:
     return float(residual @ residual) - np.count_nonzero(residual)
 
 
-def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBaseline) -> DiagnosisResult:
+def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
     steps, end_stage = (problem.step.time_step, nominal.problem.step.time_step), functools.partial(_end_stage, search)
-    evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_significantly(nominal, limits))
+    evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_from_baseline(nominal, limits))
     judged = judge(search, evidence, end_stage)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
@@ -324,7 +324,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selected_effects:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
-        final = evaluate_in_all_candidates_step(search.problem, accepted[-1].refitted_model)
+        final = reevaluate_refit_with_all_candidates(search.problem, accepted[-1].refitted_model)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
         remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
         # a disturbance that a better model explains was no event
@@ -351,7 +351,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: DiagnosisBa
         stage_seconds={name: ends[name] - ends[last] for last, name in itertools.pairwise(ends)},
         events=events,
         baseline_comparison=earlier.parameter_shifts_of_fit(final, limits),
-        counterfactual=earlier.prediction_errors_with_and_without_effects(nominal, final, search.progress),
+        counterfactual=earlier.errors_on_recordings_with_and_without_effects(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_used_time_step=steps,
         is_corrected_for_links=seen.is_corrected_for_links,
@@ -400,10 +400,11 @@ def _after(
     """Held-out null test with the accepted effects, locations of the gap, and locations of the residual gap."""
     tests = _estimation_null_test(last, limits), _held_out_null_test_and_spread(last, limits)[0]
     rest = tuple[GapLocation, ...]()
-    if null_test.residuals_exceed_noise(tests, limits.null_test_limits):
+    if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria):
         rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits))
     windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
-    where = smoother.gap_locations_from_effects_and_smoother(where, judged.closure_by_effect_location, rest, windows)
+    closed = judged.accepted_effects_closure_by_location
+    where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
     return tests[1], where, rest
 
 
@@ -448,7 +449,7 @@ def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool 
     for i, (episode, result) in enumerate(problem.predict_held_out(x, derivatives)):
         if isinstance(result, str):
             raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
-        found.append(problem.whitened_held_out_prediction_residual(i, episode, result))
+        found.append(problem.whitened_held_out_residual_and_jacobian(i, episode, result))
     return found
 
 
@@ -468,7 +469,7 @@ def _held_out_null_test_and_spread(
     found = _held_out_residuals(problem, x, True)
     residual = np.concatenate([part.residual for part in found])
     slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
-    by_parameters = np.asarray(slopes @ noise_only_covariance_factor(problem, fit.evaluation)[:shared])
+    by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, fit.evaluation)[:shared])
     by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
     residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
     return _null_test(own, residual, 0, limits), by_parameters
@@ -482,7 +483,7 @@ def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnkno
         evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
     if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
         less = [
-            replace(e, measurements=subtract_estimated_biases(e.measurements, result.predicted_outputs))
+            replace(e, measurements=subtract_estimated_bias_and_clock_errors(e.measurements, result.predicted_outputs))
             for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
         ]
         problem = problem.with_episodes(less, ())

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.diagnosis.baseline import ErrorsWithEffectsRemovedAndAdded, ParameterShiftsSinceBaseline
+from yid_ocp.diagnosis.baseline import CounterfactualErrorsOfFoundEffects, ParameterShiftsSinceBaseline
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.law import GapLaw
@@ -28,7 +28,7 @@ from yid_ocp.display import ReprMixin, ReprTexts, abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference import null_test
-from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult, largest_gap_locations
+from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult, select_largest_gap_locations
 from yid_ocp.inference.uncertainty import priors_that_determine_unknown
 
 _EFFECT = "kind location"
@@ -62,7 +62,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
     baseline_comparison: ParameterShiftsSinceBaseline | None = None
-    counterfactual: ErrorsWithEffectsRemovedAndAdded | None = None
+    counterfactual: CounterfactualErrorsOfFoundEffects | None = None
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[HeldOutTruncation, ...] = ()
@@ -100,7 +100,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         return last
 
     @property
-    def nominal_changes(self) -> dict[str, dict[str, Any]]:
+    def nominal_parameters_before_and_after(self) -> dict[str, dict[str, Any]]:
         """By parameter of the nominal model: value before and after effects are added, standard deviation and unit."""
         first, last, known = self.nominal_model, self.final_model, self.nominal_model.problem.system.parameters
         names, keys = first.problem.shared_parameters, ("before", "after", "std", "unit")
@@ -129,7 +129,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             "next_experiment": self.next_experiment,
             "statistics": diagnosis_decision_statistics(self),
             "summary": self.summary,
-            "absorption": self.nominal_changes,
+            "absorption": self.nominal_parameters_before_and_after,
             "steps": [{"added": e.effect.label, **_errors(e.refitted_model)} for e in self.selected_effects],
             "unseen": [v.effect.label for v in self.screening.detectability if not v.is_detectable],
             "untried": self.untried,
@@ -140,7 +140,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         return dict(to_json_types(found))
 
 
-def _part_to_dict(part: ParameterShiftsSinceBaseline | ErrorsWithEffectsRemovedAndAdded | GapLaw | None) -> Any:
+def _part_to_dict(part: ParameterShiftsSinceBaseline | CounterfactualErrorsOfFoundEffects | GapLaw | None) -> Any:
     """An optional part as a dictionary, or None."""
     return part and part.to_dict()
 
@@ -199,7 +199,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     before = seen.nominal_model.held_out_loss
     closures = {fit.effects[0].label: held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
-    probabilities = judged.candidate_probabilities
+    probabilities = judged.selected_effect_and_equivalent_probabilities
     found = [
         *((e.effect, added[-1].refitted_model.effect_parameters_as_reported(e.effect)) for e in added),
         *((fit.effects[0], fit.effect_parameters_as_reported(fit.effects[0])) for fit in alone),
@@ -308,7 +308,7 @@ def _gap(result: DiagnosisResult) -> str:
     }
     if result.verdict in texts:
         return texts[result.verdict]
-    if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_limits):
+    if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         return f"The gap is real ({sizes}; p {_p_value_relation(p_value)})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
     small = f"not along what {best.effect.label} would do (p {_p_value_relation(p_value)})"
@@ -317,7 +317,7 @@ def _gap(result: DiagnosisResult) -> str:
 
 def _places(result: DiagnosisResult) -> str:
     """Sentence on the gap's locations, with inseparable locations together."""
-    where = [place for place in largest_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
+    where = [place for place in select_largest_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
     named = [f"{' or '.join([p.location, *p.indistinguishable_from])} ({100 * p.gap_share:.0f} %)" for p in where]
     if not named:
         return "These data cannot locate it."
@@ -404,7 +404,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
         said = f"What remains on held-out motions is model error: {', '.join([*worst.values(), *mostly])}."
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
-        for name, own in result.nominal_changes.items()
+        for name, own in result.nominal_parameters_before_and_after.items()
         if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
     ]
     return [said, _listed("Changed parameters of the nominal model: ", moved)]

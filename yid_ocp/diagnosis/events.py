@@ -42,7 +42,7 @@ from yid_ocp.inference.smoother_model import residual_models_with_smoother_unkno
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import SensorMeasurements, subtract_estimated_biases
+from yid_ocp.problem.measurements import SensorMeasurements, subtract_estimated_bias_and_clock_errors
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
@@ -110,7 +110,7 @@ class EventSet:
     def __bool__(self) -> bool:
         return bool(self.disturbances or self.overspeeds)
 
-    def has_same_disturbances(self, other: EventSet) -> bool:
+    def has_same_force_and_fault_events(self, other: EventSet) -> bool:
         """Whether both sets have the same number of events, in the same channels at overlapping times."""
         pairs = list(zip(self.disturbances, other.disturbances, strict=False))
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
@@ -147,8 +147,8 @@ def find_force_and_fault_events(
     searched only where the smoother found unknown forces.
     """
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
-    told = [(e, result, problem.unpack_unknown_vector(x, i)[0]) for i, (e, result) in enumerate(fitted)]
-    shared = problem.unpack_unknown_vector(x, 0)[0]
+    told = [(e, result, problem.unpack_episode_unknowns(x, i)[0]) for i, (e, result) in enumerate(fitted)]
+    shared = problem.unpack_episode_unknowns(x, 0)[0]
     told += [(e, found, shared) for e, found in problem.predict_held_out(x) if not isinstance(found, str)]
     runs = [(e, result, problem.predictor.theta_with_episode_values(e, theta)) for e, result, theta in told]
     ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
@@ -190,7 +190,7 @@ def _before_overspeed(history: ForceHistory, ends: EventSet) -> ForceHistory | N
     """A history up to the recording's overspeed, without the ends distorted by a filter; None if too short."""
     until = ends._end_of(history.recording) - zero_phase_effort_filter(history.filter_cutoff).end_distortion_duration
     keep = np.flatnonzero(history.t <= until)
-    return None if len(keep) < 10 else history.subset_at_indices(keep)
+    return None if len(keep) < 10 else history.subset_at_time_indices(keep)
 
 
 def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: IntArray) -> tuple[Array, Array]:
@@ -209,7 +209,7 @@ def _read_forces(
 ) -> Iterator[ForceHistory]:
     """Force estimates of prescribed joints with compared efforts, from required and measured torque."""
     episode, result, _ = run
-    unbiased = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
+    unbiased = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
     for samples, predicted in zip(unbiased, result.predicted_outputs, strict=True):
         if not samples.sensor.effort_joints or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
@@ -236,7 +236,7 @@ def _spans(whole: ForceHistory, limits: Thresholds) -> Iterator[ForceHistory]:
     overlap = math.ceil(2 * limits.max_event_duration / whole.time_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
     for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
-        yield whole.subset_at_indices(np.arange(begin, min(begin + length, len(whole.t))))
+        yield whole.subset_at_time_indices(np.arange(begin, min(begin + length, len(whole.t))))
 
 
 def _driving_forces(

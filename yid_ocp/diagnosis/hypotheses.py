@@ -28,13 +28,13 @@ from yid_ocp.problem.episodes import Episode, truncate_episode
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions
-from yid_ocp.problem.recorded_inputs import available_signal_kinds
+from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
 _BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
 _MIN_PREDICTED_DURATION = 1.0  # shortest beginning of a held-out recording that is worth predicting [s]
-FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP = (0.9, 0.5, 0.0)
+KEPT_FRACTIONS_BEFORE_FAILURE = (0.9, 0.5, 0.0)
 """Held-out recordings keep one of these fractions of the duration that a model follows before its rollout fails: before
 a failure it has already deviated. The next fraction is tried if the refitted model fails earlier."""
 
@@ -48,7 +48,7 @@ def make_candidate_effects(
     `ConfigError` if the list is empty, or if a kind does not exist, has no location here or is part of the nominal
     model. Raises `ModelError` if a location does not exist.
     """
-    where, sensors = "diagnosis.candidates", available_signal_kinds(recordings)
+    where, sensors = "diagnosis.candidates", signal_kinds_for_effects(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
     if choice == "all":

@@ -16,7 +16,7 @@ import scipy.linalg
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
-from yid_ocp.diagnosis.hypotheses import FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP, AllCandidatesProblem
+from yid_ocp.diagnosis.hypotheses import KEPT_FRACTIONS_BEFORE_FAILURE, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
 from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement
 from yid_ocp.effects import EffectBase
@@ -25,8 +25,8 @@ from yid_ocp.effects.law import (
     TorqueLaw,
     TorqueLawTable,
     allowed_torque_law_quantity_names,
+    torque_law_argument_along_rollout,
     torque_law_from_tables,
-    torque_law_quantity_values_along_rollout,
 )
 from yid_ocp.files import to_json_types
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
@@ -236,9 +236,9 @@ def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
     """Values of a quantity in all estimation recordings, (samples,)."""
     problem, x, found = model.problem, model.problem.unknown_vector(model.values), []
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
-        theta = problem.predictor.theta_with_episode_values(episode, problem.unpack_unknown_vector(x, i)[0])
+        theta = problem.predictor.theta_with_episode_values(episode, problem.unpack_episode_unknowns(x, i)[0])
         nodes = _along(result, episode.grid.time_step)
-        found.append(torque_law_quantity_values_along_rollout(problem.system, place, quantity, theta, nodes).ravel())
+        found.append(torque_law_argument_along_rollout(problem.system, place, quantity, theta, nodes).ravel())
     values = np.concatenate(found)
     return values[np.isfinite(values)]
 
@@ -256,7 +256,7 @@ def _composed_with_laws(
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
-    composed, _ = composed.truncate_failing_held_out_recordings(start, FRACTIONS_OF_FOLLOWED_DURATION_TO_KEEP[0])
+    composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_FRACTIONS_BEFORE_FAILURE[0])
     return composed.with_whitening_linearized_at(last.values)
 
 

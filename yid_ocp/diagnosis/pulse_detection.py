@@ -145,7 +145,7 @@ class ForceHistory:
         """Median time between neighbouring points [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def subset_at_indices(self, keep: IntArray) -> ForceHistory:
+    def subset_at_time_indices(self, keep: IntArray) -> ForceHistory:
         """Estimate restricted to the time points with the indices `keep`."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}

@@ -24,7 +24,7 @@ from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects import EffectBase, ReportedParameterValue
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start, whiten_with_extra_errors
-from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_factor
+from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import (
     max_torque_bias_change_in_stds,
     problem_relinearized_at_torque_bias,
@@ -278,7 +278,7 @@ def _evaluated(
     return problem.relinearize_held_out_filters(own, effects, values), finish
 
 
-def evaluate_in_all_candidates_step(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
+def reevaluate_refit_with_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
     """Evaluate a refit again, at its estimates, in the step of all candidates. Its other results are kept."""
     if fit.problem.step is problem.problem.step:
         return fit
@@ -348,8 +348,8 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
 
 def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
     """Factor F (nx, nx) of the covariance F F' of the unknowns, inflated by the misfit as in `solve`."""
-    factor = noise_only_covariance_factor(problem, finish)
-    fit = assess_goodness_of_fit(problem, finish, limits.null_test_limits)
+    factor = noise_only_covariance_sqrt(problem, finish)
+    fit = assess_goodness_of_fit(problem, finish, limits.null_test_excess_criteria)
     std = np.sqrt(np.diag(misfit_robust_covariance(problem, finish, fit)))
     return factor * (std / np.linalg.norm(factor, axis=1))[:, None]
 
@@ -433,7 +433,7 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
         block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
         residuals.append(np.full(len(block), np.inf))
         if not isinstance(result, str):
-            residuals[-1] = problem.whitened_held_out_prediction_residual(i, episode, result).residual
+            residuals[-1] = problem.whitened_held_out_residual_and_jacobian(i, episode, result).residual
         numbered.append(block)
     whole = np.concatenate(residuals)
     if spread is not None:  # what the nominal parameters leave uncertain is no gap

@@ -34,7 +34,7 @@ from yid_ocp.inference.null_test import (
     channels_with_residual_indices,
     chi2_p_value,
     encoder_noise_residual_covariance_factor,
-    episodes_with_path_noise_redrawn,
+    episodes_with_added_path_noise,
 )
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -107,7 +107,7 @@ def linearize_candidates(
     is_in_scatter = np.any(scatter, axis=1)
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
-    redrawn = [episodes_with_path_noise_redrawn(placed, rng) for _ in draws]
+    redrawn = [episodes_with_added_path_noise(placed, rng) for _ in draws]
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
     for shapes in itertools.zip_longest(*map(_shape_grid, tried)):
         chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]

@@ -62,7 +62,7 @@ class Thresholds:
     ] = 20.0
 
     @property
-    def null_test_limits(self) -> ExcessResidualCriteria:
+    def null_test_excess_criteria(self) -> ExcessResidualCriteria:
         """Significance level and smallest excess of the null test, also used by `solve`."""
         return ExcessResidualCriteria(self.significance_level, self.min_excess_chi2_per_dof)
 

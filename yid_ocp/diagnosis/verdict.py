@@ -128,7 +128,7 @@ class Judgement:
         return tuple(entry for entry in self.transfer_checks if not entry.is_consistent)
 
     @property
-    def closure_by_effect_location(self) -> dict[str, float]:
+    def accepted_effects_closure_by_location(self) -> dict[str, float]:
         """Fraction of the gap that the accepted effects at each location close beyond those added before."""
         closed: dict[str, float] = {}
         most = 0.0
@@ -139,7 +139,7 @@ class Judgement:
         return closed
 
     @property
-    def candidate_probabilities(self) -> dict[str, float]:
+    def selected_effect_and_equivalent_probabilities(self) -> dict[str, float]:
         """Probability that an effect is a cause, by label, for the selected effects and their equivalents."""
         return {
             effect.label: self.probability * share

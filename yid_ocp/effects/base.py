@@ -166,7 +166,7 @@ class EffectBase(Effect):
             result[name] = ReportedParameterValue(value, std, unit)
         return result
 
-    def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> EffectBase:
+    def with_prior_ranges_for_largest_angles(self, largest: Mapping[str, float]) -> EffectBase:
         """Return the effect with prior ranges adapted to the largest joint angle of each segment in the data [rad]."""
         return self
 

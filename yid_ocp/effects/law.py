@@ -164,7 +164,7 @@ def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[st
     return ("angle", "speed", *driven, *(("command",) if location in system.servos else ()), "time")
 
 
-def torque_law_quantity_values_along_rollout(
+def torque_law_argument_along_rollout(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
     """Values (N, joints) of `quantity`, such as speed or load, at the midpoints of the N steps of a rollout.

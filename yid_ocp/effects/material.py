@@ -137,7 +137,7 @@ class _CubicStiffness(_SegmentEffect):
     """Springs of a segment that stiffen or soften with the angle, by the sign of k3. Each joint adds V += 1/4 k3 q^4.
 
     The prior range of k3 is -0.5 to 1 times stiffness / (largest angle)^2. The largest angle is `_REFERENCE_ANGLE`
-    until `with_prior_ranges_scaled_to_angles` sets the one of the data.
+    until `with_prior_ranges_for_largest_angles` sets the one of the data.
     """
 
     equation = "V += 1/4 k3 q^4"
@@ -149,7 +149,7 @@ class _CubicStiffness(_SegmentEffect):
         ),
     )
 
-    def with_prior_ranges_scaled_to_angles(self, largest: Mapping[str, float]) -> _CubicStiffness:
+    def with_prior_ranges_for_largest_angles(self, largest: Mapping[str, float]) -> _CubicStiffness:
         """Return the effect with a prior range of k3 for the segment's largest joint angle in the data."""
         if self.location not in largest:
             return self

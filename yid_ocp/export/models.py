@@ -134,7 +134,7 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
-    known = mjcf.model_aspect_table()[aspect]
+    known = mjcf.format_elements_by_model_aspect()[aspect]
     if aspect == "reading":
         return _READING
     if form not in known:
@@ -143,7 +143,7 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 
 
 _READING = FeatureExportSupport(
-    "not representable", f"{mjcf.model_aspect_table()['reading']['is']}: correct the readings instead"
+    "not representable", f"{mjcf.format_elements_by_model_aspect()['reading']['is']}: correct the readings instead"
 )
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
 _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
@@ -164,7 +164,7 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
     return found
 
 
-def export_support_by_parameter(
+def support_in_export_format_by_parameter(
     system: System, effects: Mapping[str, FeatureExportSupport], form: str
 ) -> dict[str, FeatureExportSupport]:
     """Support of the export format `form` for each parameter. Parameters of an effect have its support in `effects`."""

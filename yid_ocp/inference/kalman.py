@@ -68,7 +68,7 @@ class KalmanStepMatrices:
     projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
     transition: StateTransition
 
-    def normalized_innovations_and_final_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
+    def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
         """Normalized innovations of `measured` (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
@@ -120,7 +120,7 @@ def _library() -> ctypes.CDLL | None:
 
 
 @dataclass(frozen=True)
-class KalmanSteps:
+class FixedGainKalmanFilter:
     """Successive steps of a linear Kalman filter with fixed gains, in compiled code if possible.
 
     The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`.
@@ -152,7 +152,7 @@ class KalmanSteps:
             found.append((span, step))
         return found
 
-    def normalized_innovations_and_final_mean(
+    def normalized_innovations_and_next_mean(
         self, mean: Array, measured: Array, shift: Array, push: Array | None = None, keep_means: bool = False
     ) -> tuple[Array, Array, Array | None]:
         """Filter all steps: normalized innovations (r, c) and final means (nx, c).
@@ -169,7 +169,7 @@ class KalmanSteps:
         for span, step in self._single_steps():
             k = len(before)
             before.append(mean)
-            white[span], mean = step.normalized_innovations_and_final_mean(mean, measured[span])
+            white[span], mean = step.normalized_innovations_and_next_mean(mean, measured[span])
             if push is not None:
                 mean[:ns] += step.transition.state_rows[:, ns:] @ push[k]
             mean[ns:, 0] += shift[k]
@@ -217,16 +217,16 @@ def kalman_steps_and_covariance(
     noises: int,
     decay: Array,
     variance: Array,
-) -> tuple[KalmanSteps, Array]:
+) -> tuple[FixedGainKalmanFilter, Array]:
     """Compute k successive Kalman filter steps. Returns them and the state covariance (nx, nx) after the last step.
 
     The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states.
-    `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `KalmanSteps`.
+    `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `FixedGainKalmanFilter`.
     """
     count, library, covariance = np.diff(row_start), _library(), covariance.copy()
     white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)
     moves, decay, variance, observation = map(np.ascontiguousarray, (moves, decay, variance, observation))
-    found = KalmanSteps(row_start, moves, noises, decay, observation, white, projected)
+    found = FixedGainKalmanFilter(row_start, moves, noises, decay, observation, white, projected)
     ns, known = moves.shape[1], moves.shape[2] - noises
     if library is None:
         roots, parameters = np.split(white, np.cumsum(count**2)[:-1]), np.arange(ns, len(covariance))

@@ -35,7 +35,7 @@ class NominalTrajectory:
     rollout: Rollout
     measurements: Sequence[SensorMeasurements]
     tracking_feedback: TrackingFeedback | None
-    state_values_at_nodes: NodeStateValues
+    rollout_node_values: NodeStateValues
     initial_state_by_angles: Array
     initial_state_by_torque: Array
 
@@ -51,7 +51,7 @@ def nominal_trajectory_from_prediction(
     if rest is not None:
         by_angles, by_torque = rest.state_by_known_coordinates[:, : sizes["nu"]], rest.state_by_torque
     samples = [predictor.delay_corrected_measurements(samples, own) for samples in episode.measurements]
-    about = samples, episode.tracking_feedback, predictor.state_values_at_nodes(result.rollout)
+    about = samples, episode.tracking_feedback, predictor.rollout_node_values(result.rollout)
     return NominalTrajectory(predictor.model_functions, own, result.rollout, *about, by_angles, by_torque)
 
 
@@ -82,7 +82,7 @@ class ResidualDerivativesByStateAndEffort:
         readings = []
         for samples in trajectory.measurements:
             read_sensor = trajectory.model_functions.compiled_sensor_function(samples.sensor)
-            values = trajectory.state_values_at_nodes.select_nodes(samples.evaluation_nodes)
+            values = trajectory.rollout_node_values.select_nodes(samples.evaluation_nodes)
             readings.append(read_sensor(values, theta))
         n_forces, width = (step.sizes["m"], 4) if any(read.needs_neighbours for read in readings) else (0, 2)
         for samples, read in zip(trajectory.measurements, readings, strict=True):
@@ -191,7 +191,7 @@ def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float
     return step
 
 
-def predicted_cost_reduction(jacobian: Array, residual: Array, step: Array) -> float:
+def predicted_cost_reduction_by_step(jacobian: Array, residual: Array, step: Array) -> float:
     """Reduction of the cost 1/2 |r|^2 that the linear model predicts for a step."""
     return -float((jacobian.T @ residual) @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
 
@@ -210,7 +210,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
     if not len(x):
         return 0.0
     step = size_limited_damped_step(problem, x, evaluation.jacobian, evaluation.residual, 1e-14)
-    return predicted_cost_reduction(evaluation.jacobian, evaluation.residual, step)
+    return predicted_cost_reduction_by_step(evaluation.jacobian, evaluation.residual, step)
 
 
 def size_limited_damped_step(

@@ -21,7 +21,7 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import LowPassFilter, zero_phase_effort_filter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
 from yid_ocp.sensors.mounted import MountedSensor
 
@@ -162,14 +162,14 @@ def encoder_noise_residual_covariance_factor(
         return nothing
     rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
     for _ in range(_N_PATH_NOISE_DRAWS):
-        after = residual_of(problem.with_episodes(episodes_with_path_noise_redrawn(problem, rng), ()))
+        after = residual_of(problem.with_episodes(episodes_with_added_path_noise(problem, rng), ()))
         if after is not None:
             found.append(np.zeros(len(before)))
             found[-1][at] = (after - before)[at]
     return np.stack(found, axis=1) / np.sqrt(len(found)) if found else nothing
 
 
-def episodes_with_path_noise_redrawn(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
+def episodes_with_added_path_noise(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
     """Episodes moved by their recorded angles with one more draw of their encoders' noise. Measurements stay."""
     return [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
 
@@ -184,7 +184,7 @@ def _with_path_noise_redrawn(episode: Episode, problem: EstimationProblem, rng: 
     position = joints.position.copy()
     position[:, [joints.names.index(name) for name in names]] += std * rng.standard_normal((len(position), len(names)))
     moved = replace(episode.recording, joints=replace(joints, position=position))
-    low_pass, clamps = LowPassFilter(options.path_cutoff), options.clamp_pose_definitions_from_points
+    low_pass, clamps = ZeroPhaseLowPassFilter(options.path_cutoff), options.clamp_pose_point_names
     path = prescribed_coordinates_at_nodes(moved, system, episode.grid, low_pass, clamps)
     start = np.concatenate([episode.initial_known_coordinates[: len(system.driven)], path[0]])
     return replace(episode, prescribed_path=path, initial_known_coordinates=start)
@@ -256,7 +256,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
             is_smoothed = isinstance(samples.sensor, MountedSensor) and problem.system.prescribed
             if samples.sensor.effort_joints or is_smoothed:
                 cutoff, step = problem.options.path_cutoff, episode.grid.time_step
-                low_pass = LowPassFilter(cutoff) if is_smoothed else zero_phase_effort_filter(cutoff)
+                low_pass = ZeroPhaseLowPassFilter(cutoff) if is_smoothed else zero_phase_effort_filter(cutoff)
                 stride = low_pass.decorrelation_stride(step)
                 autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.channel_name_per_output):
@@ -267,7 +267,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
     return tuple(series)
 
 
-def _filtered_noise_autocorrelation(low_pass: LowPassFilter, step: float) -> Array:
+def _filtered_noise_autocorrelation(low_pass: ZeroPhaseLowPassFilter, step: float) -> Array:
     """Autocorrelation of filtered white noise at lags 0, 1, ... times `step` [s]."""
     if not np.isfinite(low_pass.cutoff):
         return np.ones(1)

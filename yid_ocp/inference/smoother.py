@@ -54,7 +54,7 @@ _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promisin
 
 
 @dataclass(frozen=True)
-class SmoothedUnknowns:
+class SmoothedEstimates:
     """Smoothed unknown forces, offsets and biases of one recording, with mean and standard deviation per interval."""
 
     recording: str
@@ -70,7 +70,7 @@ class SmoothedUnknowns:
 class SmoothedUnknownsResult:
     """Result of the weak-constraint smoother: smoothed unknowns and the evidence for each group."""
 
-    smoothed_unknowns: tuple[SmoothedUnknowns, ...]
+    smoothed_unknowns: tuple[SmoothedEstimates, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # variance at the largest evidence [squared reference]
     log_evidence_drop: dict[SmoothedUnknownGroup, float]  # fall of the log evidence without the group
     detectable_std: dict[SmoothedUnknownGroup, float]  # smallest detectable size by the model alone [reference]
@@ -166,7 +166,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         step, later, own = kalman_matrices_and_next_covariance(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, begin, products, math.inf, ())
-        white, after = step.normalized_innovations_and_final_mean(mean, interval.negative_residual_jacobian)
+        white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
         if keep:
@@ -222,7 +222,7 @@ def _run(models: _Models, variance: _Variances) -> _State:
     """Smooth all recordings at given variances; without smoothed unknowns if the filter is ill-conditioned."""
 
     def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
-        done = _forwards(model, model.smoothed_unknown_prior_variances(variance), True)
+        done = _forwards(model, model.prior_variances_of_unknowns(variance), True)
         return done, _backwards(done) if done.updates else None
 
     filtered, smoothed = zip(*map_in_threads(run, models), strict=True)
@@ -389,7 +389,7 @@ def force_log_likelihood_coefficients(
         jacobian = np.hstack([interval.negative_residual_jacobian, seen])
         rest = np.pad(interval.unreachable_products, (0, count))
         intervals.append(replace(interval, negative_residual_jacobian=jacobian, unreachable_products=rest))
-    known, split = model.smoothed_unknown_prior_variances(variance), 1 + parameters
+    known, split = model.prior_variances_of_unknowns(variance), 1 + parameters
     products = _forwards(replace(model, intervals=tuple(intervals)), known, False).products
     free = products[1:split, 1:split] + np.eye(parameters) / 9.0
     cross = products[split:, 1:split]
@@ -397,13 +397,13 @@ def force_log_likelihood_coefficients(
     return products[split:, 0] - cross @ weighed[:, 0], products[split:, split:] - cross @ weighed[:, 1:]
 
 
-def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedUnknowns:
+def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedEstimates:
     """The unknowns of one recording, with the free parameters' own uncertainty."""
     by_theta = done.mean[:, :, 1:]
     smoothed = done.mean[:, :, 0] - by_theta @ state.shift
     spread = done.covariance + np.sum((by_theta @ state.spread) * by_theta, axis=2)
     named = model.unknown_names, model.unknown_groups, model.reference_std
-    return SmoothedUnknowns(model.recording, model.interval_edges, *named, smoothed, np.sqrt(np.maximum(spread, 0.0)))
+    return SmoothedEstimates(model.recording, model.interval_edges, *named, smoothed, np.sqrt(np.maximum(spread, 0.0)))
 
 
 def _explained(models: _Models, variance: _Variances, plain: _State, state: _State) -> tuple[float, float, float, int]:
@@ -455,7 +455,7 @@ class GapLocation:
     indistinguishable_from: tuple[str, ...] = ()  # locations that the data cannot distinguish from this one
 
 
-def largest_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
+def select_largest_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
     """Select the first three locations of `where` with over 10 % of the gap, or only the first if none has."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
@@ -487,7 +487,7 @@ def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tupl
     return _by_share(found)
 
 
-def smoothed_unknown_significance_mask(trace: SmoothedUnknowns, columns: Sequence[int]) -> BoolArray:
+def smoothed_unknown_significance_mask(trace: SmoothedEstimates, columns: Sequence[int]) -> BoolArray:
     """Mask (J, columns) of the unknowns of `trace` that are more than `SIGNIFICANT_Z` stds from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > SIGNIFICANT_Z * std)
@@ -560,7 +560,7 @@ def z_scores_of_smoothed_unknowns(
     return trace.interval_edges, trace.unknown_names, values
 
 
-def smoothed_unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
+def smoothed_unknown_units(system: System, trace: SmoothedEstimates) -> tuple[str, ...]:
     """SI unit of every smoothed unknown in `trace`: of a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}

@@ -31,7 +31,7 @@ from yid_ocp.inference.linearized_residual import (
 )
 from yid_ocp.integrator.step import (
     input_or_servo_torques_of_rollout,
-    next_state_derivatives,
+    next_state_and_effort_derivatives,
     reachable_and_observable_state_mask,
 )
 from yid_ocp.model.kinematics import forward_kinematics
@@ -233,7 +233,7 @@ class LinearResidualModel:
     interval_correlation: float  # correlation of an unknown with its value one interval later
     torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
 
-    def smoothed_unknown_prior_variances(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
+    def prior_variances_of_unknowns(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
         """Prior variances (nd,) of the unknowns in `reference_std`^2: group variance plus torque noise."""
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
@@ -252,7 +252,7 @@ def residual_models_with_smoother_unknowns(
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        theta, _ = problem.unpack_unknown_vector(x, i)
+        theta, _ = problem.unpack_episode_unknowns(x, i)
         nominal = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
         blocks = [samples.residual_and_jacobian(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
@@ -299,7 +299,7 @@ def _steps(
         # as that of this step)
         followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
         inputs = feedback.gain @ followed
-    for pair in next_state_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
+    for pair in next_state_and_effort_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
         push, done = pushes[done : done + len(pair[0])], done + len(pair[0])
         by_state = (one[:, :, moving] for one in pair)
         by_load = [one[:, :, nx : nx + width] + one[:, :, nx + width :] for one in pair]

@@ -14,7 +14,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
-from yid_ocp.problem.episodes import EpisodeAndPrediction
+from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
@@ -106,7 +106,7 @@ def assess_goodness_of_fit(
     fitted = effective_parameter_count(problem, evaluation)
     found = null_test.residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, fitted)
     explains = not null_test.residuals_exceed_noise((found,), limits)
-    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.no_data_issue_exceeds_warning)
+    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_data_issue_above_warning)
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
@@ -117,14 +117,14 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
     """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
-    spread, chi2 = noise_only_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
+    spread, chi2 = noise_only_covariance_sqrt(problem, evaluation), _chi2_per_dof(problem, evaluation)
     scale = max(1.0, chi2)
     priors = residual_and_jacobian_without_weak_priors(problem, evaluation)[1][problem.residual_rows.stated_priors]
     pull = spread @ (priors @ spread).T * math.sqrt(max(0.0, problem.options.stated_std_factor**-2 - scale))
     return spread @ spread.T * scale + pull @ pull.T, chi2
 
 
-def noise_only_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
+def noise_only_covariance_sqrt(problem: EstimationProblem, evaluation: Evaluation) -> Array:
     """Factor F (nx, nx) of the covariance F F' from noise alone; F F' itself loses digits in uninformed directions."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
     _, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
@@ -144,7 +144,7 @@ def effective_parameter_count(problem: EstimationProblem, evaluation: Evaluation
     if evaluation.jacobian is None or rows.start == rows.stop:
         return count
     priors = residual_and_jacobian_without_weak_priors(problem, evaluation)[1][rows]
-    return count - float(np.sum((priors @ noise_only_covariance_factor(problem, evaluation)) ** 2))
+    return count - float(np.sum((priors @ noise_only_covariance_sqrt(problem, evaluation)) ** 2))
 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
@@ -369,7 +369,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     def kind(name: str) -> str:
         return name.rpartition(".")[2]
 
-    (theta, _), entries = problem.unpack_unknown_vector(x, 0), list(problem.system.parameters)
+    (theta, _), entries = problem.unpack_episode_unknowns(x, 0), list(problem.system.parameters)
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
     scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
@@ -402,7 +402,7 @@ def parameter_estimates(
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else _std_from_covariance(covariance, x)
-    sizes, theta = typical_parameter_magnitudes(problem, x), problem.unpack_unknown_vector(x, 0)[0]
+    sizes, theta = typical_parameter_magnitudes(problem, x), problem.unpack_episode_unknowns(x, 0)[0]
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}
     free = {name: problem.unknown_names.index(name) for name in parameter_unknown_names(problem)}
@@ -534,7 +534,7 @@ class EstimateChecksBeyondFit:
     discretisation_shifts: Mapping[str, EstimateShiftByLinksAndTimeStep] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     uncounted_errors: tuple[str, ...] = ()
-    held_out_predictions: tuple[EpisodeAndPrediction, ...] = ()
+    held_out_predictions: tuple[PredictedEpisodeOrFailure, ...] = ()
     expected_prediction_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     data_issues: tuple[Issue, ...] = ()
     step_stability: Mapping[str, Any] = field(default_factory=dict)

@@ -37,20 +37,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import KalmanSteps, kalman_steps_and_covariance
+from yid_ocp.inference.kalman import FixedGainKalmanFilter, kalman_steps_and_covariance
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
     ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import next_state_derivatives, reachable_and_observable_state_mask
+from yid_ocp.integrator.step import next_state_and_effort_derivatives, reachable_and_observable_state_mask
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
-from yid_ocp.problem.measurements import subtract_estimated_biases
+from yid_ocp.problem.measurements import subtract_estimated_bias_and_clock_errors
 
 _MIN_TORQUE_GAIN = 0.1  # smallest derivative of applied by recorded torque for conversions of errors
 _MIN_START_SLOPE = 1e-12  # smaller derivatives of an initial state are rounding
@@ -65,7 +65,7 @@ class _FilterPart(NamedTuple):
     first: int  # index of the first step
     rows: IntArray  # residual rows, in the order of the steps
     step_of_row: IntArray
-    kalman: KalmanSteps
+    kalman: FixedGainKalmanFilter
     by_torque: Array  # derivatives of the rows by a known torque of their step, shape (r, nu)
 
     def fresh_noise(self, noise: Array) -> Array:
@@ -94,7 +94,7 @@ class WhiteningFilter:
     state_mask: BoolArray  # states contained in d, shape (nx,)
     torque_bias_std: Array  # standard deviation of b after all measurements, shape (nu,) [N m]
 
-    def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+    def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.
 
         The first column of `rows` is a residual in units of sensor noise, all other columns are its derivatives. `push`
@@ -112,7 +112,7 @@ class WhiteningFilter:
         errors, (count, nu) = self.input_error_model, self.input_error_model.torque_noise.shape
         ns = int(np.count_nonzero(self.state_mask))
         torque = slice(ns, ns + nu)
-        noise, bias = self.whiten_and_estimate_torque_bias(rows[:, None], push)
+        noise, bias = self.whiten_residuals_and_estimate_torque_bias(rows[:, None], push)
         after, costate = np.zeros((count + 1, nu)), np.zeros((len(self.initial_covariance), 1))
         for part in reversed(self.filter_steps):
             found = part.kalman.smoothed_measurement_noise_and_costate(noise[part.rows], costate)
@@ -151,7 +151,7 @@ class WhiteningFilter:
                 rows = slice(first, first + _ROWS_PER_BLOCK)
                 own[rows] -= np.einsum("ru,ruc->rc", part.by_torque[rows], push[part.step_of_row[rows]])
         shift = part.fresh_noise(-noise if white is None else white - noise)
-        return part.kalman.normalized_innovations_and_final_mean(mean, own, shift, known, white is not None)
+        return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known, white is not None)
 
 
 def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> WhiteningFilter:
@@ -212,7 +212,7 @@ def _filter_steps(
     moves, blocks = np.empty((count, ns, len(columns))), list[Array]()
     observe, by_torque, projected = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu)), np.empty((ends[-1], na))
     along = course.model_functions.step, course.theta, course.rollout
-    for state, effort in next_state_derivatives(*along, inputs, feedback):
+    for state, effort in next_state_and_effort_derivatives(*along, inputs, feedback):
         span = slice(begun, begun + len(state))
         move = moves[span]
         move[:] = state if ns == nx else state[:, kept[:, None], columns]
@@ -229,7 +229,8 @@ def _filter_steps(
         blocks.append(steps.whitening)
         projected[own] = steps.projected_covariance
         begun = span.stop
-    kalman = KalmanSteps(ends.tolist(), moves, inputs.shape[2] - nu, decay, observe, np.concatenate(blocks), projected)
+    known = (ends.tolist(), moves, inputs.shape[2] - nu, decay, observe, np.concatenate(blocks), projected)
+    kalman = FixedGainKalmanFilter(*known)
     return _FilterPart(0, order, step_of_row, kalman, by_torque), covariance
 
 
@@ -240,12 +241,12 @@ def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, wh
 
 def _innovations_and_bias(episode: Episode, result: EpisodePrediction, by: ProcessNoiseWhitener) -> tuple[Array, Array]:
     rows, push = _plain(episode, result)[:, None], result.feedback_torque_and_sensitivity
-    return by.whiten_and_estimate_torque_bias(rows, push)
+    return by.whiten_residuals_and_estimate_torque_bias(rows, push)
 
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:
     """Residual of an episode in units of sensor noise, with constant sensor errors subtracted."""
-    samples = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
+    samples = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
     pairs = zip(samples, result.predicted_outputs, strict=True)
     return np.concatenate([own.residual_and_jacobian(y).residual for own, y in pairs])
 
@@ -339,7 +340,7 @@ def problem_with_whitening_at(
 
     def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
         before = _own_filter(problem.whitening_filters[i])
-        own = problem.unpack_unknown_vector(x, i)
+        own = problem.unpack_episode_unknowns(x, i)
         known = predictions[i] if predictions else None
         return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before, known, keep_weights)
 
@@ -377,7 +378,7 @@ def problem_with_held_out_kalman_whitening(
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
     """Relinearize the estimation recordings' whitening filters at the torque offsets of `x`. Weights are unchanged."""
-    parts = problem.unpack_unknown_vector
+    parts = problem.unpack_episode_unknowns
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
@@ -388,7 +389,7 @@ def problem_with_reestimated_held_out_torque_biases(
 ) -> EstimationProblem:
     """Re-estimate the torque offsets in held-out whitening filters at the unknowns `x`; gains stay fixed."""
     pairs = zip(problem.held_out_prediction_inputs(x), problem.held_out, strict=True)
-    at = [(*own, problem.held_out_theta(frozen, held)) for own, held in pairs]
+    at = [(*own, problem.held_out_parameter_vector(frozen, held)) for own, held in pairs]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
     return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
 
@@ -412,7 +413,7 @@ def _with_errors(
     return problem.with_episodes(list(map(without, problem.episodes)), list(map(without, problem.held_out)))
 
 
-def torque_bias_estimates_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+def torque_biases_and_stds_per_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
     """Estimate the constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
 
     An entry is None if torques are exact, or without a whitening filter (`problem_with_whitening_at`).
@@ -421,7 +422,7 @@ def torque_bias_estimates_by_recording(problem: EstimationProblem, x: ArrayLike)
     found: list[tuple[Array, Array] | None] = []
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
         whitening = _own_filter(own)
-        parts = problem.unpack_unknown_vector(x, i)
+        parts = problem.unpack_episode_unknowns(x, i)
         result = "" if whitening is None else problem.predictor.predict_episode(episode, *parts, False)
         if whitening is None or isinstance(result, str):
             found.append(None)

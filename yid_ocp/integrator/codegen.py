@@ -73,13 +73,13 @@ class StepFunctions:
             return str(ca.Function("step", self.equations.arguments, together).serialize())
 
 
-def step_functions(equations: DiscreteEquations) -> StepFunctions:
+def build_casadi_step_functions(equations: DiscreteEquations) -> StepFunctions:
     """Build the CasADi functions of the stepping kernel. The bodies' Jacobians are formed from vectors per joint."""
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
-    if e.force_with_derivatives_impulses is not None:
-        bodies = [part + push for part, push in zip(bodies, e.force_with_derivatives_impulses, strict=True)]
+    if e.closed_form_force_impulses is not None:
+        bodies = [part + push for part, push in zip(bodies, e.closed_form_force_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)

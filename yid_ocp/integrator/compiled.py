@@ -24,7 +24,7 @@ from yid_ocp.integrator.step_model import (
     Rollout,
     RolloutCostGradient,
     RolloutInputs,
-    StepDefinition,
+    StepEquationsAndFunctions,
     StepResidualsAndJacobians,
     TrackingFeedback,
     allocate_linearization,
@@ -108,7 +108,7 @@ class _ThetaColumns:
 class CompiledKernel:
     """Thread-safe stepping kernel in generated C. It has the methods of `InterpretedKernel`."""
 
-    def __init__(self, model: StepDefinition, library: ctypes.CDLL) -> None:
+    def __init__(self, model: StepEquationsAndFunctions, library: ctypes.CDLL) -> None:
         self._model = model
         self._library = library
         self._wished = 0  # steps for which a batch would have been the better way
@@ -117,7 +117,7 @@ class CompiledKernel:
             lambda x: _theta_columns(model, library, x)
         )
 
-    def with_step_model(self, model: StepDefinition) -> CompiledKernel:
+    def make_kernel_sharing_code(self, model: StepEquationsAndFunctions) -> CompiledKernel:
         """Make a kernel for another step model that shares this compiled library."""
         other = CompiledKernel(model, self._library)
         other._theta_columns, other._batched = self._theta_columns, self._batched
@@ -227,10 +227,10 @@ class CompiledKernel:
         self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
 
-    def next_state_derivatives(
+    def next_state_and_effort_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, in C; see `step.next_state_derivatives`."""
+        """Derivatives of a rollout's steps, in C; see `step.next_state_and_effort_derivatives`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)
@@ -282,7 +282,7 @@ def _width(member: RolloutInputs) -> int:
     return 0 if member.directions is None else member.directions.count
 
 
-def _batched_library(model: StepDefinition) -> tuple[ctypes.CDLL, int] | None:
+def _batched_library(model: StepEquationsAndFunctions) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and its number of members. None if compiler or processor do not support it."""
     parts = model.functions, model.index_tables
     source = functools.partial(codegen.kernel_c_source, *parts, batched=True)
@@ -291,7 +291,7 @@ def _batched_library(model: StepDefinition) -> tuple[ctypes.CDLL, int] | None:
     return None if library is None or not count else (library, count)
 
 
-def _theta_columns(model: StepDefinition, kernel: ctypes.CDLL, names: tuple[str, ...]) -> _ThetaColumns:
+def _theta_columns(model: StepEquationsAndFunctions, kernel: ctypes.CDLL, names: tuple[str, ...]) -> _ThetaColumns:
     """Compiled derivatives by parameters. The cache key is the kernel and the indices of the parameters."""
 
     def source() -> str:

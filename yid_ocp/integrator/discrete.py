@@ -124,7 +124,7 @@ class DiscreteEquations:
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
-    def force_with_derivatives_impulses(self) -> tuple[ca.SX, ca.SX] | None:
+    def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """Impulses of the closed-form force in `momentum_balance` and `p1`, each (n, 1) [N m s]; None without it."""
         if self.force_with_derivatives is None:
             return None
@@ -296,7 +296,7 @@ def _constraint(system: System, at: _Symbols, middle: Kinematics) -> tuple[ca.SX
     if relaxation is not None:
         gain = 1 + relaxation / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
-    return ca.densify(closure - system.grasp_compliance_diagonal() * at.lam / at.h), gain
+    return ca.densify(closure - system.constraint_compliance_diagonal() * at.lam / at.h), gain
 
 
 def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> _ConstraintImpulses:
@@ -445,7 +445,7 @@ class NlpStepConstraints:
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)
 
 
-def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpStepConstraints:
+def one_step_nlp_constraints(equations: DiscreteEquations, time_step: float) -> NlpStepConstraints:
     """Build one step's equality constraints for a nonlinear program, with their Jacobians, for a time step [s].
 
     The state is x = (q, p, z), and p1 is the momentum after the step. The constraint rows are scaled to order one:
@@ -496,7 +496,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
         1: {"q0": bent, "q1": bent - pulls.midpoint_share * pulls.after_force_by_q},
     }
-    impulses = e.force_with_derivatives_impulses or (ca.SX(n, 1), ca.SX(n, 1))
+    impulses = e.closed_form_force_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
     apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
     for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):

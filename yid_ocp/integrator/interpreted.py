@@ -23,7 +23,7 @@ from yid_ocp.integrator.step_model import (
     RolloutCostGradient,
     RolloutInputs,
     SensitivityDirections,
-    StepDefinition,
+    StepEquationsAndFunctions,
     StepResidualsAndJacobians,
     TrackingFeedback,
     allocate_linearization,
@@ -42,7 +42,7 @@ class InterpretedKernel:
     the rows of the balance, internal and constraint equations, then p1, then the effort of the prescribed coordinates.
     """
 
-    def __init__(self, model: StepDefinition) -> None:
+    def __init__(self, model: StepEquationsAndFunctions) -> None:
         self._model = model
         self._functions: CasadiLockedCache[None, list[ca.Function]] = CasadiLockedCache(self._made)
         system, sizes = model.system, model.sizes
@@ -57,7 +57,7 @@ class InterpretedKernel:
         self._residual = np.concatenate([free, np.arange(sizes["n"], self._rows)])
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
-    def with_step_model(self, model: StepDefinition) -> InterpretedKernel:
+    def make_kernel_sharing_code(self, model: StepEquationsAndFunctions) -> InterpretedKernel:
         """Make a kernel for `model`, which must have the same equations, that reuses this kernel's functions."""
         other = InterpretedKernel(model)
         other._functions = self._functions
@@ -205,10 +205,10 @@ class InterpretedKernel:
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
 
-    def next_state_derivatives(
+    def next_state_and_effort_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps; see `step.next_state_derivatives`."""
+        """Derivatives of a rollout's steps; see `step.next_state_and_effort_derivatives`."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))

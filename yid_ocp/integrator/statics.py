@@ -108,7 +108,7 @@ class EquilibriumSolver:
         step, system = self.step, self.step.system
         given = float_array_with_checked_shape("configuration", configuration, (len(self.known_coordinates),))
         theta = float_array_with_checked_shape("theta", theta, (len(system.parameters),))
-        stiffness = driven_joint_hold_stiffness(system, torque is not None)
+        stiffness = measured_joint_angle_hold_stiffness(system, torque is not None)
         nu, nz, m = step.sizes["nu"], step.sizes["nz"], step.sizes["m"]
         held = np.zeros(nu) if torque is None else float_array_with_checked_shape("torque", torque, (nu,))
         is_motor_off = bool(system.servos) & (held >= MOTOR_OFF_COMMAND / 2)
@@ -322,7 +322,7 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     return sum(energies, ca.SX(0))
 
 
-def driven_joint_hold_stiffness(system: System, known: bool) -> float:
+def measured_joint_angle_hold_stiffness(system: System, known: bool) -> float:
     """Stiffness of springs at measured angles [N m/rad]. `known` states whether torques or servo commands are given."""
     if not known:
         return RIGID_HOLD_STIFFNESS

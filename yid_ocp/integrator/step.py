@@ -20,13 +20,13 @@ from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquati
 from yid_ocp.integrator.interpreted import InterpretedKernel
 from yid_ocp.integrator.step_model import (
     Rollout,
+    RolloutConvergenceInfo,
     RolloutInputs,
-    RolloutStatus,
     SensitivityDirections,
-    StepDefinition,
+    StepEquationsAndFunctions,
     TrackingFeedback,
     build_step_model,
-    newton_correction_tolerance,
+    newton_coordinate_tolerance,
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK
@@ -40,7 +40,7 @@ _ALL_STEPS = slice(None)
 class Step(ReprMixin):
     """Step map of a system over one time step, made by `compile_step`. It `is_compiled` if it runs generated C code."""
 
-    model: StepDefinition
+    model: StepEquationsAndFunctions
     kernel: CompiledKernel | InterpretedKernel
     is_compiled: bool
 
@@ -92,7 +92,7 @@ class Step(ReprMixin):
         theta: ArrayLike,
         prescribed: tuple[ArrayLike, ArrayLike] | None = None,
         internal: ArrayLike | None = None,
-    ) -> tuple[Array, Array, Array, RolloutStatus]:
+    ) -> tuple[Array, Array, Array, RolloutConvergenceInfo]:
         """Compute one DEL step. Returns q_{k+1}, p_{k+1}, the multipliers lam (m,) and a status.
 
         Parameters
@@ -204,8 +204,8 @@ def compile_step(
 
 def step_with_time_step(step: Step, time_step: float) -> Step:
     """Copy a step with another positive time step [s]. Equations and compiled code are shared."""
-    model = replace(step.model, time_step=_positive(time_step), tolerance=newton_correction_tolerance(time_step))
-    return Step(model, step.kernel.with_step_model(model), step.is_compiled)
+    model = replace(step.model, time_step=_positive(time_step), tolerance=newton_coordinate_tolerance(time_step))
+    return Step(model, step.kernel.make_kernel_sharing_code(model), step.is_compiled)
 
 
 def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
@@ -341,13 +341,13 @@ def reachable_and_observable_state_mask(
 
     Prescribed coordinates and internal states of a neutral effect are excluded. Other coordinates and momenta count as
     measured. Only the first and the last step are examined. `loads` are extra excitations as in
-    `next_state_derivatives`. `seen` (nx,) marks states that sensors depend on directly. `disturbed` (nx,)
+    `next_state_and_effort_derivatives`. `seen` (nx,) marks states that sensors depend on directly. `disturbed` (nx,)
     marks those with an initial error; if given, states that neither these nor torque errors reach are excluded, too.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     given = (step, theta, rollout, np.repeat(inputs, count, 0), None, loads)
     first, last = slice(0, 1), slice(count - 1, count)
-    ends = [next(next_state_derivatives(*given, chosen)) for chosen in (first, last)]
+    ends = [next(next_state_and_effort_derivatives(*given, chosen)) for chosen in (first, last)]
     by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
     by_state, moved = by_all[:, :nx], np.any(by_all > 0, axis=1)
     moved[list(step.system.prescribed_coordinate_indices)] = False
@@ -365,7 +365,7 @@ def reachable_and_observable_state_mask(
     return moved & felt
 
 
-def next_state_derivatives(
+def next_state_and_effort_derivatives(
     step: Step,
     theta: Array,
     rollout: Rollout,
@@ -390,4 +390,4 @@ def next_state_derivatives(
         span = slice(first, min(first + _STEPS_PER_CHUNK, end))
         nodes, own = rollout.state[first : span.stop + 1], feedback and replace(feedback, gain=feedback.gain[span])
         along = replace(rollout, state=nodes, multipliers=rollout.multipliers[span], torque=rollout.torque[span])
-        yield step.kernel.next_state_derivatives(theta, along, own, inputs[span], loads)
+        yield step.kernel.next_state_and_effort_derivatives(theta, along, own, inputs[span], loads)

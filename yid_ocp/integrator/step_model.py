@@ -27,7 +27,7 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 
 
 @dataclass(frozen=True, eq=False)
-class StepDefinition:
+class StepEquationsAndFunctions:
     """Equations, functions and index tables of one time step, from which a kernel is built.
 
     `sizes` holds the numbers of coordinates (n), internal coordinates (nz), constraints (m), inputs (nu), prescribed
@@ -50,18 +50,19 @@ def build_step_model(
     force_split: ForceSplit,
     constraint_force_at: ConstraintForcePlacement,
     tolerance: float | None = None,
-) -> StepDefinition:
-    """Build the `StepDefinition` of a system. Arguments are as in `compile_step`."""
+) -> StepEquationsAndFunctions:
+    """Build the `StepEquationsAndFunctions` of a system. Arguments are as in `compile_step`."""
     e = discrete_equations(system, force_split, constraint_force_at)
-    functions = codegen.step_functions(e)
+    functions = codegen.build_casadi_step_functions(e)
     n, nz = system.n_coordinates, e.z0.numel()
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
-    limit = newton_correction_tolerance(time_step) if tolerance is None else tolerance
-    return StepDefinition(system, e, functions, codegen.step_sparsity_tables(functions), sizes, float(time_step), limit)
+    limit = newton_coordinate_tolerance(time_step) if tolerance is None else tolerance
+    tables = codegen.step_sparsity_tables(functions)
+    return StepEquationsAndFunctions(system, e, functions, tables, sizes, float(time_step), limit)
 
 
-def newton_correction_tolerance(time_step: float) -> float:
+def newton_coordinate_tolerance(time_step: float) -> float:
     """Convergence tolerance of Newton's method on coordinate corrections [rad or m], for a time step [s]."""
     return max(_ROUNDING_FLOOR, min(_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE * time_step))
 
@@ -95,7 +96,7 @@ _INSTABILITY_HINT = (
 
 
 @dataclass(frozen=True)
-class RolloutStatus:
+class RolloutConvergenceInfo:
     """Convergence of a rollout: status code, last correction of Newton's method [rad or m] and totals over all steps.
 
     `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
@@ -198,7 +199,7 @@ class Rollout:
     state_sensitivity: Array | None
     multipliers_sensitivity: Array | None
     effort_sensitivity: Array | None
-    status: RolloutStatus
+    status: RolloutConvergenceInfo
 
 
 CostDerivativesByRolloutOutputs = tuple[Array, Array | None, Array | None]
@@ -251,7 +252,7 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
         shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, np.empty)
     values: dict[str, Any] = dict.fromkeys(names) | arrays
-    return Rollout(**values, status=RolloutStatus(NewtonStatusCode.OK, 0, 0.0, 0, 0))
+    return Rollout(**values, status=RolloutConvergenceInfo(NewtonStatusCode.OK, 0, 0.0, 0, 0))
 
 
 def allocate_linearization(
@@ -292,4 +293,4 @@ def attach_status_to_rollout(
             getattr(rollout, name)[first_missing.get(name, step) :] = np.nan
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
-    return replace(rollout, status=RolloutStatus(NewtonStatusCode(code), step, error, *counts, last, inner))
+    return replace(rollout, status=RolloutConvergenceInfo(NewtonStatusCode(code), step, error, *counts, last, inner))

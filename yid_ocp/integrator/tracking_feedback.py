@@ -37,11 +37,11 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     if values.size not in (1, nu) and nu % max(values.size, 1):
         what = f"{values.size} gains for {nu} driven joints"
         allowed = f"1 or {nu} gains, or one for each joint of an arm"
-        raise ModelError(what, where="problem.arm_tracking_feedback_gains", allowed=allowed)
+        raise ModelError(what, where="problem.arm_proportional_gains", allowed=allowed)
     values = np.resize(values, nu)
     if np.any(values < 0):
         what = f"a tracking gain is negative: {values.min():g} N m/rad"
-        raise ModelError(what, where="problem.arm_tracking_feedback_gains", allowed="0 or more [N m/rad]")
+        raise ModelError(what, where="problem.arm_proportional_gains", allowed="0 or more [N m/rad]")
     steps = len(reference) - 1
     gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
     return TrackingFeedback(np.array(step.system.actuated_coordinate_indices, np.int32), gain, reference[:-1])
@@ -135,7 +135,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 
 @dataclass(frozen=True)
-class JointMotionAndTorqueSensitivities:
+class JointMotionAndTorqueWithSensitivities:
     """Angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
 
     The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
@@ -154,7 +154,7 @@ class JointMotionAndTorqueSensitivities:
         return _one_before(self.angles[:-1]), self.angles[:-1]
 
 
-class EffectMomentumShift:
+class EffectMomentumCalculator:
     """Computes the momentum that effects add to the recorded motion, so that the feedback does not oppose it.
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
@@ -216,8 +216,8 @@ class EffectMomentumShift:
 
     def effect_momentum_shifts_and_sensitivities(
         self,
-        recorded: JointMotionAndTorqueSensitivities,
-        true: JointMotionAndTorqueSensitivities,
+        recorded: JointMotionAndTorqueWithSensitivities,
+        true: JointMotionAndTorqueWithSensitivities,
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
@@ -226,7 +226,7 @@ class EffectMomentumShift:
         `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
         The first of the d directions are the parameters `names`.
         """
-        steps, plain_theta = len(true.torque), self.theta_without_effects(theta)
+        steps, plain_theta = len(true.torque), self.parameter_values_without_effects(theta)
         still = np.zeros((steps, len(self._kept)))
         plain, *_ = self._maps(False)(
             *recorded._before_and_after, still, still, _one_before(recorded.torque), plain_theta, self._time_step
@@ -252,7 +252,7 @@ class EffectMomentumShift:
         return (value - plain)[:, :, 0], total
 
     def _remembered(
-        self, motion: JointMotionAndTorqueSensitivities, theta: Array, wanted: _Wanted, width: int
+        self, motion: JointMotionAndTorqueWithSensitivities, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
         """Internal coordinates (N, nk) of joint effects at all nodes but the last, and derivatives (N, nk, d)."""
         steps = len(motion.torque)
@@ -266,7 +266,7 @@ class EffectMomentumShift:
             total[:, memory.rows] = memory.slopes(motion, z[:, memory.rows], rows, theta, wanted, width)
         return z, total if np.any(total) else None
 
-    def theta_without_effects(self, theta: Array) -> Array:
+    def parameter_values_without_effects(self, theta: Array) -> Array:
         """Copy of theta with neutral effects and the arm as described, by which the reference is computed."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
@@ -282,7 +282,7 @@ def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> 
 
     The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
     is assumed to be the same in this step and the previous step. `gain` (..., nu, nb) is the feedback gain of the step.
-    `by_torque` (nu, nu) is `EffectMomentumShift.momentum_derivative_by_previous_torque`.
+    `by_torque` (nu, nu) is `EffectMomentumCalculator.momentum_derivative_by_previous_torque`.
     """
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
@@ -308,7 +308,7 @@ class _Memory:
         compiled = step.is_compiled
         self._maps = CasadiLockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
-    def along(self, motion: JointMotionAndTorqueSensitivities, start: Array, theta: Array) -> Array:
+    def along(self, motion: JointMotionAndTorqueWithSensitivities, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""
         before, now = motion._before_and_after
         found = [start]
@@ -319,7 +319,7 @@ class _Memory:
 
     def slopes(
         self,
-        motion: JointMotionAndTorqueSensitivities,
+        motion: JointMotionAndTorqueWithSensitivities,
         values: Array,
         start: list[int],
         theta: Array,

@@ -25,7 +25,7 @@ _MAX_DEAD_BAND = 0.2  # [rad or m]
 MOTOR_OFF_COMMAND = 1e6  # input of a servo whose motor is off; from half of it on there is no torque [rad or m]
 _DEAD_BAND_ROUNDING = 1e-4  # smoothing range at the ends of a servo's dead band [rad or m]
 # parameter by which a recording states the proportional gain of a firmware
-SERVO_GAIN_FACTOR_PARAMETER = "servo_gain_factor"
+JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX = "servo_gain_factor"
 
 _MotorKind = Literal["ideal", "dc"]
 _MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
@@ -100,7 +100,7 @@ MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
 
 
 @dataclass(frozen=True)
-class MotorModelOptions:
+class MotorKindAndPreset:
     """Settings of a servo's motor. The kind is `ideal` or `dc`; a preset holds published data of a dc motor."""
 
     kind: Annotated[
@@ -139,7 +139,7 @@ class ServoModelOptions:
     has_gravity_compensation: Annotated[
         bool, OptionInfo("whether the controller compensates the robot's weight, so that the servos need not")
     ] = False
-    motor: Annotated[MotorModelOptions, OptionInfo("motor of every servo")] = MotorModelOptions()
+    motor: Annotated[MotorKindAndPreset, OptionInfo("motor of every servo")] = MotorKindAndPreset()
     extra_controller_terms: Annotated[
         tuple[_FirmwareTerm, ...],
         OptionInfo(
@@ -219,7 +219,7 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJoin
     )
 
 
-def build_joint_servos_and_parameters(
+def build_joint_servos(
     tree: Mechanism, joints: Sequence[str], options: ServoModelOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
     """Build a servo for every named joint. Returns the servos and their parameters, such as `JOINT.servo_gain`.
@@ -234,7 +234,7 @@ def build_joint_servos_and_parameters(
         gain, damping, delay, limit = (entry.symbol for entry in own)
         if options.motor.kind == "dc":
             words = f"the firmware's proportional gain, servo of {joint}"
-            own.append(Parameter(f"{joint}.{SERVO_GAIN_FACTOR_PARAMETER}", 1.0, "1", 0.0, math.inf, words))
+            own.append(Parameter(f"{joint}.{JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX}", 1.0, "1", 0.0, math.inf, words))
             gain = gain * own[-1].symbol
         tightness = limit**-TORQUE_SATURATION_EXPONENT
         further = _firmware_parameters(at, options.extra_controller_terms)

@@ -22,7 +22,7 @@ from yid_ocp.model.servos_and_springs import (
     PositionServo,
     RobotJointSpring,
     ServoModelOptions,
-    build_joint_servos_and_parameters,
+    build_joint_servos,
     stiffness_and_rest_parameters,
 )
 
@@ -309,7 +309,7 @@ class System(ReprMixin):
             stiffness, rest = stiffness_and_rest_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
-        moved, own = ({}, []) if servos is None else build_joint_servos_and_parameters(tree, driven, servos)
+        moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos)
         if servos is not None and servos.has_gravity_compensation:
             tree = tree.with_gravity_fraction(ca.SX(0))
         segments: list[SegmentLayout] = []
@@ -371,7 +371,7 @@ class System(ReprMixin):
         return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_coordinate_indices)
 
     @cached_property
-    def symbolic_kinematics(self) -> tuple[ca.SX, Kinematics]:
+    def symbols_and_kinematics(self) -> tuple[ca.SX, Kinematics]:
         """Symbols q of a configuration, (n, 1), and the kinematics there, which several functions share."""
         q = ca.SX.sym("q", self.n_coordinates)
         return q, forward_kinematics(self.mechanism, q)
@@ -381,7 +381,7 @@ class System(ReprMixin):
         """Symbols of the effects' internal coordinates by name, in the order of z. Grasps and placements use them."""
         return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
-    def segment_layout(self, name: str) -> SegmentLayout:
+    def layout_of_segment(self, name: str) -> SegmentLayout:
         """Return the layout of a segment. Raises `ModelError`, with the nearest name, if there is no such segment."""
         found = {layout.name: layout for layout in self.segment_layouts}
         require_known_names([name], found, "segment", "segments of the model", ModelError)
@@ -458,7 +458,7 @@ class System(ReprMixin):
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
         return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
-    def grasp_compliance_diagonal(self) -> ca.SX:
+    def constraint_compliance_diagonal(self) -> ca.SX:
         """Constraint compliances (m, 1): the diagonal of C in phi(q_{k+1}) = C lam_k / h."""
         return ca.vertcat(ca.SX(0, 1), *(g.compliance for g in self.grasps for _ in range(g.n_constraint_equations)))
 

@@ -21,9 +21,9 @@ from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.joint_paths import FramePositionEvaluator, PlannedMotion, PlanOptions
 from yid_ocp.planning.motion_search import (
     DOptimalityCriterion,
-    DOptimalityOrDiscriminationCriterion,
     EffectDiscriminationCriterion,
     InformativeMotionSearch,
+    MotionSearchCriterion,
     MotionSearchResult,
     PlanResidualAndLimitFunctions,
 )
@@ -162,7 +162,7 @@ def _effects(
 
 def _criterion(
     experiment: SplineMotionExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
-) -> DOptimalityOrDiscriminationCriterion:
+) -> MotionSearchCriterion:
     columns = [name.split("[")[0] for name in experiment.sensitivity_column_names]
     parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
     if not rivals:
@@ -276,7 +276,7 @@ def _plan(
     experiment: SplineMotionExperiment,
     limits: PlanResidualAndLimitFunctions,
     search: InformativeMotionSearch,
-    criterion: DOptimalityOrDiscriminationCriterion,
+    criterion: MotionSearchCriterion,
     found: Sequence[MotionSearchResult],
     rivals: Sequence[EffectBase],
     unseen: Mapping[str, float],
@@ -311,11 +311,9 @@ def _plan(
     )
 
 
-def _judged(
-    experiment: SplineMotionExperiment, criterion: DOptimalityOrDiscriminationCriterion, found: MotionSearchResult
-) -> float:
+def _judged(experiment: SplineMotionExperiment, criterion: MotionSearchCriterion, found: MotionSearchResult) -> float:
     try:
-        rows = experiment.planned_recording_sensitivities(found.w)
+        rows = experiment.planned_sensitivities_to_unknowns(found.w)
     except SolverError:
         return -math.inf
     return criterion.value_and_gradient_wrt_sensitivities(rows, False)[0]
@@ -342,12 +340,12 @@ def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str,
 
 def _distances(
     experiment: SplineMotionExperiment,
-    criterion: DOptimalityOrDiscriminationCriterion,
+    criterion: MotionSearchCriterion,
     rivals: Sequence[EffectBase],
     w: Array,
 ) -> dict[tuple[str, str], tuple[float, float]]:
     assert isinstance(criterion, EffectDiscriminationCriterion)
-    recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_recording_sensitivities(w)
+    recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_sensitivities_to_unknowns(w)
     before, after = criterion.distances_from_best_imitation(recorded), criterion.distances_from_best_imitation(planned)
     labels = [effect.label for effect in rivals]
     pairs = itertools.permutations(range(len(labels)), 2)

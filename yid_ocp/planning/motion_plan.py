@@ -189,7 +189,7 @@ def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBefo
 
 def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
     """The same motion from equilibrium with another step or other parameters."""
-    rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.start_configuration)
+    rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.start_system_configuration)
     return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
 

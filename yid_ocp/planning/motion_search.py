@@ -73,7 +73,7 @@ class PlanResidualAndLimitFunctions:
         """Reference position of the point at every node, (N + 1, 3) [m]. None if only the end position counts."""
         if self.options.goal != "path":
             return None
-        begin = self.simulator.start_configuration[None]
+        begin = self.simulator.start_system_configuration[None]
         first = self.point.positions_and_jacobian(begin, self.simulator.theta)[0][0, :3]
         vias = (first + np.asarray(offset) for offset in self.options.point_waypoint_offsets_from_start)
         places = np.vstack([first, *vias, self.target])
@@ -344,7 +344,7 @@ class EffectDiscriminationCriterion:
         return float(np.sum(rest**2) + np.sum(prior[:, None] * used**2)) / change.shape[1], rest, others, used
 
 
-DOptimalityOrDiscriminationCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
+MotionSearchCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
 
 _MIN_TRUST_RADIUS, _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 1e-3, 0.05, 0.4  # for every unknown [rad or m]
 _MIN_STEP = 1e-9  # step in the linear picture that counts as none [rad or m]
@@ -373,7 +373,7 @@ class InformativeMotionSearch:
         self,
         experiment: SplineMotionExperiment,
         limits: PlanResidualAndLimitFunctions,
-        criterion: DOptimalityOrDiscriminationCriterion,
+        criterion: MotionSearchCriterion,
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())

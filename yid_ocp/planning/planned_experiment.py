@@ -65,7 +65,7 @@ class SplineMotionExperiment:
         `ModelError` if no equilibrium is found.
         """
         system, episode = problem.system, problem.episodes[0]
-        if problem.options.clamp_pose_definitions_from_points or not (system.driven or system.prescribed):
+        if problem.options.clamp_pose_point_names or not (system.driven or system.prescribed):
             said, allowed = "the model has no joint whose motion could be planned", "a robot whose arms move"
             raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
@@ -172,7 +172,7 @@ class SplineMotionExperiment:
         problem = EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra)
         return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
-    def planned_recording_sensitivities(self, w: Array) -> Array:
+    def planned_sensitivities_to_unknowns(self, w: Array) -> Array:
         """Whitened sensitivities of the planned recording to relative changes. `SolverError` if its rollout fails."""
         return self._weighted(self.planned_estimation_problem(w))
 
@@ -267,7 +267,7 @@ class SplineMotionExperiment:
         """The problem with the joints on a path (N + 1, nc), and its evaluation."""
         problem = self._known
         moved = problem.with_episodes([replace(problem.episodes[0], prescribed_path=path)], ())
-        return moved, moved.evaluate(moved.initial_unknowns, derivatives, (self.simulator.start_configuration,))
+        return moved, moved.evaluate(moved.initial_unknowns, derivatives, (self.simulator.start_system_configuration,))
 
     @cached_property
     def _blur(self) -> tuple[Array, Array]:

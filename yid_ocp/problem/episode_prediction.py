@@ -14,7 +14,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_rollouts
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
-from yid_ocp.integrator.tracking_feedback import JointMotionAndTorqueSensitivities
+from yid_ocp.integrator.tracking_feedback import JointMotionAndTorqueWithSensitivities
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialStateWithSensitivity, truncate_episode
@@ -31,7 +31,7 @@ from yid_ocp.problem.model_functions import (
 )
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads, mean_step_input_delay_derivative, mean_step_inputs
-from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeValueSmoother
+from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
@@ -104,7 +104,7 @@ class EpisodePredictor:
             own[self.system.parameters.index(name)] = value
         return own
 
-    def initial_state_of_episode(
+    def initial_state_and_derivative(
         self,
         episode: Episode,
         theta: Array,
@@ -179,7 +179,7 @@ class EpisodePredictor:
         if not self._follows_momenta:
             return inputs
         rows = slice(2 * self.system.n_coordinates, None)
-        recorded = JointMotionAndTorqueSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
+        recorded = JointMotionAndTorqueWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
         shift, measured = self.model_functions.reference_momentum_correction, episode.measured_driven_angles
         return inputs.with_effect_momentum_in_reference(shift, recorded, measured, theta, names, by_internal)
@@ -212,7 +212,7 @@ class EpisodePredictor:
         if (lag := corrections.joint_delays_or_lag_times("torque_lag", theta, names)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
-            left = errors.estimated_torque_error_to_subtract
+            left = errors.remaining_torque_error_after_effects
             torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
             angles, loads = np.hstack([arm, path]), episode.joint_loads
@@ -255,7 +255,7 @@ class EpisodePredictor:
         wanted = self.unknowns.free_parameter_names if derivatives else ()
         theta = self.theta_with_episode_values(episode, theta)
         inputs = self.corrected_inputs(episode, theta, wanted)
-        start = self.initial_state_of_episode(episode, theta, offset, wanted, guess, inputs)
+        start = self.initial_state_and_derivative(episode, theta, offset, wanted, guess, inputs)
         if start.failure_message:
             return start.failure_message
         by_start = start.state_sensitivity
@@ -318,7 +318,7 @@ class EpisodePredictor:
         y, total = self._read(samples, read, theta, self.unknowns.free_parameter_names)
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
-    def state_values_at_nodes(self, rollout: Rollout) -> NodeStateValues:
+    def rollout_node_values(self, rollout: Rollout) -> NodeStateValues:
         """State values at all nodes of a rollout. Loads are efforts (prescribed joints) or torques (driven joints)."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
@@ -338,7 +338,7 @@ class EpisodePredictor:
     def delay_corrected_measurements(self, samples: SensorMeasurements, theta: Array) -> SensorMeasurements:
         """Shift measurements earlier by the sensor's delay at `theta`, to the times of the true values."""
         late = self._delay_in_steps(samples, theta, ())
-        return samples if late is None else samples.shifted_earlier_by_steps(late[0])
+        return samples if late is None else samples.shifted_earlier_by_delays(late[0])
 
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
         """The rollout with efforts of prescribed joints as sensors record them: with lag and smoothed."""
@@ -356,7 +356,7 @@ class EpisodePredictor:
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
         nodes = [self.delay_corrected_measurements(samples, theta).evaluation_nodes for samples in compared]
-        smooth, grid = LowPassFilter(self.options.path_cutoff), episode.grid
+        smooth, grid = ZeroPhaseLowPassFilter(self.options.path_cutoff), episode.grid
         return smooth.node_smoother(np.unique(np.concatenate(nodes)), grid.steps, self.integrator_step.time_step)
 
     def _predict(
@@ -369,9 +369,9 @@ class EpisodePredictor:
     ) -> tuple[Array, Array]:
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
-            samples = samples.shifted_earlier_by_steps(late[0])
+            samples = samples.shifted_earlier_by_delays(late[0])
         slopes_of = (rollout.state_sensitivity, rollout.effort_sensitivity, by_applied, rollout.multipliers_sensitivity)
-        along = _Trajectory(self.state_values_at_nodes(rollout), *slopes_of)
+        along = _Trajectory(self.rollout_node_values(rollout), *slopes_of)
         y, total = self._read(samples, along, theta, wanted)
         predicted, slopes = samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
         if late is not None and rollout.state_sensitivity is not None:
@@ -416,7 +416,7 @@ class EpisodePredictor:
         wanted, rollout = self.unknowns.free_parameter_names, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
         pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}
-        total, read = np.zeros(len(wanted)), self.state_values_at_nodes(self._recorded(episode, rollout, theta, ()))
+        total, read = np.zeros(len(wanted)), self.rollout_node_values(self._recorded(episode, rollout, theta, ()))
         for samples, pull in zip(episode.measurements, pulls, strict=True):
             total += self._pull(samples, pull, read, theta, pulled)
         by_state, by_effort, by_applied, by_multipliers = pulled.values()
@@ -425,7 +425,7 @@ class EpisodePredictor:
         lag = self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted)
         if lag is not None:
             lagged = FirstOrderLag(*lag, self.integrator_step.time_step)
-            by_effort, by_lag = lagged.lagged_node_values_gradients(rollout.effort, by_effort)
+            by_effort, by_lag = lagged.lagged_node_values_adjoint(rollout.effort, by_effort)
             total += by_lag
         feedback = episode.tracking_feedback
         if feedback is not None:
@@ -433,7 +433,7 @@ class EpisodePredictor:
         partials = (by_state, by_multipliers if np.any(by_multipliers) else None, by_effort)
         by_inputs = self.integrator_step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
         inputs = self.corrected_inputs(episode, theta, wanted)
-        start = self.initial_state_of_episode(episode, theta, offset, wanted, result.equilibrium_guess, inputs)
+        start = self.initial_state_and_derivative(episode, theta, offset, wanted, result.equilibrium_guess, inputs)
         known = start.state, start.state_sensitivity, inputs
         inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, *known)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
@@ -454,7 +454,7 @@ class EpisodePredictor:
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameter_names
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
-            samples = samples.shifted_earlier_by_steps(late[0])
+            samples = samples.shifted_earlier_by_delays(late[0])
         at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_nodes
         read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(values.select_nodes(nodes), theta)
         direct = np.einsum("mk,mkq->q", at_nodes, read.by_theta)
@@ -511,14 +511,14 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
     if not error > _POOR_EQUILIBRIUM_RMSE:
         return episode
     elastic = [predictor.system.mechanism.joint_index(spring.joint_name) for spring in predictor.system.elastic_joints]
-    shapes = [predictor.initial_state_of_episode(episode, own, offset, ()).state[:n].copy()]
+    shapes = [predictor.initial_state_and_derivative(episode, own, offset, ()).state[:n].copy()]
     shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
     with contextlib.suppress(DataError):
         fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
         # an equilibrium near this configuration has the details
         fitted_shape = fit(at, early.measurements, own, _MAX_RESTING_TIME, episode.prescribed_path, roughly=True)
         shapes.append(fitted_shape.state[:n])
-    others = [predictor.initial_state_of_episode(episode, own, offset, (), shape).state[:n] for shape in shapes]
+    others = [predictor.initial_state_and_derivative(episode, own, offset, (), shape).state[:n] for shape in shapes]
     errors = [_first_points_error(predictor, replace(early, equilibrium_guess=q), theta) for q in others]
     best = int(np.argmin(errors))
     is_better = errors[best] < _MAX_REMAINING_ERROR_FRACTION * error
@@ -559,7 +559,7 @@ def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epis
     result = predictor.predict_episode(episode, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
     if isinstance(result, str):
         return episode
-    load, own = episode.joint_loads.copy(), predictor.state_values_at_nodes(result.rollout).load
+    load, own = episode.joint_loads.copy(), predictor.rollout_node_values(result.rollout).load
     for samples in compared:
         at = [corrections.joint_names.index(joint) for joint in samples.sensor.effort_joints]
         column = [predictor.system.mechanism.joint_index(joint) for joint in samples.sensor.effort_joints]

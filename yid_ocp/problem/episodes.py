@@ -36,10 +36,10 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles_at_nodes,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, zero_phase_effort_filter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_GROUP_NAME,
+    JOINT_EFFORT_SENSOR_KEY,
     JOINT_POSITION_GROUP_NAME,
     PositionSensor,
     is_noise_std_stated,
@@ -113,7 +113,7 @@ class TorqueAndAngleErrorModel:
         return self.torque_bias + self.torque_noise
 
     @property
-    def estimated_torque_error_to_subtract(self) -> Array:
+    def remaining_torque_error_after_effects(self) -> Array:
         """Torque error that remains to be subtracted after effects on torques were applied, (N, nu) [N m]."""
         return self.recorded_minus_true_torque - self.transmitted_torque_noise
 
@@ -152,7 +152,7 @@ def _recorded_input_errors(
     joints, driven = recording.joints, system.driven
     if joints is None or joints.effort is None or not driven or system.servos:
         return None
-    effort = sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
+    effort = sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
     position = sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
     std = joint_torque_noise_std(joints, driven, effort, recording.name)
     bias = joint_torque_bias_std(joints, driven, effort)
@@ -160,7 +160,7 @@ def _recorded_input_errors(
     if not encoders and not np.any(std > 0) and not np.any(bias > 0):
         return None
     angle = joint_angle_noise_std(joints, driven, position, recording.name)
-    for group, choice, level in ((JOINT_EFFORT_GROUP_NAME, effort, std), (JOINT_POSITION_GROUP_NAME, position, angle)):
+    for group, choice, level in ((JOINT_EFFORT_SENSOR_KEY, effort, std), (JOINT_POSITION_GROUP_NAME, position, angle)):
         if not is_noise_std_stated(joints, group, choice):
             words = "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest"
             log.warning(words + " changes", recording.name, group, level.min(), level.max(), CHANNEL_KINDS[group].unit)
@@ -226,21 +226,21 @@ def prepare_episode(
     gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level.
     """
     step, system = functions.step, functions.step.system
-    efforts = options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
+    efforts = options.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
     recording = recording.with_effort_sampling_kind(efforts.effort_sampling_kind)
     grid = rollout_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         what = "the arms of the model are driven, but the recording has no joints"
         where, hint = f"recording '{recording.name}'", "import the joints too, or set model.arms.mode: prescribed"
         raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
-    low_pass, clamps = LowPassFilter(options.path_cutoff), options.clamp_pose_definitions_from_points
+    low_pass, clamps = ZeroPhaseLowPassFilter(options.path_cutoff), options.clamp_pose_point_names
     path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, clamps)
     arm = smooth = np.zeros((grid.steps + 1, 0))
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
         read = (recording.joints, system.driven, grid, recording.name)
         torque = mean_step_inputs(*read, servos=system.servos)
-        arm = smoothed_joint_angles_at_nodes(*read, LowPassFilter(math.inf))
+        arm = smoothed_joint_angles_at_nodes(*read, ZeroPhaseLowPassFilter(math.inf))
         smooth = smoothed_joint_angles_at_nodes(*read, low_pass) if options.arm_tracking_feedback == "lqr" else arm
     uncertain = options.has_uncertain_point_clocks and any("damping" in name for name in free)
     effects = [own for own in system.effects if isinstance(own, EffectBase)]
@@ -268,9 +268,9 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if not step.system.driven or step.system.servos or options.arm_tracking_feedback == "none":
         return episode
     if options.arm_tracking_feedback == "proportional":
-        loop = proportional_tracking_feedback(step, episode.measured_driven_angles, options.arm_tracking_feedback_gains)
+        loop = proportional_tracking_feedback(step, episode.measured_driven_angles, options.arm_proportional_gains)
     else:
-        plain = functions.reference_momentum_correction.theta_without_effects(theta)
+        plain = functions.reference_momentum_correction.parameter_values_without_effects(theta)
         known = episode.smoothed_driven_angles, episode.torque, plain
         loop = lqr_tracking_feedback(step, *known, functions.arms_only_integrator_step)
     return replace(episode, tracking_feedback=loop)
@@ -340,7 +340,7 @@ def _samples(
         grid.node_times,
         grid.time_step,
         zero_phase_effort_filter(options.path_cutoff),
-        LowPassFilter(options.path_cutoff),
+        ZeroPhaseLowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
         has_uncertain_clocks,
         sticking_speeds,
@@ -358,5 +358,5 @@ def _samples(
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
 
 
-EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
+PredictedEpisodeOrFailure = tuple[Episode, EpisodePrediction | str]
 """A recording and its prediction, or the reason why it has no prediction."""

@@ -19,9 +19,9 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_at_equilibrium_with_denoised_gear_loads
 from yid_ocp.problem.episodes import (
     Episode,
-    EpisodeAndPrediction,
     EpisodePrediction,
     InitialStateWithSensitivity,
+    PredictedEpisodeOrFailure,
     mass_matrix_diagonal_at_zero,
     prepare_episode,
     truncate_episode,
@@ -32,16 +32,16 @@ from yid_ocp.problem.evaluation import (
     ProcessNoiseWhitener,
     ResidualVectorLayout,
     UnknownVectorLayout,
-    check_free_parameters,
+    check_free_parameter_names,
     check_initial_values_and_bounds,
     check_no_known_value_of_free_parameters,
     check_unique_recording_names,
     estimated_initial_state_names,
-    initial_internal_state_offset_bounds,
+    max_abs_initial_internal_state_offsets,
     soft_logarithm_and_slope,
     stated_prior_jacobian,
-    stated_prior_stds,
-    whitened_episode_residual,
+    stated_prior_stds_of_unknowns,
+    whitened_prediction_residual,
 )
 from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_residual_factors
 from yid_ocp.problem.model_functions import ModelFunctions
@@ -105,7 +105,7 @@ class EstimationProblem(ReprMixin):
         if not options.path_cutoff:
             cutoff = select_path_cutoff([*recordings, *held_out], step.system.prescribed)
             options = replace(options, path_cutoff=cutoff)
-        check_free_parameters(step.system, free, options)
+        check_free_parameter_names(step.system, free, options)
         if not recordings:
             what, hint = "there is no recording to estimate on", "add one under recordings.estimate"
             raise DataError(what, where="recordings.estimate", allowed="one recording or more", hint=hint)
@@ -147,7 +147,7 @@ class EstimationProblem(ReprMixin):
         self.unknown_names = self.unknowns.unknown_names
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
         inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
-        self._prior_std = stated_prior_stds(self.unknowns, options, model_functions.step.system, inertia)
+        self._prior_std = stated_prior_stds_of_unknowns(self.unknowns, options, model_functions.step.system, inertia)
         has_weak_priors = options.weighting != "paper" and options.weak_prior_geometric_std > 1
         weak = self.positive_unknowns_mask & ~np.isfinite(self._prior_std) & has_weak_priors
         self._weak: IntArray = np.flatnonzero(weak)
@@ -185,7 +185,7 @@ class EstimationProblem(ReprMixin):
         """Lower and upper bounds of the unknown vector, (nx,) each."""
         parts = (self.shared_parameters, self.local_parameters)
         (low, high), (own_low, own_high) = (self.system.parameters.lower_and_upper_bounds(part) for part in parts)
-        wide = initial_internal_state_offset_bounds(self.system, self.unknowns.initial_state_names)
+        wide = max_abs_initial_internal_state_offsets(self.system, self.unknowns.initial_state_names)
         pack = self.unknowns.pack_same_for_all_recordings
         return pack(low, own_low, -wide), pack(high, own_high, wide)
 
@@ -231,9 +231,9 @@ class EstimationProblem(ReprMixin):
         neutral_and_fixed = self.predictor.are_input_corrections_neutral_and_fixed
         return all(neutral_and_fixed(episode, self.theta) for episode in self.episodes)
 
-    def unpack_unknown_vector(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
+    def unpack_episode_unknowns(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""
-        return self.unknowns.unpack_unknown_vector(x, episode, self.theta, self.system)
+        return self.unknowns.unpack_episode_unknowns(x, episode, self.theta, self.system)
 
     def unknown_vector(self, values: Mapping[str, float]) -> Array:
         """Copy (nx,) of the initial unknown vector, with the named `values` inserted and clipped to the bounds."""
@@ -254,7 +254,7 @@ class EstimationProblem(ReprMixin):
         """
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
-        asked = [(e, *self.unpack_unknown_vector(x, i), guess) for i, (e, guess) in enumerate(pairs)]
+        asked = [(e, *self.unpack_episode_unknowns(x, i), guess) for i, (e, guess) in enumerate(pairs)]
         results = self.predictor.predict_episodes(asked, derivatives)
         failures = [result for result in results if isinstance(result, str)]
         if failures:
@@ -263,7 +263,7 @@ class EstimationProblem(ReprMixin):
         cost, residuals, jacobians = 0.0, [], []
         threshold = self.options.huber_threshold
         for i, result in enumerate(done):
-            part = whitened_episode_residual(self.episodes[i], self.whitening_filters[i], result, threshold)
+            part = whitened_prediction_residual(self.episodes[i], self.whitening_filters[i], result, threshold)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
@@ -303,7 +303,7 @@ class EstimationProblem(ReprMixin):
                 raw = samples.whitened_residual(result.predicted_outputs[k])
                 _, factor = huber_loss_and_residual_factors(raw, self.options.huber_threshold)
                 pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
-            theta, offset = self.unpack_unknown_vector(x, i)
+            theta, offset = self.unpack_episode_unknowns(x, i)
             own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, theta, offset, pulls)
             gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
         prior, prior_jacobian = self.prior_residual_and_jacobian(x)
@@ -318,7 +318,7 @@ class EstimationProblem(ReprMixin):
         rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
         return np.concatenate([stated @ (x - start), value / spread]), rows
 
-    def initial_state_of_episode(
+    def initial_state_and_derivative(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialStateWithSensitivity:
         """Initial state of an episode, with derivatives with respect to the free parameters and the equilibrium offset.
@@ -327,10 +327,11 @@ class EstimationProblem(ReprMixin):
         """
         own = self.predictor.theta_with_episode_values(episode, theta)
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
-        return self.predictor.initial_state_of_episode(episode, own, none, self.unknowns.free_parameter_names, guess)
+        names = self.unknowns.free_parameter_names
+        return self.predictor.initial_state_and_derivative(episode, own, none, names, guess)
 
-    def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[EpisodeAndPrediction]:
-        """Predict held-out recordings with the parameters of `held_out_theta`.
+    def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[PredictedEpisodeOrFailure]:
+        """Predict held-out recordings with the parameters of `held_out_parameter_vector`.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
         prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free
@@ -343,23 +344,23 @@ class EstimationProblem(ReprMixin):
         """Inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
         x, found = np.asarray(x, float), []
         for held in self.held_out:
-            theta, shared = self.held_out_theta(x, held), held.initial_state_shared_with
+            theta, shared = self.held_out_parameter_vector(x, held), held.initial_state_shared_with
             if shared is not None:
                 episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
-                found.append((episode, theta, self.unpack_unknown_vector(x, shared)[1]))
+                found.append((episode, theta, self.unpack_episode_unknowns(x, shared)[1]))
                 continue
             episode = self.predictor.episode_with_fitted_initial_state(held, theta)
             std = self.initial_state_prior_std
             found.append((episode, theta, _estimated_initial_state_offset(self.predictor, episode, theta, std)))
         return found
 
-    def held_out_theta(self, x: Array, held: Episode) -> Array:
+    def held_out_parameter_vector(self, x: Array, held: Episode) -> Array:
         """Vector theta (ntheta,) of a held-out recording, with the shared parameters in `x`.
 
         Local parameters have the values in `x` if it is part of an estimation recording, else their initial values.
         """
         whole = held.initial_state_shared_with
-        theta, _ = self.unpack_unknown_vector(x, whole or 0)
+        theta, _ = self.unpack_episode_unknowns(x, whole or 0)
         for name in self.local_parameters if whole is None else ():
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return theta
@@ -416,11 +417,11 @@ class EstimationProblem(ReprMixin):
         """Whether errors of recorded torques or angles are process noise in at least one recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
 
-    def whitened_held_out_prediction_residual(
+    def whitened_held_out_residual_and_jacobian(
         self, i: int, episode: Episode, result: EpisodePrediction
     ) -> ResidualAndJacobian:
         """Whitened residual of held-out recording `i` without robust loss; `result` is from `predict_held_out`."""
-        return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
+        return whitened_prediction_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
     def truncated_to_duration(self, duration: float) -> EstimationProblem:
         """Problem rebuilt on the first `duration` [s] of each recording, without held-out recordings."""
@@ -466,7 +467,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
     short = _beginning(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
-    limit = initial_internal_state_offset_bounds(predictor.system, predictor.unknowns.initial_state_names)
+    limit = max_abs_initial_internal_state_offsets(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

@@ -22,7 +22,7 @@ from yid_ocp.problem.measurements import (
     SensorMeasurements,
     huber_loss_and_residual_factors,
     whiten_against_sensor_biases,
-    whitened_sensitivities_to_sensor_errors,
+    whitened_measurement_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import ProblemOptions
 
@@ -38,7 +38,7 @@ class ProcessNoiseWhitener(Protocol):
         """Standard deviations of torque and angle errors, and the errors about which the filter is linearised."""
         ...
 
-    def whiten_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+    def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
 
         The first column of `rows` (r, c) is the residual in units of sensor noise, all other columns are its
@@ -117,14 +117,14 @@ def _sensor_whitened_residual(
     )
 
 
-def whitened_episode_residual(
+def whitened_prediction_residual(
     episode: Episode, whitening: ProcessNoiseWhitener | None, result: EpisodePrediction, threshold: float
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
     Constant sensor errors count as noise (`whiten_against_sensor_biases`). `threshold` is the Huber threshold.
     """
-    by_constants = whitened_sensitivities_to_sensor_errors(episode.measurements)
+    by_constants = whitened_measurement_sensitivities_to_sensor_errors(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
     plain = _sensor_whitened_residual(episode.measurements, result)
@@ -135,7 +135,7 @@ def whitened_episode_residual(
         kept, push = columns.shape[1], result.feedback_torque_and_sensitivity
         # constant sensor errors do not drive the motion
         push = None if push is None else np.pad(push, ((0, 0), (0, 0), (0, by_constants.shape[1])))
-        innovations, _ = whitening.whiten_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
+        innovations, _ = whitening.whiten_residuals_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
         columns = whiten_against_sensor_biases(by_constants, columns)
@@ -181,7 +181,9 @@ class UnknownVectorLayout:
         wide[:, self.unknown_indices_affecting_recording(recording)] = block
         return wide
 
-    def unpack_unknown_vector(self, x: ArrayLike, recording: int, theta: Array, system: System) -> tuple[Array, Array]:
+    def unpack_episode_unknowns(
+        self, x: ArrayLike, recording: int, theta: Array, system: System
+    ) -> tuple[Array, Array]:
         """Copy of `theta` with one recording's values from `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
         result = theta.copy()
@@ -196,7 +198,7 @@ class UnknownVectorLayout:
         return np.concatenate(parts)
 
 
-def stated_prior_stds(
+def stated_prior_stds_of_unknowns(
     unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
 ) -> Array:
     """Standard deviation of each unknown's stated Gaussian prior, (nx,). It is infinite for unknowns without prior.
@@ -263,13 +265,13 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
     return {name: size for effect in effects for name, size in effect.max_abs_initial_internal_coordinates.items()}
 
 
-def initial_internal_state_offset_bounds(system: System, names: Sequence[str]) -> Array:
+def max_abs_initial_internal_state_offsets(system: System, names: Sequence[str]) -> Array:
     """Largest absolute initial offset (len(names),) of effects' internal coordinates, infinite for other names."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 
 
-def check_free_parameters(system: System, free: Sequence[str], options: ProblemOptions) -> None:
+def check_free_parameter_names(system: System, free: Sequence[str], options: ProblemOptions) -> None:
     """Raise `ConfigError` if a free parameter is unknown or repeated, or if a local or prior parameter is not free."""
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)

@@ -18,7 +18,7 @@ from yid_ocp.model import forward_kinematics
 from yid_ocp.model.objects.cable import INITIAL_ANGLE_AND_TORQUE_SUFFIXES, INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.sensors import Sensor, sensor_reading_function
+from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 
 # Width of the elastic prior [rad]: this bend at a joint of mean stiffness costs as much as one standard deviation of a
 # measured point. The cost of other joints is proportional to their stiffness.
@@ -170,7 +170,7 @@ class InitialStateFitter:
     def _reading_function(self, sensor: Sensor) -> ca.Function:
         """Function of a sensor's readings and their derivatives by the free coordinates and the fitted parameters."""
         e = self.step.equations
-        read = sensor_reading_function(self.step.system, sensor, self.fitted_parameters)(q=e.q1, theta=e.theta)
+        read = sensor_function_with_jacobians(self.step.system, sensor, self.fitted_parameters)(q=e.q1, theta=e.theta)
         slopes = ca.horzcat(read["by_q"][:, self._free], read["by_theta"])
         return ca.Function("points", [e.q1, e.theta], [ca.densify(read["y"]), ca.densify(slopes)])
 

@@ -177,7 +177,7 @@ class SensorMeasurements:
             jacobian = robust[:, None] * self.decorrelate_residual_rows(self.weight[seen][:, None] * slopes[seen])
         return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
-    def shifted_earlier_by_steps(self, steps: Array) -> SensorMeasurements:
+    def shifted_earlier_by_delays(self, steps: Array) -> SensorMeasurements:
         """Shift samples earlier by each output's delay `steps` (k,), clipped to the predictable nodes."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
@@ -290,7 +290,7 @@ def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
-def whitened_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements]) -> Array:
+def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements]) -> Array:
     """Derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
 
     Derivatives of the residual, prediction minus measurement, have the opposite sign.
@@ -306,11 +306,11 @@ def whitened_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements
     return found
 
 
-def subtract_estimated_biases(
+def subtract_estimated_bias_and_clock_errors(
     samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
 ) -> tuple[SensorMeasurements, ...]:
     """Subtract constant errors and clock offsets, estimated from a prediction (M, k) per sensor, from measurements."""
-    slopes = whitened_sensitivities_to_sensor_errors(samples)
+    slopes = whitened_measurement_sensitivities_to_sensor_errors(samples)
     if not slopes.shape[1]:
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)

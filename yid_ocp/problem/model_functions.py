@@ -15,14 +15,14 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
-    EffectMomentumShift,
-    JointMotionAndTorqueSensitivities,
+    EffectMomentumCalculator,
+    JointMotionAndTorqueWithSensitivities,
     compile_driven_arms_only_step,
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
-from yid_ocp.sensors import Sensor, sensor_reading_function
+from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class CorrectedInputs:
 
     def with_effect_momentum_in_reference(
         self,
-        shift: EffectMomentumShift,
-        recorded: JointMotionAndTorqueSensitivities,
+        shift: EffectMomentumCalculator,
+        recorded: JointMotionAndTorqueWithSensitivities,
         measured: Array,
         theta: Array,
         names: Sequence[str],
@@ -85,7 +85,7 @@ class CorrectedInputs:
             return self
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
-        true = JointMotionAndTorqueSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
+        true = JointMotionAndTorqueWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
         momentum, slope = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, names)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
@@ -291,7 +291,7 @@ def _inner_nodes(nodes: IntArray, count: int) -> IntArray:
 
 
 class _SensorReadings(NamedTuple):
-    """Readings (K, k) of a sensor at K nodes, and their derivatives (K, k, ...); see `sensor_reading_function`."""
+    """Readings (K, k) of a sensor at K nodes, with derivatives (K, k, ...); see `sensor_function_with_jacobians`."""
 
     output: Array
     by_q: Array
@@ -324,7 +324,7 @@ class ModelFunctions:
             lambda _: InitialStateFitter(step, start_parameters)
         )
         self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_arms_only_step(step))
-        self._momentum = CasadiLockedCache[None, EffectMomentumShift](lambda _: EffectMomentumShift(step))
+        self._momentum = CasadiLockedCache[None, EffectMomentumCalculator](lambda _: EffectMomentumCalculator(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
@@ -350,7 +350,7 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def reference_momentum_correction(self) -> EffectMomentumShift:
+    def reference_momentum_correction(self) -> EffectMomentumCalculator:
         """Correction of the tracking feedback's reference momentum for the effects in the model."""
         return self._momentum(None)
 
@@ -370,5 +370,6 @@ class ModelFunctions:
 
     def _compiled(self, key: tuple[Sensor, bool]) -> MappedFunction:
         sensor, differentiated = key
-        function = sensor_reading_function(self.step.system, sensor, self.parameter_names if differentiated else ())
+        names = self.parameter_names if differentiated else ()
+        function = sensor_function_with_jacobians(self.step.system, sensor, names)
         return MappedFunction(function, shared_inputs=(6,), use_compiler=self.step.is_compiled)

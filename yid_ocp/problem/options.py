@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.integrator.step import Step
-from yid_ocp.model.objects.base import CableTopology, ClampPoseDefinition
+from yid_ocp.model.objects.base import CableTopology, ClampPoseFromTwoPoints
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeightingName
 from yid_ocp.sensors import SensorOptions as SensorOptions
@@ -107,7 +107,7 @@ class ProblemOptions:
     arm_tracking_feedback: Annotated[
         Literal["none", "proportional", "lqr"], OptionInfo("tracking filter of driven arms; arms with servos have none")
     ] = "lqr"
-    arm_tracking_feedback_gains: Annotated[
+    arm_proportional_gains: Annotated[
         tuple[Annotated[float, Ge(0)], ...],
         Len(1),
         OptionInfo("gains of the filter `proportional`, for one arm or for all driven joints", "N m/rad"),
@@ -128,7 +128,7 @@ class ProblemOptions:
         ),
     ] = 0.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
-    clamp_pose_definitions_from_points: tuple[ClampPoseDefinition, ...] = ()
+    clamp_pose_point_names: tuple[ClampPoseFromTwoPoints, ...] = ()
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)
@@ -168,6 +168,6 @@ class ProblemOptions:
     cable_topology: CableTopology | None = field(default=None, compare=False, repr=False)
 
     @property
-    def no_data_issue_exceeds_warning(self) -> bool:
+    def has_no_data_issue_above_warning(self) -> bool:
         """Whether no data quality issue is more severe than a warning."""
         return all(doubt.weight == "warning" for doubt in self.data_issues)

@@ -20,7 +20,7 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import FirstOrderLag
 from yid_ocp.sensors.base import EffortSamplingKind, expand_to_joint_values
 from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_GROUP_NAME,
+    JOINT_EFFORT_SENSOR_KEY,
     JOINT_POSITION_GROUP_NAME,
     PositionSensor,
     PrescribedJointEffortSensor,
@@ -237,7 +237,7 @@ def _channel_groups(
             if given is not None:
                 stds[attribute] = expand_to_joint_values(given, original.names, names, f"sensors.{sensor.group_name}")
         function = predictor.model_functions.compiled_sensor_function(sensor)
-        read = function(predictor.state_values_at_nodes(outcome.rollout), theta).output
+        read = function(predictor.rollout_node_values(outcome.rollout), theta).output
         values = read.reshape(len(read), len(names), *([-1] if sensor.channel.components else []))
         std, bias = (stds.get(attribute, np.zeros(len(names))) for attribute in sensor.channel.std_attribute_names)
         widen = (slice(None), *[None] * (values.ndim - 2))
@@ -253,7 +253,7 @@ def _channel_groups(
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
     """A group with the recorded points that clamps follow: they are inputs and are not predicted."""
     original = next(entry for entry in source.points if entry.name == group.name)
-    clamps = predictor.options.clamp_pose_definitions_from_points
+    clamps = predictor.options.clamp_pose_point_names
     followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point_name, clamp.z_axis_point_name))
     names = tuple(name for name in followed if name in original.names and name not in group.names)
     if not names:
@@ -312,7 +312,7 @@ def _joint_readings(
     if (lag := corrections.joint_delays_or_lag_times("torque_lag", theta, ())) is not None:
         # the applied torque lags behind the recorded one
         rollout = replace(rollout, torque=FirstOrderLag(-lag[0], lag[1], h).lagged_node_values(rollout.torque, None)[0])
-    values, found = predictor.state_values_at_nodes(rollout), []
+    values, found = predictor.rollout_node_values(rollout), []
     for sensor in (PositionSensor(names), PrescribedJointEffortSensor(names)):
         read = functions.compiled_sensor_function(sensor)(values, theta).output
         shift, _ = corrections.sensor_delays_with_derivatives(sensor, theta, ()) or (np.zeros(len(names)), None)
@@ -353,11 +353,11 @@ def _levels(
     """Standard deviations (nj,) of angle, torque and torque offset assumed by the estimation; None if not stated."""
     joints, driven = episode.recording.joints, predictor.system.driven
     assert joints is not None
-    effort = predictor.options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
+    effort = predictor.options.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
     position = predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
     kinds = (
         (JOINT_POSITION_GROUP_NAME, position, joint_angle_noise_std),
-        (JOINT_EFFORT_GROUP_NAME, effort, joint_torque_noise_std),
+        (JOINT_EFFORT_SENSOR_KEY, effort, joint_torque_noise_std),
     )
     noisy, levels = () if episode.input_errors is None else driven, np.zeros((3, len(names)))
     at, found = [names.index(name) for name in noisy], list[Array | None]()

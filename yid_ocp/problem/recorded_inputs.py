@@ -14,13 +14,13 @@ from yid_ocp.data.channel_checks import median_sample_period, seen_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.model.objects.base import ClampPoseDefinition
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR_PARAMETER, PositionServo
+from yid_ocp.model.objects.base import ClampPoseFromTwoPoints
+from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX, MOTOR_OFF_COMMAND, PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors import CHANNEL_KINDS, measuring_camera_pose, recorded_joint_column_indices
-from yid_ocp.sensors.base import additional_sensor_channel_kinds
+from yid_ocp.sensors.base import additional_channel_kinds_of_group
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
@@ -42,10 +42,10 @@ def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -
     channels = [(g.t, g.position[:, [g.names.index(name)]]) for g in groups for name in joints if name in g.names]
     sizes = [seen_noise_std(t, angle[:, 0]) for t, angle in channels]
     while cutoff < most and min(sizes, default=0.0) > 0:
-        higher, p_values = LowPassFilter(min(2 * cutoff, most)), []
+        higher, p_values = ZeroPhaseLowPassFilter(min(2 * cutoff, most)), []
         for (t, angle), std in zip(channels, sizes, strict=True):
             impulse = std * (t == t[len(t) // 2])[:, None]
-            kept, noise = (higher(t, values) - LowPassFilter(cutoff)(t, values) for values in (angle, impulse))
+            kept, noise = (higher(t, values) - ZeroPhaseLowPassFilter(cutoff)(t, values) for values in (angle, impulse))
             degrees = 2 * (higher.cutoff - cutoff) * (t[-1] - t[0])
             p_values.append(scipy.special.chdtrc(degrees, degrees * np.mean(kept**2) / np.sum(noise**2)))
         if min(p_values) > _NOISE_ONLY_LEVEL:
@@ -116,7 +116,7 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
 
     Raises `DataError` if only some of the recordings with motors on state gains, because gains cannot be compared then.
     """
-    wanted = {name: f"{name}.{SERVO_GAIN_FACTOR_PARAMETER}" for name in system.servos}
+    wanted = {name: f"{name}.{JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX}" for name in system.servos}
     wanted = {name: parameter for name, parameter in wanted.items() if parameter in system.parameters}
     found: dict[str, dict[str, float]] = {}
     silent = []
@@ -194,20 +194,20 @@ def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
 
 
 def smoothed_joint_angles_at_nodes(
-    joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: LowPassFilter
+    joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: ZeroPhaseLowPassFilter
 ) -> Array:
     """Low-pass filter recorded joint angles and sample them at every node, (steps + 1, len(names)) [rad]."""
     columns = recorded_joint_column_indices(joints, names, where)
     return _smoothed_at_nodes(joints.t, joints.position[:, columns], grid, low_pass)
 
 
-def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: LowPassFilter) -> Array:
+def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter) -> Array:
     spline = scipy.interpolate.CubicSpline(t, low_pass(t, values), axis=0)
     return np.asarray(spline(np.clip(grid.node_times, *t[[0, -1]])))
 
 
 def smoothed_joint_efforts(
-    recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: LowPassFilter
+    recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter
 ) -> Array:
     """Low-pass filtered joint efforts (steps + 1, len(names)) [N m] at every node. `DataError` without efforts."""
     joints = recording.joints
@@ -228,10 +228,10 @@ def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: A
     difference is constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
     """
     gap = (measured - model)[np.clip(np.arange(len(model)), nodes.min(), nodes.max())]
-    return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
+    return measured - gap + ZeroPhaseLowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
 
-def available_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
+def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
     """Signal kinds that the recordings contain, of those that effects can require, such as `joints.effort`.
 
     Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, each point group that
@@ -246,7 +246,7 @@ def available_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
             if any(channel.matches_group_name(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
         for group in recording.channel_groups:
-            of_vectors = [c.group for c in additional_sensor_channel_kinds(group.name) if c.components]
+            of_vectors = [c.group for c in additional_channel_kinds_of_group(group.name) if c.components]
             mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
         if any(measuring_camera_pose(group) is not None for group in recording.points):
             found.add("camera")
@@ -260,7 +260,7 @@ def available_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
 
 def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
     """Kinds of effects that cannot be candidates, by the signals that they require but the recordings lack."""
-    present, found = available_signal_kinds(recordings), dict[str, list[str]]()
+    present, found = signal_kinds_for_effects(recordings), dict[str, list[str]]()
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):
             found.setdefault(" and ".join(missing), []).append(kind)
@@ -271,8 +271,8 @@ def prescribed_coordinates_at_nodes(
     recording: Recording,
     system: System,
     grid: TimeGrid,
-    low_pass: LowPassFilter,
-    clamps: tuple[ClampPoseDefinition, ...] = (),
+    low_pass: ZeroPhaseLowPassFilter,
+    clamps: tuple[ClampPoseFromTwoPoints, ...] = (),
 ) -> Array:
     """Prescribed coordinates (steps + 1, nc) at every node, from smoothed recorded joints and clamp points.
 
@@ -295,7 +295,7 @@ def prescribed_coordinates_at_nodes(
 
 
 def _clamp_course(
-    recording: Recording, clamp: ClampPoseDefinition, grid: TimeGrid, low_pass: LowPassFilter
+    recording: Recording, clamp: ClampPoseFromTwoPoints, grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter
 ) -> Mapping[str, Array]:
     origin = _smoothed_point_path(recording, clamp.origin_point_name, grid, low_pass)
     direction = _smoothed_point_path(recording, clamp.z_axis_point_name, grid, low_pass) - origin
@@ -315,7 +315,7 @@ def _clamp_course(
     return result
 
 
-def _smoothed_point_path(recording: Recording, point: str, grid: TimeGrid, low_pass: LowPassFilter) -> Array:
+def _smoothed_point_path(recording: Recording, point: str, grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter) -> Array:
     """Smoothed position of a recorded point at every node, shape (steps + 1, 3) [m]."""
     for group in recording.points:
         if point in group.names:

@@ -21,7 +21,7 @@ _MIN_RELATIVE_WEIGHT = 1e-4  # fraction of the largest weight below which weight
 
 
 @dataclass(frozen=True)
-class LowPassFilter:
+class ZeroPhaseLowPassFilter:
     """Zero-phase Butterworth low-pass filter of order 4 on an even clock, run forward and backward."""
 
     cutoff: float  # frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter
@@ -118,7 +118,7 @@ class NodeValueSmoother:
 
 
 @lru_cache(maxsize=16)
-def _weights(low_pass: LowPassFilter, step: float) -> Array:
+def _weights(low_pass: ZeroPhaseLowPassFilter, step: float) -> Array:
     """Filter weights of neighbouring samples, an odd number that sum to one."""
     response = low_pass._response(step)
     middle = len(response) // 2
@@ -127,9 +127,9 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def zero_phase_effort_filter(cutoff: float) -> LowPassFilter:
+def zero_phase_effort_filter(cutoff: float) -> ZeroPhaseLowPassFilter:
     """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
-    return LowPassFilter(cutoff, 2)
+    return ZeroPhaseLowPassFilter(cutoff, 2)
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class FirstOrderLag:
         total[:, :, :width] += self._by_time(value, followed)[:, :, None] * self.time_constant_sensitivity
         return followed, total
 
-    def lagged_node_values_gradients(self, value: Array, pull: Array) -> tuple[Array, Array]:
+    def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
         """Convert a cost's gradient by lagged node values to gradients by input and parameters (adjoint)."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)

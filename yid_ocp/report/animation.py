@@ -153,7 +153,7 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
     """Position and quaternion (x, y, z, w) of joints at configurations (F, n), as integers, one row per frame."""
     if not names:
         return []
-    (symbols, moved), index = system.symbolic_kinematics, system.mechanism.joint_index
+    (symbols, moved), index = system.symbols_and_kinematics, system.mechanism.joint_index
     parts = [ca.horzcat(moved.joint_rotations[index(name)], moved.joint_origins[index(name)]) for name in names]
     function = ca.Function("poses", [symbols, system.parameters.symbols], [ca.densify(ca.horzcat(*parts))])
     found = np.array(function.map(len(q))(q.T, np.tile(theta[:, None], (1, len(q)))))
@@ -186,7 +186,8 @@ class ConfigurationTrajectory:
 def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _AnimatedMotion:
     """Joints, tips and points of a system at configurations q (F, n), and the lines between them."""
     system, tree = told.system, told.system.mechanism
-    (symbols, kinematics), names, owned = system.symbolic_kinematics, tree.joint_names, _link_radii(system, told.theta)
+    (symbols, kinematics), names = system.symbols_and_kinematics, tree.joint_names
+    owned = _link_radii(system, told.theta)
     origins = list(kinematics.joint_origins)
     pairs = [(joint.parent_index, j, names[j] in owned) for j, joint in enumerate(tree.joints)]
     points: dict[str, int] = {}

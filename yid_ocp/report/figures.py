@@ -122,7 +122,7 @@ class TimePlotData:
     is_low_row: bool = False
 
 
-def prediction_and_residual_plot_data(
+def channel_prediction_and_residual_plot_data(
     title: str,
     unit: str,
     t: Array,

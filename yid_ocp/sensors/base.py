@@ -78,7 +78,7 @@ class SensorOptions:
 
 
 @dataclass(frozen=True)
-class RecordedChannelKind:
+class RecordedChannelSpec:
     """One kind of recorded quantity: its group, dataset, unit, components and sensor constants.
 
     Noise levels are stored in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std` or, for points, in the
@@ -102,11 +102,11 @@ class RecordedChannelKind:
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
-CHANNEL_KINDS: Registry[RecordedChannelKind] = Registry("recorded channel")
+CHANNEL_KINDS: Registry[RecordedChannelSpec] = Registry("recorded channel")
 """Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def additional_sensor_channel_kinds(group: str) -> tuple[RecordedChannelKind, ...]:
+def additional_channel_kinds_of_group(group: str) -> tuple[RecordedChannelSpec, ...]:
     """Channel kinds registered for a recording's group of this name; empty for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
@@ -217,7 +217,7 @@ class Sensor(ABC):
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
     """
 
-    channel: ClassVar[RecordedChannelKind]  # kind of recorded channels
+    channel: ClassVar[RecordedChannelSpec]  # kind of recorded channels
     group_name: str  # settings key: a point group, such as `points_camera`, or `joints.effort`
     # prediction without a model: zero, or the first measured value
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
@@ -272,7 +272,7 @@ class Sensor(ABC):
         """Symbolic error-free reading at a node, (outputs_per_channel * len(channel_names), 1)."""
 
 
-def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
+def sensor_function_with_jacobians(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
     """Build a CasADi function of a sensor's readings y, including effects on the sensor, and of their derivatives.
 
     It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), with the
@@ -283,7 +283,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     n = system.n_coordinates
     sizes = {"q": n, "v": n, "a": n, "z": len(rows), "load": n, "lam": system.n_constraints}
     at = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    (at["q"], kinematics), scale = system.symbolic_kinematics, system.recorded_time_scale
+    (at["q"], kinematics), scale = system.symbols_and_kinematics, system.recorded_time_scale
     true = (at["q"], at["v"] / scale, at["a"] / scale**2, at["z"], at["load"], at["lam"] / scale)
     state = NodeStateSymbols(system, kinematics, *true, rows, sensor.camera_pose)
     parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
@@ -305,7 +305,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
 
 
 class _SmoothingFilter(Protocol):
-    """A zero-phase low-pass filter, as in `problem.signal_filters.LowPassFilter`."""
+    """A zero-phase low-pass filter, as in `problem.signal_filters.ZeroPhaseLowPassFilter`."""
 
     @property
     def cutoff(self) -> float: ...

@@ -17,7 +17,7 @@ from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
-    RecordedChannelKind,
+    RecordedChannelSpec,
     RecordedJointsInterface,
     RecordedPointGroup,
     Sensor,
@@ -29,10 +29,10 @@ from yid_ocp.sensors.base import (
     recorded_joint_column_indices,
 )
 
-JOINT_EFFORT_GROUP_NAME = "joints.effort"
+JOINT_EFFORT_SENSOR_KEY = "joints.effort"
 JOINT_POSITION_GROUP_NAME = "joints.position"
-_EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(RecordedChannelKind("joints", "effort", "N m"))
-_POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(RecordedChannelKind("joints", "position", "rad"))
+_EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_SENSOR_KEY)(RecordedChannelSpec("joints", "effort", "N m"))
+_POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(RecordedChannelSpec("joints", "position", "rad"))
 _MAX_STEPS_PER_GAP = 0.1  # median gap between a quantized channel's values, in smallest gaps and per value
 NOISE_ESTIMATE_DIFFERENCE_ORDER = 6  # of differences: they remove motion slower than the sampling
 
@@ -73,7 +73,7 @@ class PrescribedJointEffortSensor(JointSensor):
 
     channel = _EFFORT
     naive_prediction = "zero"
-    group_name: str = JOINT_EFFORT_GROUP_NAME
+    group_name: str = JOINT_EFFORT_SENSOR_KEY
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
@@ -110,10 +110,10 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
     return [SensorData(PositionSensor(names), joints.t[later], value, std)]
 
 
-@SENSOR_READERS.register(JOINT_EFFORT_GROUP_NAME)
+@SENSOR_READERS.register(JOINT_EFFORT_SENSOR_KEY)
 def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     """Measured efforts of prescribed joints, low-pass filtered and thinned to independent samples."""
-    joints, choice = around.recording.joints, around.sensor_usage(JOINT_EFFORT_GROUP_NAME)
+    joints, choice = around.recording.joints, around.sensor_usage(JOINT_EFFORT_SENSOR_KEY)
     if joints is None or joints.effort is None or choice.use is False:
         return []
     names = tuple(name for name in around.system.prescribed if name in joints.names)
@@ -123,8 +123,8 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
         where = f"recording '{around.recording.name}': joints, attribute effort_std"
-        raise missing_noise_level_error("the joint efforts", where, JOINT_EFFORT_GROUP_NAME, "N m")
-    std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
+        raise missing_noise_level_error("the joint efforts", where, JOINT_EFFORT_SENSOR_KEY, "N m")
+    std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_SENSOR_KEY}.std")
     is_sample = joints.effort_sampling_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
     sensor = PrescribedJointEffortSensor(names)
@@ -229,14 +229,14 @@ joint_angle_noise_std = partial(_joint_noise_std, group=JOINT_POSITION_GROUP_NAM
 
 Unless the settings give the noise, the encoder's resolution adds the variance step^2/12. The step is the recording's
 `position_resolution` or, if not stated, is estimated from the gaps between values."""
-joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME)
+joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_SENSOR_KEY)
 """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
 
 
 def joint_torque_bias_std(joints: RecordedJointsInterface, names: Sequence[str], choice: SensorOptions) -> Array:
     """Standard deviation of the recorded torques' constant errors, (len(names),) [N m]. Zero if unknown."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
-    key = f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"
+    key = f"sensors.{JOINT_EFFORT_SENSOR_KEY}.bias_std"
     return expand_to_joint_values(0.0 if given is None else given, joints.names, names, key)
 
 

@@ -15,7 +15,7 @@ from yid_ocp.sensors.joints import JointSensor, filtered_effort_measurements
 
 _TORQUE_CONSTANT = "torque_constant"
 _CURRENT = base.CHANNEL_KINDS.register("motors.current")(
-    base.RecordedChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
+    base.RecordedChannelSpec("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
 )
 
 

@@ -126,7 +126,7 @@ def _with_encoder_noise(
     columns = [joints.names.index(name) for name in names]
     q = np.zeros((len(times), n))
     q[:, at] = np.stack([np.interp(times, joints.t, joints.position[:, column]) for column in columns], axis=1)
-    function = base.sensor_reading_function(system, sensor, ())
+    function = base.sensor_function_with_jacobians(system, sensor, ())
     symbols = [ca.SX.sym(name, function.size1_in(name)) for name in ("q", "theta")]
     slopes = function(q=symbols[0], theta=symbols[1])
     gains = around.path_filter.noise_gains_of_value_and_rates(float(np.median(np.diff(joints.t))))
@@ -144,10 +144,10 @@ def _with_encoder_noise(
 
 _XYZ = ("x", "y", "z")
 _ANGULAR_VELOCITY = base.CHANNEL_KINDS.register("imu.angular_velocity")(
-    base.RecordedChannelKind("imu", "angular_velocity", "rad/s", _XYZ)
+    base.RecordedChannelSpec("imu", "angular_velocity", "rad/s", _XYZ)
 )
 _SPECIFIC_FORCE = base.CHANNEL_KINDS.register("imu.specific_force")(
-    base.RecordedChannelKind("imu", "specific_force", "m/s^2", _XYZ)
+    base.RecordedChannelSpec("imu", "specific_force", "m/s^2", _XYZ)
 )
 
 

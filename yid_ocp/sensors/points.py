@@ -15,7 +15,7 @@ from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
-_POINTS = base.CHANNEL_KINDS.register("points")(base.RecordedChannelKind("points", "position", "m", ("x", "y", "z")))
+_POINTS = base.CHANNEL_KINDS.register("points")(base.RecordedChannelSpec("points", "position", "m", ("x", "y", "z")))
 
 
 @dataclass(frozen=True)

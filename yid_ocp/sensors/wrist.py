@@ -17,12 +17,12 @@ import casadi as ca
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.mechanism import Inertia, Placement
 from yid_ocp.model.system import MidpointStateSymbols, NodeStateSymbols, System, six_joint_floating_mechanism
-from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelKind
+from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelSpec
 from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
 _XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
-_FORCE = CHANNEL_KINDS.register("wrist.force")(RecordedChannelKind("wrist", "force", "N", _XYZ, _SIGN))
-_TORQUE = CHANNEL_KINDS.register("wrist.torque")(RecordedChannelKind("wrist", "torque", "N m", _XYZ, _SIGN))
+_FORCE = CHANNEL_KINDS.register("wrist.force")(RecordedChannelSpec("wrist", "force", "N", _XYZ, _SIGN))
+_TORQUE = CHANNEL_KINDS.register("wrist.torque")(RecordedChannelSpec("wrist", "torque", "N m", _XYZ, _SIGN))
 _N_LOCKED_JOINTS = 6
 
 

@@ -155,7 +155,7 @@ class Solution(ReprMixin):
         if found.ok:
             return found.episode_predictions
         predict, pairs = problem.predictor.predict_episode, enumerate(problem.episodes)
-        parts = problem.unpack_unknown_vector
+        parts = problem.unpack_episode_unknowns
         return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:

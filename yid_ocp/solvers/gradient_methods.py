@@ -16,7 +16,7 @@ from yid_ocp.inference.linearized_residual import (
     achievable_cost_reduction,
     bounded_levenberg_marquardt_step,
     is_stationary_point,
-    predicted_cost_reduction,
+    predicted_cost_reduction_by_step,
     projected_gradient_norm,
 )
 from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, unknowns_covariance_and_reduced_chi2
@@ -112,7 +112,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
             scaled, mu = _step_within_length(jacobian * size, residual, mu, low, (upper - x) / size, longest)
             step = size * scaled
-            promised = predicted_cost_reduction(jacobian, residual, step)
+            promised = predicted_cost_reduction_by_step(jacobian, residual, step)
             # damping makes any step promise little
             if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary_point(problem, x, now):
                 return ended(base.Status.CONVERGED, _LOWEST)

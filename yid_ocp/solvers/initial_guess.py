@@ -12,14 +12,14 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction_by_step
 from yid_ocp.inference.uncertainty import unknowns_covariance_and_reduced_chi2
 from yid_ocp.integrator.step import generalized_momentum_from_velocity, simulate
 from yid_ocp.integrator.tracking_feedback import lqr_tracking_feedback
 from yid_ocp.problem.episodes import Episode, InitialStateWithSensitivity
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 
 log = logging.getLogger(__name__)
 
@@ -69,9 +69,9 @@ def guess_unknowns_and_node_states(
         moved = np.where(problem.positive_unknowns_mask, np.clip(factor * x, lower, upper), x)
         begins, states, multipliers, total = [], [], [], 0.0
         for i, episode in enumerate(problem.episodes):
-            shared, _ = problem.unpack_unknown_vector(moved, i)
+            shared, _ = problem.unpack_episode_unknowns(moved, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
-            begins.append(problem.initial_state_of_episode(episode, theta))
+            begins.append(problem.initial_state_and_derivative(episode, theta))
             found: list[tuple[Array, Array]] = []
             if not begins[-1].failure_message:
                 found += _tracked(problem, episode, nodes[i], theta, begins[-1].state)
@@ -93,7 +93,7 @@ def guess_unknowns_and_node_states(
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
     """Mean square whitened residual, without effort channels, of a trajectory (N + 1, nx) of recording `i`."""
-    shared, _ = problem.unpack_unknown_vector(x, i)
+    shared, _ = problem.unpack_episode_unknowns(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameter_names)))
     parts = [np.zeros(1)]
@@ -110,7 +110,8 @@ def _tracked(
     """Node states and multipliers of the rollout with the tracking filter; empty if it fails."""
     feedback = episode.tracking_feedback
     if feedback is None and problem.system.driven and not problem.system.servos:
-        smooth = LowPassFilter(problem.options.path_cutoff)(episode.grid.node_times, episode.measured_driven_angles)
+        low_pass = ZeroPhaseLowPassFilter(problem.options.path_cutoff)
+        smooth = low_pass(episode.grid.node_times, episode.measured_driven_angles)
         arms = problem.model_functions.arms_only_integrator_step
         feedback = lqr_tracking_feedback(problem.step, smooth, episode.torque, theta, arms=arms)
     inputs = episode.grid.steps, episode.torque, episode.prescribed_path, feedback
@@ -219,7 +220,7 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
     low[others], high[others] = np.maximum(low[others], -1.0), np.minimum(high[others], 1.0)
     scaled = found.jacobian * size
     step = bounded_levenberg_marquardt_step(scaled, found.residual, 1e-10, low, high)
-    return step[amplitudes] * size[amplitudes], predicted_cost_reduction(scaled, found.residual, step)
+    return step[amplitudes] * size[amplitudes], predicted_cost_reduction_by_step(scaled, found.residual, step)
 
 
 def starts_toward_other_minima(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:

@@ -15,7 +15,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
-    predicted_cost_reduction,
+    predicted_cost_reduction_by_step,
     projected_gradient_norm,
 )
 from yid_ocp.integrator.step import simulate
@@ -196,7 +196,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             closed = now.residual + now.by_defect
             bounds = _step_bounds(problem, x, size)
             step = size * bounded_levenberg_marquardt_step(now.jacobian * size, closed, mu, *bounds)
-            promised = predicted_cost_reduction(now.jacobian, closed, step)
+            promised = predicted_cost_reduction_by_step(now.jacobian, closed, step)
             moved = float(np.max(np.abs(step) / size, initial=0.0))
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
             if moved < self.step_tolerance or flat:
@@ -358,8 +358,8 @@ class _ShootingIntervals:
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are searched near those of the problem's initial values, at any point
         x = problem.initial_unknowns
-        thetas = (problem.unpack_unknown_vector(x, i)[0] for i in range(len(problem.episodes)))
-        starts = map(problem.initial_state_of_episode, problem.episodes, thetas)
+        thetas = (problem.unpack_episode_unknowns(x, i)[0] for i in range(len(problem.episodes)))
+        starts = map(problem.initial_state_and_derivative, problem.episodes, thetas)
         found = [None if start.failure_message else start.equilibrium for start in starts]
         n = problem.step.sizes["n"]
         self.equilibrium_guesses = tuple(None if rest is None else rest.state[:n] for rest in found)
@@ -374,7 +374,7 @@ class _ShootingIntervals:
         return x, list(found.node_states)
 
     def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        shared, _ = self.problem.unpack_unknown_vector(x, i)
+        shared, _ = self.problem.unpack_episode_unknowns(x, i)
         theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], shared)
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
@@ -391,9 +391,9 @@ class _ShootingIntervals:
         problem = self.problem
         cost, defect, residuals, jacobians, changes, slopes = 0.0, 0.0, [], [], [], []
         for i, episode in enumerate(problem.episodes):
-            theta, offset = problem.unpack_unknown_vector(x, i)
+            theta, offset = problem.unpack_episode_unknowns(x, i)
             theta = problem.predictor.theta_with_episode_values(episode, theta)
-            start = problem.initial_state_of_episode(episode, theta, offset, self.equilibrium_guesses[i])
+            start = problem.initial_state_and_derivative(episode, theta, offset, self.equilibrium_guesses[i])
             condensed = start.failure_message or self._condensed(i, theta, start, nodes[i])
             if isinstance(condensed, str):
                 return condensed

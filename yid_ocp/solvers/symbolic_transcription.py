@@ -26,15 +26,15 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.discrete import NlpStepConstraints, nlp_step_constraints
-from yid_ocp.integrator.statics import driven_joint_hold_stiffness
+from yid_ocp.integrator.discrete import NlpStepConstraints, one_step_nlp_constraints
+from yid_ocp.integrator.statics import measured_joint_angle_hold_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episode_prediction import sensor_not_predictable_at_nodes_error
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import SOFT_LOGARITHM_MIN_RATIO
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.sensors import Sensor, sensor_reading_function
+from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 from yid_ocp.solvers.initial_guess import (
     UnknownsAndNodeStateGuess,
     guess_unknowns_and_node_states,
@@ -114,8 +114,8 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
         if rows:
             blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
             first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
-            theta, _ = problem.unpack_unknown_vector(x, i)
-            begin = problem.initial_state_of_episode(episode, theta, guess=first[: problem.step.sizes["n"]])
+            theta, _ = problem.unpack_episode_unknowns(x, i)
+            begin = problem.initial_state_and_derivative(episode, theta, guess=first[: problem.step.sizes["n"]])
             x[columns[own:]] = (first - begin.state)[rows]
     return x
 
@@ -229,7 +229,7 @@ class _Maker:
         for k, name in enumerate(self._names):
             theta[system.parameters.index(name)] = free[k]
         self._freed = _FreeParameterSymbols(self._names, free, fixed, theta)
-        self._stage = nlp_step_constraints(self._step.equations, self._step.time_step)
+        self._stage = one_step_nlp_constraints(self._step.equations, self._step.time_step)
         self._stages: dict[tuple[bool, bool], _DrivenStage] = {}
         self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalVariableFunction, bool]] = {}
 
@@ -273,7 +273,7 @@ class _Maker:
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
-        shared, _ = problem.unpack_unknown_vector(found.x, i)
+        shared, _ = problem.unpack_episode_unknowns(found.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, shared)
         rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (known := begin.equilibrium) is not None:
@@ -371,7 +371,7 @@ class _Maker:
             statics = problem.model_functions.equilibrium_solver
             rest = statics.symbolic_equations
             sought, held = rest.inputs[0], rest.inputs[2]
-            stiffness = driven_joint_hold_stiffness(problem.system, bool(problem.system.driven))
+            stiffness = measured_joint_angle_hold_stiffness(problem.system, bool(problem.system.driven))
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()
@@ -438,7 +438,7 @@ class _Maker:
         """Reading of a sensor at a node, and whether it depends on efforts, and so on the next step."""
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
-            function = sensor_reading_function(self._problem.system, sensor, self._names)
+            function = sensor_function_with_jacobians(self._problem.system, sensor, self._names)
             if any(function.size2_out(name) for name in ("by_v", "by_a", "by_lam")):
                 raise sensor_not_predictable_at_nodes_error(sensor.group_name)
             loaded = function.nnz_out("by_load") > 0

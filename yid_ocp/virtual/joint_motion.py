@@ -29,7 +29,7 @@ _SECOND_HARMONIC = 0.35  # amplitude relative to the first harmonic
 _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
 
-class JointMotion(Protocol):
+class JointOffsetMotion(Protocol):
     """Interface of a motion of the driven joints about their initial angles, from standstill."""
 
     @property

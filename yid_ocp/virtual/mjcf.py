@@ -43,7 +43,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
 @functools.cache
-def model_aspect_table() -> Mapping[str, Mapping[str, str]]:
+def format_elements_by_model_aspect() -> Mapping[str, Mapping[str, str]]:
     """Aspects of a model that an engine may or may not represent: a description (`is`) and elements of each format."""
     return dict(YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml")))
 
@@ -85,7 +85,7 @@ class ExpressionEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Find the model aspects (keys of `model_aspect_table`) whose expressions depend on `symbols`."""
+    """Find the model aspects (keys of `format_elements_by_model_aspect`) whose expressions depend on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -435,14 +435,14 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
 
 
 def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: bool) -> None:
-    native = model_aspect_table().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
+    native = format_elements_by_model_aspect().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
     able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
     for effect in system.effects:
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
         if aspects:
-            changed = model_aspect_table()[min(aspects)]["is"]
+            changed = format_elements_by_model_aspect()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            allowed = ", ".join(own["is"] for name, own in model_aspect_table().items() if name in able)
+            allowed = ", ".join(own["is"] for name, own in format_elements_by_model_aspect().items() if name in able)
             where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:

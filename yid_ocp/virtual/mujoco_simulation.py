@@ -23,7 +23,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortSamplingKind
-from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
+from yid_ocp.virtual.joint_motion import JointOffsetMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf_text, mujoco_xml
 
 DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
@@ -124,7 +124,7 @@ class SimulationResult:
 def simulate_in_mujoco(
     system: System,
     values: Mapping[str, float] | None,
-    motion: JointMotion,
+    motion: JointOffsetMotion,
     simulation: SimulationOptions | None = None,
     *,
     initial_joint_angles: Mapping[str, float] | None = None,
@@ -139,7 +139,7 @@ def simulate_in_mujoco(
 
     Parameters
     ----------
-    motion : JointMotion
+    motion : JointOffsetMotion
         Motion of exactly the driven joints.
     initial_joint_angles : mapping of str to float, optional
         Initial angles [rad or m]. Default: `grasping_joint_angles`.
@@ -169,7 +169,7 @@ def simulate_in_mujoco(
             controller = _ServoCommander(scene, motion)
             _settle_under_servo_commands(scene, nominal_damping, controller.initial_command)
         else:
-            controller = TrackingController(scene, motion, settled_holding_torques(scene, nominal_damping))
+            controller = TrackingController(scene, motion, settle_and_return_holding_torques(scene, nominal_damping))
         if injected is not None:
             injected.begin_motion(scene.data)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
@@ -216,7 +216,7 @@ def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | 
         mujoco.set_mjcb_passive(None)
 
 
-def settled_holding_torques(scene: MujocoModelAndState, damping: Array) -> Array:
+def settle_and_return_holding_torques(scene: MujocoModelAndState, damping: Array) -> Array:
     """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
 
     `damping` replaces the joint damping while the scene settles, because it can decide which of several equilibria is
@@ -258,7 +258,7 @@ class TrackingController:
     Before the motion the scene is at equilibrium, held by the torques `balance` (nu,) [N m].
     """
 
-    def __init__(self, scene: MujocoModelAndState, motion: JointMotion, balance: Array) -> None:
+    def __init__(self, scene: MujocoModelAndState, motion: JointOffsetMotion, balance: Array) -> None:
         self._scene, self._motion = scene, motion
         self._free = copy.copy(scene.model)
         self._free.opt.disableflags |= int(scene.mujoco.mjtDisableBit.mjDSBL_EQUALITY)
@@ -267,7 +267,7 @@ class TrackingController:
         zero = np.zeros(len(scene.moved_joint_ids))
         self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
 
-    def apply_input_to_scene(self, t: float) -> Array:
+    def apply_and_return_input(self, t: float) -> Array:
         """Apply and return the torques (nu,) [N m] at time t [s], computed from the scene's present state."""
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
@@ -289,11 +289,11 @@ class TrackingController:
 class _ServoCommander:
     """Controller that commands position servos along a motion about the scene's present joint angles."""
 
-    def __init__(self, scene: MujocoModelAndState, motion: JointMotion) -> None:
+    def __init__(self, scene: MujocoModelAndState, motion: JointOffsetMotion) -> None:
         self._scene, self._motion = scene, motion
         self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
 
-    def apply_input_to_scene(self, t: float) -> Array:
+    def apply_and_return_input(self, t: float) -> Array:
         commands = np.asarray(self.initial_command + self._motion.offset_and_derivatives(t)[0])
         self._scene.data.ctrl[:] = commands
         return commands
@@ -364,7 +364,7 @@ def _play(
     for tick, done in enumerate(ticks.tolist()):
         end = done if tick == len(ticks) - 1 else int(ticks[tick + 1])
         mujoco.mj_kinematics(model, data)
-        torques.append(controller.apply_input_to_scene(done / steps_per_second))
+        torques.append(controller.apply_and_return_input(done / steps_per_second))
         if tick % periods == 0:
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])
@@ -448,14 +448,14 @@ def replay_mismatch_by_channel(
         assert joints.position_command is not None
         commanded = _commanded(scene, system, t, joints.position_command[:, columns])
         return _errors(system, recording, joints, columns, commanded)
-    balance = settled_holding_torques(scene, np.array(model.dof_damping))
+    balance = settle_and_return_holding_torques(scene, np.array(model.dof_damping))
     noisy = joints.position_std is None or bool(np.any(np.asarray(joints.position_std) > 0))
     path = _Path(moved, t, position, _SMOOTHING_SAMPLES if noisy else 0.0)
     if system.driven:
         return _errors(system, recording, joints, columns, _driven(scene, path, t, effort))
     controller = TrackingController(scene, path, balance)
     scene.data.qvel[scene.moved_joint_ids] = path.offset_and_derivatives(0.0)[1]  # a recording may begin in motion
-    played = _played(scene, t[-1], lambda k, now: controller.apply_input_to_scene(now))
+    played = _played(scene, t[-1], lambda k, now: controller.apply_and_return_input(now))
     return _errors(system, recording, joints, columns, played)
 
 

@@ -28,13 +28,13 @@ from yid_ocp.vision.camera_registration import (
     ROTATION_SLICE,
     TRANSLATION_SLICE,
     ArmSurface,
-    CalibrationState,
+    CameraState,
     RobustCostDerivatives,
     StampedCloud,
     SurfaceObservationFractions,
     candidate_calibration_states,
     robust_gradient_and_hessian,
-    seen_occluded_and_missing_surface_fractions,
+    seen_occluded_and_seen_through_surface_fractions,
 )
 from yid_ocp.vision.point_cloud import MAD_TO_STD, weighted_median
 
@@ -85,7 +85,7 @@ class _StampDelay(NamedTuple):
 
 
 def stamp_delay_beyond_clock_offset(
-    arm: ArmSurface, state: CalibrationState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
+    arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Estimate the delay [s] of a frame's time stamp beyond the common clock offset. None if the arm is not in view.
 
@@ -189,10 +189,10 @@ class ArmBasedCameraCalibrationOptions:
 class CameraCalibration:
     """Result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
 
-    camera_state: CalibrationState  # used pose, depth and clock
-    prior_state: CalibrationState
+    camera_state: CameraState  # used pose, depth and clock
+    prior_state: CameraState
     usual_square_distance: float | None  # misfit of single frames [m^2]; None if no clock was compared
-    # (10, 10), of `camera_state`, in the order of `CalibrationState.difference_from`; zero if nothing was estimated
+    # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero if nothing was estimated
     state_covariance: Array
     estimate_minus_used: Array  # (10,), estimate minus used state, if the pose is fixed
     arm_visibility: SurfaceObservationFractions | None  # visibility of the arm at the calibrated state
@@ -225,7 +225,7 @@ def calibration_without_estimation(pose: Array, options: CameraClockOptions, rea
     """Make a calibration from the given pose and clock offset, without estimation. `reason` says why."""
     offset = options.initial_stamp_minus_joint_time
     text = f"clock offset {1e3 * offset:.0f} ms as given" + (f": {reason}" if reason else "")
-    state = CalibrationState(pose, clock_offset=offset)
+    state = CameraState(pose, clock_offset=offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
 
@@ -246,7 +246,7 @@ def calibrate_camera(
     does not match the clouds, or moves too little to determine the clock.
     """
     about = float(np.mean([g.stamp for g in frames])) if frames else 0.0
-    told = CalibrationState(pose, clock_offset=clock.initial_stamp_minus_joint_time, clock_reference_stamp=about)
+    told = CameraState(pose, clock_offset=clock.initial_stamp_minus_joint_time, clock_reference_stamp=about)
     try:
         return _Calibrator(arm, told, rng, options, clock).run(frames)
     except _UntoldError as reason:
@@ -271,7 +271,7 @@ class _Calibrator:
     """Data of one call of `calibrate_camera`."""
 
     arm: ArmSurface
-    told: CalibrationState
+    told: CameraState
     rng: np.random.Generator
     options: ArmBasedCameraCalibrationOptions
     clock: CameraClockOptions
@@ -302,7 +302,7 @@ class _Calibrator:
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = seen_occluded_and_missing_surface_fractions(self.arm, chosen, state, _RAY_REACH)
+        presence = seen_occluded_and_seen_through_surface_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= _MIN_ARM_COVERAGE * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
@@ -333,7 +333,7 @@ class _Calibrator:
         kept = points[((at > low) & (at < high)).all(axis=1)]
         return StampedCloud(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
-    def _start(self, glimpses: Sequence[StampedCloud]) -> CalibrationState:
+    def _start(self, glimpses: Sequence[StampedCloud]) -> CameraState:
         """The state at which most of the arm's surface coincides with measured points."""
         few = []
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
@@ -347,7 +347,7 @@ class _Calibrator:
         for trial in tried:
             for reach in _STAGE_REACHES:
                 trial = self._rounds(trial, few, reach, False, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
-            presence = seen_occluded_and_missing_surface_fractions(self.arm, few, trial, 0.5 * _RAY_REACH)
+            presence = seen_occluded_and_seen_through_surface_fractions(self.arm, few, trial, 0.5 * _RAY_REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
             if most > _GOOD_START_FRACTION:
@@ -355,8 +355,8 @@ class _Calibrator:
         return best
 
     def _rounds(
-        self, state: CalibrationState, frames: list[StampedCloud], reach: float, along: bool, cap: int, rounds: int
-    ) -> tuple[CalibrationState, Callable[[CalibrationState], RobustCostDerivatives], list[StampedCloud]]:
+        self, state: CameraState, frames: list[StampedCloud], reach: float, along: bool, cap: int, rounds: int
+    ) -> tuple[CameraState, Callable[[CameraState], RobustCostDerivatives], list[StampedCloud]]:
         """The state after some steps on a limited number of points per frame, the cost of states, and these points."""
         chosen = []
         for glimpse in frames:
@@ -371,7 +371,7 @@ class _Calibrator:
             hint = "check the specified pose and the unit of the clouds"
             raise _UntoldError("what the camera sees does not lie on it", hint)
 
-        def cost(state: CalibrationState) -> RobustCostDerivatives:
+        def cost(state: CameraState) -> RobustCostDerivatives:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
             return robust_gradient_and_hessian(rows, reach)
 
@@ -384,7 +384,7 @@ class _Calibrator:
                 break
         return state, cost, chosen
 
-    def _message(self, state: CalibrationState, covariance: Array, stamp: float) -> str:
+    def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
         stds = np.sqrt(np.diag(covariance))
         known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms (stamp minus joint time)"
         searched = self.clock.search_half_width > 0

@@ -41,7 +41,7 @@ from yid_ocp.vision.surface_meshes import ArticulatedSurfaces
 
 ROTATION_SLICE, TRANSLATION_SLICE = slice(0, 3), slice(3, 6)
 DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = 6, 7, 8, 9
-"""Positions of the parts of a `CalibrationState` change in its vector."""
+"""Positions of the parts of a `CameraState` change in its vector."""
 CAMERA_STATE_SIZE, MIN_ARM_POINTS_PER_FRAME = 10, 40
 
 # through which the robot's visible surface is sampled
@@ -62,7 +62,7 @@ _MIN_CURVATURE_FRACTION = 0.2  # lower bound of the robust sum's curvature, rela
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationState:
+class CameraState:
     """Estimated camera state: pose, depth scale and offset, clock offset and drift."""
 
     pose: Array  # (4, 4), camera in the world, R and t
@@ -103,7 +103,7 @@ class CalibrationState:
         result[:, :, DEPTH_OFFSET_INDEX] = away / ahead[:, None]
         return result
 
-    def with_state_increment(self, change: Array) -> CalibrationState:
+    def with_state_increment(self, change: Array) -> CameraState:
         """Camera state after a change of rotation (world axes), translation, log depth scale, depth and clock."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
@@ -111,9 +111,9 @@ class CalibrationState:
         scale, offset, clock, drift = map(float, change[DEPTH_SCALE_INDEX:])
         depth = self.depth_scale * math.exp(scale), self.depth_offset + offset
         clocks = self.clock_offset + clock, self.clock_drift + drift, self.clock_reference_stamp
-        return CalibrationState(pose, *depth, *clocks)
+        return CameraState(pose, *depth, *clocks)
 
-    def difference_from(self, other: CalibrationState) -> Array:
+    def difference_from(self, other: CameraState) -> Array:
         """Difference (10,) of this state from another one."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
@@ -158,7 +158,7 @@ class ArmSurface:
     def _part_poses_at_time(self, t: float) -> Array:
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
-    def visible_surface_points_and_parts(self, state: CalibrationState, stamp: float) -> tuple[Array, IntArray]:
+    def visible_surface_points_and_parts(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
         """World points on moving surfaces that an unobstructed camera sees, and the surface part of each point."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
@@ -187,7 +187,7 @@ class ArmSurface:
                 error = (distance - 1.0) * square  # n . (P - (origin + d (P - origin)))
             kept = (square > _MIN_INCIDENCE_COSINE * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
         else:
-            error, normal, part = self.robot_surfaces.nearest_moving_surface(points, q, reach)
+            error, normal, part = self.robot_surfaces.distance_to_moving_surface(points, q, reach)
             kept = np.ones(len(points), bool)
         chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
         behind, now, later = (
@@ -200,7 +200,7 @@ class ArmSurface:
         return _SurfaceMatches(chosen, error[chosen], normal[chosen], rate, part[chosen], local)
 
     def linearized_surface_distances(
-        self, state: CalibrationState, frame: StampedCloud, reach: float, along: bool
+        self, state: CameraState, frame: StampedCloud, reach: float, along: bool
     ) -> _CalibrationEquations:
         """Distances [m] of points within `reach` of the arm, linearised in the camera state; `along`: camera rays."""
         points, t = state.measured_to_world_points(frame.points), float(state.stamps_to_joint_clock(frame.stamp))
@@ -283,8 +283,8 @@ def _at_least(least: Array, matrix: Array) -> Array:
 
 
 def candidate_calibration_states(
-    arm: ArmSurface, frames: Sequence[StampedCloud], specified: CalibrationState, search: float, count: int
-) -> list[CalibrationState]:
+    arm: ArmSurface, frames: Sequence[StampedCloud], specified: CameraState, search: float, count: int
+) -> list[CameraState]:
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
     Returns at most `count` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets are within `search` [s]
@@ -297,7 +297,7 @@ def candidate_calibration_states(
     total = np.zeros((len(delays), len(cells)))
     for glimpse in frames:
         _add_costs(total, arm, specified, glimpse, delays, cells)
-    result: list[CalibrationState] = []
+    result: list[CameraState] = []
     for index in np.argsort(total, axis=None):
         delay, cell = np.unravel_index(index, total.shape)
         change = np.zeros(CAMERA_STATE_SIZE)
@@ -315,7 +315,7 @@ def candidate_calibration_states(
 
 
 def _add_costs(
-    total: Array, arm: ArmSurface, told: CalibrationState, glimpse: StampedCloud, delays: Array, cells: IntArray
+    total: Array, arm: ArmSurface, told: CameraState, glimpse: StampedCloud, delays: Array, cells: IntArray
 ) -> None:
     """Add the costs of the arm's points, `delays` [s] earlier and shifted by cells, to `total` (delays, cells)."""
     from scipy.ndimage import distance_transform_edt  # slow to import; only needed to search for the camera's pose
@@ -367,8 +367,8 @@ class SurfaceObservationFractions:
     samples: int
 
 
-def seen_occluded_and_missing_surface_fractions(
-    arm: ArmSurface, frames: Sequence[StampedCloud], state: CalibrationState, within: float
+def seen_occluded_and_seen_through_surface_fractions(
+    arm: ArmSurface, frames: Sequence[StampedCloud], state: CameraState, within: float
 ) -> SurfaceObservationFractions:
     """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
     counts = np.zeros(4)

@@ -38,7 +38,7 @@ from yid_ocp.vision.shape_evidence import (
     tube_link_projections,
 )
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd, ShapeGuessFinder
-from yid_ocp.vision.surface_meshes import link_lengths_and_radius_by_segment
+from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segment
 
 _Left = tuple[BoolArray, BoolArray]
 """Masks of the nodes and points of a frame that are used."""
@@ -134,7 +134,7 @@ class ShapeFitter:
         n_loose = len(self.free_joints) - len(self.bend_joints)
         self._prior = np.concatenate([held_by, np.full(n_loose, _WEAK_REGULARISATION)])
 
-        sizes = link_lengths_and_radius_by_segment(system, values)
+        sizes = model_link_lengths_and_radius_by_segment(system, values)
         self.link_radii = np.concatenate([np.full(len(lengths), radius) for lengths, radius in sizes.values()])
         self.link_segments = tuple(name for name, (lengths, _) in sizes.items() for _ in lengths)
         q = ca.SX.sym("q", system.n_coordinates)
@@ -395,7 +395,7 @@ class ShapeFitter:
             hessian[:] += weighted.T @ rows
 
         if task is not None:
-            depths = shape_evidence.surface_depth_residuals(corners, self.link_radii, task.points, task.camera)
+            depths = shape_evidence.surface_distances_along_sight(corners, self.link_radii, task.points, task.camera)
             weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
             segment = np.array([names.index(owner) for owner in self.link_segments])
             for k in range(len(self.link_radii)):
@@ -461,7 +461,7 @@ def _symbolic_functions(system: System, options: ShapeFitOptions, free_joints: S
     derivatives by the free joints as a second output. `gap` of the grasps, `holders` and places `taken` by them.
     `grown`: derivatives of the first three by the logarithm of each tube's length.
     """
-    symbols, tree, (q, kinematics) = system.parameters.symbols, system.mechanism, system.symbolic_kinematics
+    symbols, tree, (q, kinematics) = system.parameters.symbols, system.mechanism, system.symbols_and_kinematics
     corners = []
     for segment in system.segment_layouts:
         for i, names in enumerate(segment.link_joints):

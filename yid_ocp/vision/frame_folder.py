@@ -222,7 +222,7 @@ def read_frame_folder(
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
     camera = frames.validated_camera_pose(head.get("pose") if pose is None else pose, where)
-    scale = metres_per_unit(str(unit or head.get("unit", "m")), where)
+    scale = metres_per_named_unit(str(unit or head.get("unit", "m")), where)
     frame = head.get("frame", "camera")
     if frame not in ("camera", "world"):
         said = unknown_name_error_arguments(str(frame), ("camera", "world"))
@@ -269,7 +269,7 @@ def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike
         writer.writerows([name, repr(float(t))] for name, t in zip(names, sequence.stamps, strict=True))
 
 
-def metres_per_unit(unit: str, where: str) -> float:
+def metres_per_named_unit(unit: str, where: str) -> float:
     """Length of a cloud's unit in metres [m]. Raises `DataError` for an unknown unit."""
     if unit not in _METRES_PER_UNIT:
         raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_error_arguments(unit, _METRES_PER_UNIT))

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, time_since_first_message_function
 from yid_ocp.errors import DataError
-from yid_ocp.vision.frame_folder import STAMP_FILE, metres_per_unit, read_frame_folder
+from yid_ocp.vision.frame_folder import STAMP_FILE, metres_per_named_unit, read_frame_folder
 from yid_ocp.vision.frames import CameraIntrinsics, FrameSequence, PointColourArray, validated_camera_pose
 
 _CLOUD_MESSAGE, _IMAGE_MESSAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
@@ -35,7 +35,7 @@ _PER_METRE = "/option/Depth_Units/value"  # topic of RealSense's files with the 
 def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str | None) -> FrameSequence:
     """Open the frames in a bag."""
     camera = validated_camera_pose(pose, str(path))
-    bag, scale = OpenBag(path), metres_per_unit(unit, str(path))
+    bag, scale = OpenBag(path), metres_per_named_unit(unit, str(path))
     name = _topic(bag, topic)
     messages, stamps = _frames(bag, name)
     if not messages:

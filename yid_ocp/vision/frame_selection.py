@@ -20,7 +20,7 @@ from yid_ocp.vision.fit import ShapeFitOptions, ShapeFitter
 from yid_ocp.vision.point_cloud import CloudFilterOptions, SkeletonOptions, XyzTuple
 from yid_ocp.vision.sequence_calibration import (
     ForeignObject,
-    SharedFrameEstimates,
+    SequenceEstimates,
     TubeDimensionEstimates,
     TubeDimensionKind,
 )
@@ -127,7 +127,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     return None
 
 
-def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
+def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
     """Mark frames that deviate from the other good frames as dropped. Returns all frames."""
     fits = _good_fits(frames)
     if not fits:
@@ -152,10 +152,10 @@ def _good_fits(frames: Sequence[FrameReport]) -> dict[int, FrameShapeFit]:
     return {k: frame.shape_fit for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None}
 
 
-def states_and_points_of_good_frames(
+def good_frame_configurations_and_points(
     frames: Sequence[FrameReport],
     columns: Sequence[int],
-    common: SharedFrameEstimates,
+    common: SequenceEstimates,
     foreign_objects: Sequence[ForeignObject],
     options: TrackOptions,
     source: str,

@@ -19,7 +19,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
-from yid_ocp.vision.surface_meshes import link_lengths_and_radius_by_segment
+from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segment
 
 XyzTuple = tuple[float, float, float]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
@@ -103,7 +103,7 @@ class ReachableObjectRegion:
         *,
         anywhere: bool = False,
     ) -> None:
-        tree, sizes = system.numeric_mechanism(values), link_lengths_and_radius_by_segment(system, values)
+        tree, sizes = system.numeric_mechanism(values), model_link_lengths_and_radius_by_segment(system, values)
         reach = {"": 0.0}
         for segment in system.segment_layouts:
             reach[segment.name] = float(sizes[segment.name][0].sum()) + reach[segment.parent_segment or ""]
@@ -220,7 +220,7 @@ def weighted_median(values: Array, weight: Array) -> float:
 class SkeletonOptions:
     """Settings of the skeleton extraction."""
 
-    points_per_segment: Annotated[int, Ge(2), OptionInfo("points per segment, k1 in Caldwell et al.")] = 50
+    max_cloud_points_per_node: Annotated[int, Ge(2), OptionInfo("points per segment, k1 in Caldwell et al.")] = 50
     neighbour_radius: Annotated[
         PositiveFloat,
         OptionInfo("largest distance of neighbours; somewhat more than the thickest tube's diameter", "m"),
@@ -273,8 +273,8 @@ def _thin_to_nodes(
 def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
     """The nearest points of a centre within the radius, at most as many as a segment has."""
     square, within = _square_distances(points, centre), options.neighbour_radius**2
-    if len(square) > options.points_per_segment:
-        found = np.argpartition(square, options.points_per_segment - 1)[: options.points_per_segment]
+    if len(square) > options.max_cloud_points_per_node:
+        found = np.argpartition(square, options.max_cloud_points_per_node - 1)[: options.max_cloud_points_per_node]
         return np.asarray(found[square[found] <= within])
     return np.flatnonzero(square <= within)
 

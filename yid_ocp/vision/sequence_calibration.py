@@ -26,7 +26,7 @@ from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import MAD_TO_STD
 from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, tube_link_projections
-from yid_ocp.vision.surface_meshes import link_lengths_and_radius_by_segment
+from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segment
 
 _BACKGROUND_NOISE_STDS = 3.0  # stds of a point within which it belongs to the background
 # fraction of the frames in which what stands still must be seen: arm and object hide it from time to time
@@ -133,7 +133,7 @@ def foreign_objects_from_clusters(
         text += f"in {len(group)} of {len(clusters)} frames: "
         boxed = "leave it out with track.options.filters.box_lower and box_upper"
         if link:
-            text += f"give its shape under model.bodies_missing_from_urdf with parent_frame: {link}"
+            text += f"give its shape under model.surfaces_missing_from_urdf with parent_frame: {link}"
         elif moving:
             text += boxed if beside else "take it out of view"
             text += ", or give the object's colour under track.options.filters.object_colours" if coloured else ""
@@ -260,7 +260,7 @@ def estimate_and_check_dimensions(
     `std` holds the standard deviations [m] of a point's distance from the surface and of the position error shared by
     all frames. `fitted` fits the frames, given parameter values and the configurations of the previous round.
     """
-    sizes = link_lengths_and_radius_by_segment(system, given).values()
+    sizes = model_link_lengths_and_radius_by_segment(system, given).values()
     told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
     count, many = len(told), len(told) // 2
     names = tuple(f"{s.name}.{kind}" for kind in _DIMENSION_KINDS for s in system.segment_layouts)
@@ -315,7 +315,7 @@ def _changed(system: System, given: Mapping[str, float] | None, change: Array) -
 
 
 @dataclass(frozen=True, eq=False)
-class SharedFrameEstimates:
+class SequenceEstimates:
     """Estimates shared by all frames of a sequence: camera calibration, tube dimensions and background."""
 
     camera_calibration: CameraCalibration  # the camera's pose, how it scales depth, and its clock

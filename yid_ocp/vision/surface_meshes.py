@@ -71,7 +71,7 @@ class SceneDescription:
     system: System
     robot_urdf: str | Path | None = None  # URDF with the robot's meshes (`package:baxter`); None for the object alone
     parameter_values: Mapping[str, float] | None = None  # includes lengths and radii; default nominal
-    bodies_missing_from_urdf: Sequence[ExtraMesh] = ()  # meshes other than robot and object
+    surfaces_missing_from_urdf: Sequence[ExtraMesh] = ()  # meshes other than robot and object
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +174,7 @@ class ArticulatedSurfaces:
                 result[asked[near]] = distance.astype(np.float64) <= reach
         return result
 
-    def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
+    def distance_to_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
         """Distance [m], normal towards the point and part of the nearest moving surface. inf, 0, -1 beyond `within`."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
@@ -329,7 +329,7 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
     return None if sphere is None else TriangleMesh.sphere(sphere)
 
 
-def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
+def extra_meshes_by_joint_index(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
     """Load meshes missing from the URDF, by joint index (-1: the world).
 
     Raises `ConfigError` if a link does not exist or an entry does not define exactly one shape, and `ModelError` if a
@@ -337,7 +337,7 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
     """
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
-        where = f"model: bodies_missing_from_urdf: {number}"
+        where = f"model: surfaces_missing_from_urdf: {number}"
         given = [kind for kind in _EXTRA_MESH_SHAPES if getattr(entry, kind) is not None]
         if len(given) != 1:
             what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "keep or add one shape"
@@ -389,7 +389,7 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
     raise ModelError(what, where=str(urdf), allowed=allowed, hint="put the meshes into the package of the URDF")
 
 
-def link_lengths_and_radius_by_segment(
+def model_link_lengths_and_radius_by_segment(
     system: System, values: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Array, float]]:
     """Link lengths and radius [m] of every tube, by segment name."""
@@ -405,7 +405,7 @@ def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = N
     if not system.segment_layouts:
         what, hint = "the model has no object to see", "set model.object with segments"
         raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
-    meshes, sizes = dict[int, TriangleMesh](), link_lengths_and_radius_by_segment(system, values)
+    meshes, sizes = dict[int, TriangleMesh](), model_link_lengths_and_radius_by_segment(system, values)
     for segment in system.segment_layouts:
         lengths, radius = sizes[segment.name]
         for i, (names, length) in enumerate(zip(segment.link_joints, lengths, strict=True)):

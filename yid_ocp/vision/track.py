@@ -35,7 +35,7 @@ from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, Wei
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
     ForeignObject,
-    SharedFrameEstimates,
+    SequenceEstimates,
     TubeDimensionEstimates,
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
@@ -74,7 +74,7 @@ def track_object(
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_shared_values()
     frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
-    return tracker.track_result_from_frame_reports(*tracker.drop_outlying_frames_and_choose_root_end(frames), common)
+    return tracker.track_result_from_frame_reports(*tracker.align_root_ends_and_mark_outlying_frames(frames), common)
 
 
 @dataclass(eq=False)
@@ -130,7 +130,7 @@ class FrameTracker:
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
         tree = system.numeric_mechanism(values)
-        meshes = surface_meshes.extra_meshes_by_joint(scene.bodies_missing_from_urdf, tree)
+        meshes = surface_meshes.extra_meshes_by_joint_index(scene.surfaces_missing_from_urdf, tree)
         if scene.robot_urdf is not None:
             robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in robot):
@@ -163,7 +163,7 @@ class FrameTracker:
             q[index] = self.joint_angles_at(t)
         return q
 
-    def estimate_shared_values(self) -> SharedFrameEstimates:
+    def estimate_shared_values(self) -> SequenceEstimates:
         """Estimate what all frames share, from some of them: camera calibration, tube dimensions and background."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
@@ -193,7 +193,7 @@ class FrameTracker:
             near = self.shape_fitter.max_informative_surface_distance
             found = BackgroundPoints.from_point_clouds(clouds, 2 * filters.voxel_size, noise, shapes, near)
             background = found.merged_with(background)
-        return SharedFrameEstimates(calibration, sizes, background)
+        return SequenceEstimates(calibration, sizes, background)
 
     def _calibration(self) -> CameraCalibration:
         options, pose = self.options, self.sequence.camera_pose
@@ -281,7 +281,7 @@ class FrameTracker:
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
-    def process_frame(self, index: int, common: SharedFrameEstimates) -> FrameReport:
+    def process_frame(self, index: int, common: SequenceEstimates) -> FrameReport:
         """Process one frame, independent of other frames, and return its report."""
         work, look = self._look(index, common.camera_calibration, common.background)
         if look is None:
@@ -300,7 +300,7 @@ class FrameTracker:
         work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason or "")
         return work.report
 
-    def frame_processing_stages(self, frame: FrameReport, common: SharedFrameEstimates) -> FrameProcessingStages | None:
+    def frame_clouds_and_skeleton(self, frame: FrameReport, common: SequenceEstimates) -> FrameProcessingStages | None:
         """Return a frame's raw cloud, filtered cloud and skeleton for figures. None if its cloud cannot be read."""
         calibration = common.camera_calibration
         try:
@@ -317,19 +317,19 @@ class FrameTracker:
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def drop_outlying_frames_and_choose_root_end(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+    def align_root_ends_and_mark_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Drop outlying frames and choose the root end, with a note on how it was chosen."""
         rooted, note = frame_selection.align_root_ends(frames, self.options)
-        return frame_selection.mark_outlying_frames(rooted, self.options), note
+        return frame_selection.mark_outlying_frames_as_dropped(rooted, self.options), note
 
     def track_result_from_frame_reports(
-        self, frames: Sequence[FrameReport], note: str, common: SharedFrameEstimates
+        self, frames: Sequence[FrameReport], note: str, common: SequenceEstimates
     ) -> TrackResult:
         """Make the tracking result from frame reports. Raises `DataError` if no frame is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.find_foreign_objects(frames)
         of = common, things, self.options, self.sequence.source
-        measured = frame_selection.states_and_points_of_good_frames(frames, columns, *of)
+        measured = frame_selection.good_frame_configurations_and_points(frames, columns, *of)
         place = self._shape(common.dimensions).point_frame_positions
         return TrackResult(
             self.point_names,

@@ -28,7 +28,7 @@ from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_folder import current_local_time_text
-from yid_ocp.workflow.run_history import drift_and_outlier_tests_to_dict, read_estimates, require_comparable_runs
+from yid_ocp.workflow.run_history import read_estimates, require_runs_of_one_model, run_drift_and_outliers_to_dict
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve
 
@@ -46,7 +46,7 @@ class _BatchRun:
     overrides: tuple[str, ...]
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `batch` and return its exit code."""
     members = batch_runs_from_configs(arguments.configs, arguments.recordings, arguments.overrides)
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
@@ -191,8 +191,8 @@ def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
     if len(folders) < 2:
         return None
     try:
-        require_comparable_runs(folders)
-        return drift_and_outlier_tests_to_dict(assess_drift_and_outlier_runs(list(map(read_estimates, folders))))
+        require_runs_of_one_model(folders)
+        return run_drift_and_outliers_to_dict(assess_drift_and_outlier_runs(list(map(read_estimates, folders))))
     except YidError:
         return None
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.config.reader import DEFAULT_CONFIG_FILE_NAME, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DEFAULT_CONFIG_FILE_NAME, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
@@ -47,7 +47,7 @@ _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": 
 log = logging.getLogger(__name__)
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `blind` and return its exit code."""
     if arguments.rescore is not None:
         folder, target = arguments.rescore, arguments.out or Path(arguments.rescore) / "rescored"
@@ -55,10 +55,10 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     if arguments.join:
         together = functools.partial(score_joined_slices, arguments.join, arguments.out or "joined-slices")
         return run_command_and_print(arguments, together)
-    said, default = arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME
+    said, default = arguments.overrides, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME
     runs = [load_config(path, said, default) for path in arguments.configs or [None]]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
-        runs.append(load_config(None, said, DEFAULT_CONFIG_FILE_NAME))
+        runs.append(load_config(None, said, SHIPPED_DEFAULT_CONFIG_FILE_NAME))
     workers = worker_config_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     purpose = blind.BLIND_ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
@@ -290,7 +290,7 @@ def _diagnose_case_from_recordings_task(
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
     found["evidence"] = evidence
     if experiment["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
-        wide = blind_scores.thresholds_accepting_best_candidate(run.diagnosis)
+        wide = blind_scores.thresholds_always_accepting_best_candidate(run.diagnosis)
         try:
             anything = blind.diagnose_blind_case(ensemble, case, candidates, wide)
             found["open"] = to_json_types(diagnosis_decision_statistics(anything))

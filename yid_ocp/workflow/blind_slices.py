@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -102,7 +102,7 @@ def score_whole_ensemble(
         for label, found in pairs
     ]
     own = "seed", "purpose", "code", "code_of_cases", "command", "versions", "candidates", "variations"
-    result = blind_scores.detection_and_false_alarm_rates(marks) | {
+    result = blind_scores.blind_case_score_summary(marks) | {
         **{key: first[key] for key in (*own, "ensemble_sha256")},
         "slices": [part["slice"] for part in parts],
         "date": current_local_time_text(),
@@ -141,7 +141,7 @@ def rescore_blind(
     labels = {}
     for label in blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"]):
         labels[label.case] = label
-    wanted = load_config(None, overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
+    wanted = load_config(None, overrides, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
     names = [text.partition("=")[0].removeprefix("diagnosis.") for text in overrides]
     changes = {name: getattr(wanted, name) for name in names if hasattr(wanted, name)}
     marks, changed = [], []
@@ -159,7 +159,7 @@ def rescore_blind(
             changed.append({**told, "now": f"{mark.verdict} {mark.answer}", "right": [before.right, mark.right]})
     kept = {key: commitment[key] for key in ("seed", "purpose")}
     rescored = {"settings": list(overrides), "changed": changed, "of": str(made)}
-    result = blind_scores.detection_and_false_alarm_rates(marks) | {**kept, "rescored": rescored}
+    result = blind_scores.blind_case_score_summary(marks) | {**kept, "rescored": rescored}
     return CommandOutcome(target, _write_result(target, result | {"code": package_source_hash()})[0], None)
 
 

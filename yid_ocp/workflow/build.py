@@ -29,7 +29,7 @@ from yid_ocp.model.objects.base import CableTopology, ObjectBetweenClamps
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
-from yid_ocp.sensors.base import additional_sensor_channel_kinds
+from yid_ocp.sensors.base import additional_channel_kinds_of_group
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role, unknown_name_error
 
@@ -56,7 +56,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     robot = None
     if model.robot is not None:
         with add_setting_location_to_errors(run, "model", "arms", "joints"):
-            robot = read_urdf(model.robot, **urdf_joint_and_link_options(run))
+            robot = read_urdf(model.robot, **read_urdf_arguments(run))
     joints = () if robot is None else robot.joint_names
     damping, of_object = _dampings(run, joints)
     item = model.object
@@ -100,7 +100,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     return _completed(run, system, link_division)
 
 
-def urdf_joint_and_link_options(run: RunSettings) -> dict[str, Any]:
+def read_urdf_arguments(run: RunSettings) -> dict[str, Any]:
     """Options of `read_urdf` for the joints and links of the robot that a run uses."""
     arms = run.model.arms
     return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}
@@ -123,7 +123,7 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
     """Measured vertices and clamps of a run's cable. None for an object without its own clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
-        return run.model.object.topology() if isinstance(run.model.object, ObjectBetweenClamps) else None
+        return run.model.object.branch_vertices() if isinstance(run.model.object, ObjectBetweenClamps) else None
 
 
 def arms_are_estimated_states(run: RunSettings) -> bool:
@@ -135,7 +135,7 @@ def arms_are_estimated_states(run: RunSettings) -> bool:
         return False
     recordings = read_recordings_of_role(run)
     for group in (group for recording in recordings for group in recording.channel_groups):
-        of_vectors = (kind.quantity for kind in additional_sensor_channel_kinds(group.name) if kind.components)
+        of_vectors = (kind.quantity for kind in additional_channel_kinds_of_group(group.name) if kind.components)
         for quantity in (quantity for quantity in of_vectors if quantity in group.values_by_quantity):
             said = run.sensors.get(f"{group.name}.{quantity}")
             if said is None or said.use is not False:
@@ -178,7 +178,7 @@ def _clamped_system(run: RunSettings, item: ObjectBetweenClamps, kind: str) -> S
         what = f"the lengths of a {kind} are computed from recordings, but none is listed"
         raise run.config_error(what, "recordings", "estimate", allowed="one or more", hint="add a recording")
     with add_setting_location_to_errors(run, "model", "object"):
-        lengths = typical_point_pair_distances(item.topology().edge_vertex_names, recordings)
+        lengths = typical_point_pair_distances(item.branch_vertices().edge_vertex_names, recordings)
         return item.build_system_with_clamps(lengths, run.model.gravity)
 
 

@@ -27,13 +27,13 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model import System
-from yid_ocp.model.objects.base import CableTopology, ClampPoseDefinition, ObjectBetweenClamps
+from yid_ocp.model.objects.base import CableTopology, ClampPoseFromTwoPoints, ObjectBetweenClamps
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import DividedLinksModel, RefinementKind
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
-from yid_ocp.sensors.base import additional_sensor_channel_kinds
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
+from yid_ocp.sensors.base import additional_channel_kinds_of_group
+from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.run_inputs import read_recordings_of_role, unknown_name_error
@@ -79,9 +79,9 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         # gains in the settings take precedence over recorded ones
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
-    clamps: tuple[ClampPoseDefinition, ...] = ()
+    clamps: tuple[ClampPoseFromTwoPoints, ...] = ()
     if cable is not None and isinstance(run.model.object, ObjectBetweenClamps):
-        clamps = cable.clamp_pose_definitions_from_points
+        clamps = cable.clamp_pose_point_names
         for name in {group.name for group in groups}:
             said = sensors.setdefault(name, SensorOptions())
             if said.used_points is None:
@@ -93,12 +93,12 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     return replace(
         run.problem,
         sensors=sensors,
-        clamp_pose_definitions_from_points=clamps,
+        clamp_pose_point_names=clamps,
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
         has_uncertain_point_clocks=not clamps,  # clamps follow the points' own clock
-        excess_residual_criteria=run.diagnosis.null_test_residual_limits,
+        excess_residual_criteria=run.diagnosis.fit_excess_residual_criteria,
         checked_discretisations=_checked_discretisations(run),
         divided_links_model=_divided_links_model(run, system),
         cable_topology=cable,
@@ -196,7 +196,7 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
     names = (*system.driven, *system.prescribed)
     posture = dict(zip(names, map(float, episode.initial_known_coordinates), strict=True))
     theta = problem.predictor.theta_with_episode_values(episode, problem.theta)
-    start = problem.initial_state_of_episode(episode, theta)
+    start = problem.initial_state_and_derivative(episode, theta)
     near = None if start.failure_message else start.state[: system.n_coordinates]
     return min_gap_by_grasp_at_robot_posture(system, posture, theta, near)
 
@@ -219,12 +219,12 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
         if name not in known:
             what, details = f"no recording has a group '{name}'", unknown_name_error_arguments(name, sorted(known))
             raise run.config_error(what, "sensors", name, **details)
-        if said.effort_sampling_kind is not None and name != JOINT_EFFORT_GROUP_NAME:
-            what, hint = f"'{name}' has no efforts", f"set it under sensors.{JOINT_EFFORT_GROUP_NAME}, or leave it out"
-            where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_GROUP_NAME}"
+        if said.effort_sampling_kind is not None and name != JOINT_EFFORT_SENSOR_KEY:
+            what, hint = f"'{name}' has no efforts", f"set it under sensors.{JOINT_EFFORT_SENSOR_KEY}, or leave it out"
+            where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_SENSOR_KEY}"
             raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
-        constants = next((c.constants for c in additional_sensor_channel_kinds(group) if c.quantity == quantity), {})
+        constants = next((c.constants for c in additional_channel_kinds_of_group(group) if c.quantity == quantity), {})
         for constant in said.constants:
             if constant not in constants:
                 details = unknown_name_error_arguments(constant, constants)
@@ -314,7 +314,7 @@ def _beside_the_model(
     run: RunSettings, system: System, arm: RecordedJointsModel | None, cable: CableTopology | None, recording: Recording
 ) -> list[Issue]:
     gravity = np.array(run.model.gravity, float)
-    recording = recording.with_effort_sampling_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_sampling_kind)
+    recording = recording.with_effort_sampling_kind(_choice(run)(JOINT_EFFORT_SENSOR_KEY).effort_sampling_kind)
     if cable is not None:
         return list(point_checks.cable_point_geometry_issues(cable, recording, gravity))
     found: list[Issue] = []
@@ -340,7 +340,7 @@ def _excitation(
             asked.setdefault(joint, []).append(name)
     found = list(joint_checks.joint_excitation_issues(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
     if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
-        options = _choice(run)(JOINT_EFFORT_GROUP_NAME)
+        options = _choice(run)(JOINT_EFFORT_SENSOR_KEY)
         whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
         weak = [list(joint_checks.slow_motion_excitation_issues(arm, one, options)) for one in whole]
         if all(weak):  # one informative recording is enough
@@ -363,11 +363,11 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
     lengths = ca.vertcat(ca.SX(0), *(length for segment in system.segment_layouts for length in segment.link_lengths))
     size = float(ca.Function("size", [system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))
     wanted = any(samples.sensor.point_names for episode in problem.episodes for samples in episode.measurements)
-    if not size or not wanted or problem.options.clamp_pose_definitions_from_points:
+    if not size or not wanted or problem.options.clamp_pose_point_names:
         return []
     found: list[Issue] = []
     for i, episode in enumerate(problem.episodes):
-        own = problem.unpack_unknown_vector(problem.initial_unknowns, i)
+        own = problem.unpack_episode_unknowns(problem.initial_unknowns, i)
         result = problem.predictor.predict_episode(episode, *own, False, None)
         if isinstance(result, EpisodePrediction):
             found += point_checks.object_point_rollout_issues(episode, result, size)

@@ -24,9 +24,9 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
-from yid_ocp.workflow.build import build_step, build_system, divided_joint_parameter_scale, urdf_joint_and_link_options
+from yid_ocp.workflow.build import build_step, build_system, divided_joint_parameter_scale, read_urdf_arguments
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_grasp_gaps_at_start
-from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_settings_command
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_command_function
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
@@ -36,9 +36,9 @@ _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links
 _N_MODES = 3
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `check` and return its exit code."""
-    code = make_settings_command(_run_check)(arguments)
+    code = make_command_function(_run_check)(arguments)
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 
@@ -93,7 +93,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
     path = input_files_by_name(run)[run.model.robot] if run.model.robot is not None else None
     if path is not None and b"<mujoco" not in check_input_file(path).read_bytes():
         # Pinocchio reads the URDF file itself, without changes by settings or effects
-        read, gravity = urdf_joint_and_link_options(run), np.array(run.model.gravity, float)
+        read, gravity = read_urdf_arguments(run), np.array(run.model.gravity, float)
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
@@ -147,7 +147,7 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
     arm, errors, noise = episode.recording.joints, episode.input_errors, {}
     if arm is None or errors is None:
         return {}
-    effort, position = joints.JOINT_EFFORT_GROUP_NAME, joints.JOINT_POSITION_GROUP_NAME
+    effort, position = joints.JOINT_EFFORT_SENSOR_KEY, joints.JOINT_POSITION_GROUP_NAME
     for group, noise_std in ((effort, joints.joint_torque_noise_std), (position, joints.joint_angle_noise_std)):
         choice = problem.options.sensors.get(group, SensorOptions())
         noise[group] = {
@@ -164,7 +164,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
     """Animations of every estimation recording with the initial parameters, or of the recording alone."""
     scenes = []
     for i, episode in enumerate(problem.episodes):
-        shared = problem.unpack_unknown_vector(problem.initial_unknowns, i)[0]
+        shared = problem.unpack_episode_unknowns(problem.initial_unknowns, i)[0]
         if first.ok:
             prediction = first.episode_predictions[i]
             told = predicted_configuration_trajectory("with the initial values", problem, episode, prediction, shared)

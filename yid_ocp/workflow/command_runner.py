@@ -42,7 +42,7 @@ class CommandOutcome(Generic[_CommandOutput]):
     is_successful: bool = True
 
 
-def make_settings_command(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
+def make_command_function(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
     """Make a command that calls `work(settings, out, progress, ...)`, where `...` are the arguments `names`."""
 
     def run(arguments: argparse.Namespace) -> int:
@@ -221,7 +221,7 @@ class _BarProgress(Progress):
             words = f"{self._text}: {done} of {total}, {text}{self._left.of_parts(done, total)}"
             self._bars.update(self._task, description=words, completed=done, total=total)
 
-    def report_table(self, rows: Sequence[Sequence[str]]) -> None:
+    def renew_results_table(self, rows: Sequence[Sequence[str]]) -> None:
         self._table[:] = aligned_table_lines([*rows[: _MAX_TABLE_ROWS + 1]])
 
     def finish_stage(self) -> None:

@@ -14,7 +14,7 @@ from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.solve import solution_to_result_dict
 
@@ -44,7 +44,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             folder.log_event("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.report_iterate(entry)
 
-        limits, budget = run.diagnosis.null_test_residual_limits, run.compare.total_time_budget
+        limits, budget = run.diagnosis.fit_excess_residual_criteria, run.compare.total_time_budget
         comparison = compare_methods(problem, solvers, truth, iterate, limits, math.inf if budget is None else budget)
         judged = comparison.verdict_solution
         own, checks = judged.problem or problem, judged.checks or EstimateChecksBeyondFit()
@@ -71,4 +71,4 @@ def _compare_result(problem: EstimationProblem, comparison: MethodsComparisonRes
     return {"format": "yid-compare/1", "methods": methods, **attributes_to_dict(comparison, names)}
 
 
-run_from_arguments = make_settings_command(_run_compare)
+run_and_return_exit_code = make_command_function(_run_compare)

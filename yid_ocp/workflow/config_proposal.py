@@ -12,7 +12,7 @@ from scipy.ndimage import maximum_filter1d
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import mean_sample_rate, seen_noise_std
-from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_RECORDING_GROUP
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
@@ -20,7 +20,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.sensors.base import RecordedChannelKind, additional_sensor_channel_kinds
+from yid_ocp.sensors.base import RecordedChannelSpec, additional_channel_kinds_of_group
 from yid_ocp.sensors.joints import is_noise_std_stated
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
@@ -247,7 +247,7 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
 
 def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bool) -> tuple[str, str]:
     wrists = [group.name for group in recording.channel_groups if group.name.startswith("wrist")]
-    wrists = [name for name in wrists if name != ESTIMATED_WRENCH_GROUP_NAME]
+    wrists = [name for name in wrists if name != ESTIMATED_WRENCH_RECORDING_GROUP]
     seen = ", ".join([*(group.name for group in recording.points), *wrists])
     is_servo = joints.effort is None and _commanded(joints)
     if not has_object and not is_servo and joints.effort is None and not wrists:
@@ -438,9 +438,9 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     return found
 
 
-def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, RecordedChannelKind]]:
+def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, RecordedChannelSpec]]:
     for group in recording.channel_groups:
-        for kind in additional_sensor_channel_kinds(group.name):
+        for kind in additional_channel_kinds_of_group(group.name):
             if kind.components and kind.quantity in group.values_by_quantity:
                 yield f"{group.name}.{kind.quantity}", group, kind
 

@@ -16,9 +16,9 @@ import numpy as np
 from yid_ocp import files
 from yid_ocp.analysis.run_estimates import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
-from yid_ocp.config.reader import EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
-from yid_ocp.diagnosis.baseline import DiagnosisBaseline, add_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel, StoredFit
@@ -32,7 +32,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
 from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, animation_of_trajectories
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
+from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
 from yid_ocp.workflow import prediction_outputs, run_history
@@ -47,9 +47,9 @@ _STORE_FORMAT = "yid-refits/1"
 _MAX_SHOWN_UNKNOWNS = 5  # in a figure; the page's maps and trajectories.h5 contain all
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `diagnose` and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides, EMBEDDED_DIAGNOSIS_CONFIG_FILE_NAME)
+    settings = load_config(arguments.config, arguments.overrides, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline_run_folders=said))
@@ -87,7 +87,7 @@ def run_diagnose(
                 thresholds=run.diagnosis,
                 progress=logged,
                 known_fits=NominalSolutionAndRefitStore(nominal, refits),
-                baseline=DiagnosisBaseline.from_run_estimates(runs, without),
+                baseline=EarlierRunsBaseline.from_run_estimates(runs, without),
                 exclude=run.diagnosis.excluded_candidates,
             )
         except KeyboardInterrupt:
@@ -101,14 +101,14 @@ def run_diagnose(
             files.write_text(folder.path / "law.csv", torque_law_tables_csv(finding.law.tables))
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
-        follows_points = bool(last.problem.options.clamp_pose_definitions_from_points)
+        follows_points = bool(last.problem.options.clamp_pose_point_names)
         moving = not follows_points and bool(system.driven or system.prescribed)
         x = last.problem.unknown_vector(last.values)
         recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
         own = {
             "model": _final_model_to_dict(finding),
             "doubts": issues_to_plain_data(problem.options.data_issues),
-            "torque_offsets": prediction_outputs.estimated_torque_offsets(last.problem, x),
+            "torque_offsets": prediction_outputs.torque_offsets_by_recording(last.problem, x),
             "not_candidates": effect_kinds_without_recorded_signals(recordings),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
@@ -124,7 +124,7 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.screening.detectability} - {effect.label for effect in fit.effects}
-    theta, _ = problem.unpack_unknown_vector(problem.unknown_vector(fit.values), 0)
+    theta, _ = problem.unpack_episode_unknowns(problem.unknown_vector(fit.values), 0)
     found = {}
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
@@ -152,8 +152,8 @@ class _LoggedProgress(Progress):
         self.folder.log_event("part", done=done, total=total, text=text)
         self.shown.report_parts_done(done, total, text)
 
-    def report_table(self, rows: Sequence[Sequence[str]]) -> None:
-        self.shown.report_table(rows)
+    def renew_results_table(self, rows: Sequence[Sequence[str]]) -> None:
+        self.shown.renew_results_table(rows)
 
 
 def _flags(run: RunSettings) -> list[str]:
@@ -207,8 +207,8 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     for errors in (episode.input_errors for episode in problem.episodes):
         if errors is not None:
             given = {
-                (JOINT_EFFORT_GROUP_NAME, "std"): errors.torque_std,
-                (JOINT_EFFORT_GROUP_NAME, "bias_std"): errors.torque_bias_std,
+                (JOINT_EFFORT_SENSOR_KEY, "std"): errors.torque_std,
+                (JOINT_EFFORT_SENSOR_KEY, "bias_std"): errors.torque_bias_std,
                 (JOINT_POSITION_GROUP_NAME, "std"): errors.angle_std,
             }
             levels |= {level for level, std in given.items() if np.any(std > 0)}
@@ -239,7 +239,7 @@ def _scenes(finding: DiagnosisResult, predicted: list[EpisodeWithNominalAndEffec
 
 
 def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePrediction) -> ConfigurationTrajectory:
-    theta = fit.problem.unpack_unknown_vector(fit.problem.unknown_vector(fit.values), 0)[0]
+    theta = fit.problem.unpack_episode_unknowns(fit.problem.unknown_vector(fit.values), 0)[0]
     return prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
 
 

@@ -59,7 +59,7 @@ _RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
 _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bias": "vector"}  # by kind of unknown
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `export` and return its exit code."""
     source, form, out = Path(arguments.source), arguments.format, arguments.out
     if source.is_dir() and form not in ("csv", _MCAP):
@@ -175,7 +175,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     if form == "mjcf":
         grasp = FeatureExportSupport("native", "equality constraints between sites, or a tendon where it gives way")
     parameters = {}
-    for name, entry in models.export_support_by_parameter(full, supports, form).items():
+    for name, entry in models.support_in_export_format_by_parameter(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}

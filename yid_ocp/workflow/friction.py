@@ -16,7 +16,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, Status, solve
 from yid_ocp.workflow.build import friction_joint_names, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
@@ -34,7 +34,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             law: replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
             for law in EFFECT_KINDS_BY_FRICTION_LAW
         }
-        estimating_on_all = friction_law_comparison.problem_estimating_on_held_out_too
+        estimating_on_all = friction_law_comparison.problem_estimating_from_all_recordings
         problems = [estimating_on_all(build_problem(settings)) for settings in by_law.values()]
         kinds = friction_law_comparison.recording_names_by_name_stem(problems[0])
         if len(kinds) < 2:
@@ -85,4 +85,4 @@ def _law_result(
     return {**result, "converged": fit.is_converged, "parameters": parameters}
 
 
-run_from_arguments = make_settings_command(_run_friction)
+run_and_return_exit_code = make_command_function(_run_friction)

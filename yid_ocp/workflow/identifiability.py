@@ -32,7 +32,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm_holding_object
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command, worker_config_from_arguments
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import solve_and_decide_cable_memory
@@ -66,7 +66,7 @@ class IdentifiabilityOptions:
         return [flag for flag, given in said.items() if given] + ([] if names == "auto" else ["--intervals", names])
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `identifiability` and return its exit code."""
     names = [name for name in arguments.intervals.split(",") if name]
     asked = IdentifiabilityOptions(
@@ -77,7 +77,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
         rank_changes=arguments.what_if,
     )
     work = partial(run_identifiability, options=asked, workers=worker_config_from_arguments(arguments))
-    return make_settings_command(work)(arguments)
+    return make_command_function(work)(arguments)
 
 
 def run_identifiability(
@@ -98,7 +98,7 @@ def run_identifiability(
         progress.begin_stage("building the model and its compiled step")
         system = build_system(run)
         problem = whole = build_problem(run, build_step(run, system_with_grasp_offset_effects(system)))
-        limits = run.diagnosis.null_test_residual_limits
+        limits = run.diagnosis.fit_excess_residual_criteria
         solution = None
         if asked.evaluation_point == "solution":
             safe = solve_and_decide_cable_memory(run, problem, folder, progress)
@@ -241,8 +241,8 @@ class _IdentifiabilityTasks:
 def _profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Task: profile likelihood of one parameter and its updated verdict, as plain data."""
     run, problem = _problem(common)
-    known = {key: common[key] for key in ("start", "grasp_std")} | {"limits": run.diagnosis.null_test_residual_limits}
-    found = fisher.identifiability(problem, common["x"], intervals=[name], **known)
+    start, std, limits = common["start"], common["grasp_std"], run.diagnosis.fit_excess_residual_criteria
+    found = fisher.identifiability(problem, common["x"], intervals=[name], limits=limits, start=start, grasp_std=std)
     return dict(to_lossless_plain_data({"parameter": found.parameters[name], "profile": found.profiles[name]}))
 
 

@@ -14,7 +14,7 @@ from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, write_recording
 from yid_ocp.data.checks import recording_quality_issues
 from yid_ocp.data.merge import merge_recordings
-from yid_ocp.data.readers import base, preview_file, read_any, reader_option_names
+from yid_ocp.data.readers import base, preview_file, read_any, reader_option_names_for_file
 from yid_ocp.data.readers.csv import column_pattern
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
@@ -39,7 +39,7 @@ _FLAGS = {
 _SWITCHES = {("has_header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `import` and return its exit code."""
     files, asked = arguments.files, reader_options_from_arguments(arguments)
     if arguments.preview:
@@ -129,7 +129,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
 
 def recording_issue_lines(recording: Recording) -> list[str]:
     """Describe issues of a recording itself, such as units, clocks, few samples, no motion or channels."""
-    units, reasons = base.guess_units(recording)
+    units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
     said = [f"in doubt ({issue.certainty_word}): {issue.what}; {issue.advice}" for issue in found]
@@ -142,7 +142,7 @@ def _merged(
     files: Sequence[str], options: Mapping[str, Any], offsets: Mapping[str, float] | None, progress: Progress
 ) -> Recording:
     """One recording from several files. An option applies to every file that supports it."""
-    known = {file: () if has_native_recording_suffix(file) else reader_option_names(file) for file in files}
+    known = {file: () if has_native_recording_suffix(file) else reader_option_names_for_file(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):
             what = f"no file has a format with the option '{name}'"

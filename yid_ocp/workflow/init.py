@@ -15,11 +15,11 @@ from typing import Any, cast
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema, option_info_from_annotation
 from yid_ocp.data import Recording, read_recording, write_recording
-from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_RECORDING_GROUP
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError, OutputError, require_known_names
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import ObjectWithInitialValues, init_object_templates, parse_comma_separated_numbers
+from yid_ocp.model.objects.base import InitialObjectSettings, init_object_templates, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import options_by_key
@@ -36,7 +36,7 @@ from yid_ocp.workflow.config_proposal import ProposedConfigChoices, held_out_spl
 _SCHEMA_FILE = "yid-ocp.schema.json"
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `init` and return its exit code."""
     out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):
@@ -74,7 +74,7 @@ def run_from_arguments(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _object_from_arguments(arguments: argparse.Namespace) -> ObjectWithInitialValues | None:
+def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettings | None:
     """The described object, if any. `ConfigError`, with the option, if a number is missing or impossible."""
     templates, word = init_object_templates(), arguments.object
     if word is None:
@@ -228,7 +228,7 @@ _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 def _config_text(
     robot: str,
     about: str,
-    item: ObjectWithInitialValues | None,
+    item: InitialObjectSettings | None,
     proposal: ProposedConfigChoices,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
@@ -278,7 +278,7 @@ def _wrapped_list(values: Iterable[str], column: int) -> str:
     return "[" + f",\n{' ' * column}".join(entry.rstrip(", ") for entry in rows) + "]"
 
 
-def _of_object(item: ObjectWithInitialValues, proposal: ProposedConfigChoices) -> dict[str, Any]:
+def _of_object(item: InitialObjectSettings, proposal: ProposedConfigChoices) -> dict[str, Any]:
     """Initial dampings of an object, frames of points whose places are uncertain, and further frames for sensors."""
     tips = [f"w_{segment.name}" for segment in item.settings.segment_definitions()]
     of_points = [places for group, places in proposal.point_placements.items() if "." not in group]
@@ -333,7 +333,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
             why = "torques with noise move the arms: set mode: prescribed to use it"
             entries = ["use: false", *entries]
             said = why if proposal.arm_mode == "driven" else "its frame is not known"
-        elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
+        elif group.startswith(ESTIMATED_WRENCH_RECORDING_GROUP):
             entries = ["use: false", *entries]
             said = "an estimate from joint torques, less the loads that the driver knows: in place of efforts only"
         yield group, entries, said, places

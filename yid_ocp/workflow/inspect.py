@@ -27,7 +27,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
@@ -116,7 +116,7 @@ def _run_inspect(
     return CommandOutcome(folder.path, written, None)
 
 
-run_from_arguments = make_settings_command(_run_inspect, "entries", "export")
+run_and_return_exit_code = make_command_function(_run_inspect, "entries", "export")
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint:

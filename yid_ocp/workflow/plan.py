@@ -24,11 +24,11 @@ from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_inform
 from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, TargetMotionPlan, plan_motion_to_target
 from yid_ocp.problem.measurements import rollout_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes, select_path_cutoff
-from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_file
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role
@@ -74,7 +74,7 @@ def run_plan(
     return CommandOutcome(folder.path, written, found, found.is_successful)
 
 
-run_from_arguments = make_settings_command(run_plan)
+run_and_return_exit_code = make_command_function(run_plan)
 
 
 def _compile_step_for_planning(run: RunSettings) -> Step:
@@ -91,10 +91,10 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
     [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system
-    clamps = () if cable is None else cable.clamp_pose_definitions_from_points
+    clamps = () if cable is None else cable.clamp_pose_point_names
     grid = rollout_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        low_pass = LowPassFilter(run.problem.path_cutoff or select_path_cutoff([recording], system.prescribed))
+        low_pass = ZeroPhaseLowPassFilter(run.problem.path_cutoff or select_path_cutoff([recording], system.prescribed))
         path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, clamps)
     return dict(zip(system.prescribed, map(float, path[0]), strict=True))
 

@@ -19,7 +19,7 @@ from yid_ocp.inference import whitening
 from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodeAndPrediction, EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.solvers import Solution
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 
 
-def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
+def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
     """Estimated torque offset of every joint in every recording, held-out too: `value`, `std`, `prior_std` [N m].
 
     The problem's whitening filters are fixed near `x` (nx,). The result is empty without filters, or without offsets in
@@ -36,7 +36,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     """
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
-    known = list(zip(problem.episodes, whitening.torque_bias_estimates_by_recording(problem, x), strict=True))
+    known = list(zip(problem.episodes, whitening.torque_biases_and_stds_per_recording(problem, x), strict=True))
     apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
     if apart:
         is_whitened = any(problem.held_out_whitening_filters)
@@ -59,7 +59,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     return found
 
 
-def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
+def estimate_texts_by_format(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
     """Make texts to copy, such as YAML lines, from estimates of identifiable parameters. Empty if there are none.
 
     The result holds `values` with total standard deviations, `joints` (number of links and range of joint stiffness [N
@@ -69,7 +69,7 @@ def copyable_estimate_texts(problem: EstimationProblem, solution: Solution, fold
     found = {n: e for n, e in solution.parameters.items() if e.free and e.verdict == "identifiable"}
     if not found:
         return {}
-    system, theta = problem.system, problem.unpack_unknown_vector(solution.x, 0)[0]
+    system, theta = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0]
     joints, lines, found_symbols = [], [], ca.vertcat(*(system.parameters[name].symbol for name in found))
 
     def numbers(*terms: ca.SX) -> Array:
@@ -127,7 +127,7 @@ EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, Episo
 
 
 def write_solve_trajectories(
-    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
+    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
 ) -> None:
     """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1` (HDF5).
 

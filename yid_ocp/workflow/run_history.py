@@ -34,7 +34,7 @@ from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_prin
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
 from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_recording_path, uniquely_named_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_default_recording, uniquely_named_recordings
 
 log = logging.getLogger(__name__)
 
@@ -160,7 +160,7 @@ def _dependent(folders: Sequence[str | Path]) -> str:
     return ""
 
 
-def require_comparable_runs(folders: Sequence[Path]) -> None:
+def require_runs_of_one_model(folders: Sequence[Path]) -> None:
     """Raise `ConfigError` unless all run folders have the same model and none is the baseline of another."""
     dependent = _dependent(folders)
     if dependent:
@@ -214,7 +214,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
     """Load recordings without the sought effect, from settings or baseline, and the reason if there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):
-        file = resolve_recording_path(path)
+        file = resolve_default_recording(path)
         if not is_file(file):
             where = ("recordings", "without_effect", i)
             what, allowed = f"there is no such recording: {file}", "the path of an existing file"
@@ -224,7 +224,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
-                found.append(read_recording(resolve_recording_path(path)))
+                found.append(read_recording(resolve_default_recording(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
     named = (replace(recording, name=f"{recording.name} (without)") for recording in found)
@@ -247,7 +247,7 @@ def require_recordings_not_in_baseline(
             raise run.config_error(what, *where, allowed="recordings of another time", hint=hint)
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `report` and return its exit code."""
     paths = [Path(folder) for folder in arguments.runs]
     return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown))
@@ -265,9 +265,9 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     if len(paths) == 2 and _have_same_recordings(paths):
         return _overlay_runs(paths, out, progress)
     estimates = [read_estimates(path) for path in paths]
-    require_comparable_runs(paths)
+    require_runs_of_one_model(paths)
     progress.begin_stage(f"comparing {len(paths)} runs")
-    told = drift_and_outlier_tests_to_dict(assess_drift_and_outlier_runs(estimates))
+    told = run_drift_and_outliers_to_dict(assess_drift_and_outlier_runs(estimates))
     settings = RunSettings(name="history", description="Runs of one model side by side.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
@@ -276,7 +276,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     return CommandOutcome(folder.path, written, None)
 
 
-def drift_and_outlier_tests_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
+def run_drift_and_outliers_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
     """Convert drift and outlier tests of several runs to a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drift_tests:

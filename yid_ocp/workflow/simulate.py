@@ -18,7 +18,7 @@ from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
@@ -63,7 +63,7 @@ def run_simulate(
     return CommandOutcome(folder.path, written, recording, recording is not None)
 
 
-run_from_arguments = make_settings_command(run_simulate, "seed", "noise")
+run_and_return_exit_code = make_command_function(run_simulate, "seed", "noise")
 
 
 def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) -> _Made:

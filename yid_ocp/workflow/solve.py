@@ -15,13 +15,13 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByLinksAndTimeStep, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import EpisodeAndPrediction
+from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.solvers import Iterate, Solution, Status
 from yid_ocp.solvers import base as solvers
 from yid_ocp.solvers.base import IterationCallback
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
 _RESULT_FORMAT = "yid-solve/1"
@@ -47,7 +47,7 @@ def run_solve(
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
         folder.log_event("end", **end)
         prediction_outputs.write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
-        offsets = prediction_outputs.estimated_torque_offsets
+        offsets, to_path = prediction_outputs.torque_offsets_by_recording, os.path.relpath(folder.final_path)
         more = {
             "doubts": issues_to_plain_data(checks.data_issues),
             "safeguard": checks.cable_memory_message,
@@ -55,7 +55,7 @@ def run_solve(
             "discretisation": discretisation_shifts_to_dict(checks.discretisation_shifts, checks.data_std),
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
-            "to_use": prediction_outputs.copyable_estimate_texts(problem, solution, os.path.relpath(folder.final_path)),
+            "to_use": prediction_outputs.estimate_texts_by_format(problem, solution, to_path),
             "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
         result = solution_to_result_dict(problem, solution, held_out) | more
@@ -64,7 +64,7 @@ def run_solve(
     return CommandOutcome(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 
-run_from_arguments = make_settings_command(run_solve, "live")
+run_and_return_exit_code = make_command_function(run_solve, "live")
 
 
 def solve_and_decide_cable_memory(
@@ -89,7 +89,7 @@ def _iterate_logger(
         progress.report_iterate(entry)
         if is_live:
             iterates.append(entry)
-            progress.report_table(_iterate_table(problem, iterates))
+            progress.renew_results_table(_iterate_table(problem, iterates))
 
     return iterate
 
@@ -124,10 +124,10 @@ def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dic
 
 
 def solution_to_result_dict(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
 ) -> dict[str, Any]:
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
-    errors, units, residuals = estimation.prediction_errors_and_units(problem, solution, held_out)
+    errors, units, residuals = estimation.prediction_errors_units_and_fit_errors(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
     worse = estimation.channels_worse_than_naive_prediction(errors, units)
     return {

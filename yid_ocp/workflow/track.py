@@ -29,23 +29,23 @@ from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
-from yid_ocp.vision.sequence_calibration import ForeignObject, SharedFrameEstimates, TubeDimensionEstimates
+from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceEstimates, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import SceneDescription, VirtualFramesWithTruth
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import all_issues_of_one_recording, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandOutcome, make_settings_command, worker_config_from_arguments
+from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path, unknown_name_error
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_default_recording, unknown_name_error
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 
-def run_from_arguments(arguments: argparse.Namespace) -> int:
+def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `track` and return its exit code."""
-    return make_settings_command(partial(_run_track, workers=worker_config_from_arguments(arguments)))(arguments)
+    return make_command_function(partial(_run_track, workers=worker_config_from_arguments(arguments)))(arguments)
 
 
 def _run_track(
@@ -68,7 +68,7 @@ def _run_track(
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
-                frames, note = tracker.drop_outlying_frames_and_choose_root_end(done)
+                frames, note = tracker.align_root_ends_and_mark_outlying_frames(done)
                 try:
                     found = tracker.track_result_from_frame_reports(frames, note, common)
                 except DataError as error:
@@ -78,7 +78,7 @@ def _run_track(
             raise
         progress.begin_stage("drawing")
         for frame in _drawn(frames, settings.n_drawn_frames):
-            stages = tracker.frame_processing_stages(frame, common)
+            stages = tracker.frame_clouds_and_skeleton(frame, common)
             if stages is not None:
                 track_result.draw_frame_processing_stages(stages, folder.path / "pictures")
         result = _track_result(frames, common, tracker.find_foreign_objects(frames), found) | {"root": note}
@@ -119,10 +119,7 @@ def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
 
 
 def _track_result(
-    frames: Sequence[FrameReport],
-    common: SharedFrameEstimates,
-    things: Sequence[ForeignObject],
-    found: TrackResult | None,
+    frames: Sequence[FrameReport], common: SequenceEstimates, things: Sequence[ForeignObject], found: TrackResult | None
 ) -> dict[str, Any]:
     """`yid-track/1` without issues, inputs and versions; `found` is None if no frame is good."""
     spent = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
@@ -200,12 +197,12 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         hint = "set track.frames_path to frames of a camera, or model.arms.mode: driven"
         raise run.config_error(what, "track", "virtual_frames", allowed=allowed, hint=hint)
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
-    for name in settings.gripper_start_from_object_end:
+    for name in settings.gripper_start_offset_from_object_end:
         if name not in grasps:
-            where = ("track", "virtual_frames", "gripper_start_from_object_end", name)
+            where = ("track", "virtual_frames", "gripper_start_offset_from_object_end", name)
             raise unknown_name_error(run, "grasp", name, grasps, *where)
     with add_setting_location_to_errors(run, "track", "virtual_frames"):
-        posture = grasping_joint_angles(system, offsets=settings.gripper_start_from_object_end)
+        posture = grasping_joint_angles(system, offsets=settings.gripper_start_offset_from_object_end)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
         seed = settings.seed
@@ -224,7 +221,7 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
 
 
 def _camera_scene(run: RunSettings, system: System) -> SceneDescription:
-    return SceneDescription(system, run.model.robot, bodies_missing_from_urdf=run.model.bodies_missing_from_urdf)
+    return SceneDescription(system, run.model.robot, surfaces_missing_from_urdf=run.model.surfaces_missing_from_urdf)
 
 
 def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames_path"]) -> FrameSequence:
@@ -237,7 +234,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
     if not run.recordings.estimate:
         return None
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = resolve_recording_path(run.recordings.estimate[0])
+        path = resolve_default_recording(run.recordings.estimate[0])
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
@@ -256,14 +253,14 @@ class _FrameTasks:
     input_hashes: dict[str, str]
     own_files: tuple[Path, ...] = ()
 
-    def estimate_shared_values(self) -> SharedFrameEstimates:
+    def estimate_shared_values(self) -> SequenceEstimates:
         [found] = require_task_values(self._run(_calibrate_sequence_task, {"what is common": {}}, InlineExecutor()))
         if "refused" in found:
             raise DataError(**found["refused"])
-        return files.dataclass_from_plain_data(SharedFrameEstimates, found)
+        return files.dataclass_from_plain_data(SequenceEstimates, found)
 
     def track_frames(
-        self, tracker: FrameTracker, common: SharedFrameEstimates, workers: WorkerConfig | Executor, progress: Progress
+        self, tracker: FrameTracker, common: SequenceEstimates, workers: WorkerConfig | Executor, progress: Progress
     ) -> list[FrameReport]:
         names, told = tracker.sequence.frame_names, files.to_lossless_plain_data(common)
         tasks = {names[i]: {"common": told, "index": i} for i in tracker.frame_order}
@@ -302,7 +299,7 @@ def _frame_tasks(
 ) -> tuple[_FrameTasks, VirtualFramesWithTruth | None]:
     """Tracking tasks of frames in files, first written if a virtual camera renders them, and their true motion."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
-    joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
+    joints = resolve_default_recording(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
         _read_joints(run)
         _read_frames(run, "frames_path")  # raises errors about the files with the names of the settings
@@ -345,7 +342,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     del inputs
     tracker = _tracker(files.read_input_text(config), config)
-    found = tracker.process_frame(index, files.dataclass_from_plain_data(SharedFrameEstimates, common))
+    found = tracker.process_frame(index, files.dataclass_from_plain_data(SequenceEstimates, common))
     return dict(files.to_lossless_plain_data(found))
 
 

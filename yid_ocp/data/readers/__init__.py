@@ -36,7 +36,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     """
     path = Path(path)
     known_as = _format_of(path)
-    reader, known = READERS[known_as], reader_option_names(path)
+    reader, known = READERS[known_as], reader_option_names_for_file(path)
     parameters = inspect.signature(reader).parameters
     default = parameters["options"].default if "options" in parameters else None
     for name in options:
@@ -47,7 +47,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     return reader(path, **given, **_told(reader, progress))
 
 
-def reader_option_names(path: str | os.PathLike[str]) -> list[str]:
+def reader_option_names_for_file(path: str | os.PathLike[str]) -> list[str]:
     """Names of the options of `read_any` for a file or folder of this format. Raises the errors of `read_any`."""
     parameters = inspect.signature(READERS[_format_of(Path(path))]).parameters
     names = [entry.name for entry in fields(parameters["options"].default)] if "options" in parameters else parameters

@@ -16,9 +16,9 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.foreign_formats import (
-    ESTIMATED_WRENCH_GROUP_NAME,
+    ESTIMATED_WRENCH_RECORDING_GROUP,
     OTHER_JOINT_MESSAGE_TYPES,
-    joint_values_at_field_paths,
+    joint_values_from_message_fields,
     joint_values_of_message,
 )
 from yid_ocp.data.readers import base
@@ -208,9 +208,9 @@ def read_bag(
         points.append(PointGroup(name, *position, None, options.point_sensor_name, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     channels = tuple(_mounted_sensors(bag, groups, seconds))
-    if channels and channels[-1].name == ESTIMATED_WRENCH_GROUP_NAME:
+    if channels and channels[-1].name == ESTIMATED_WRENCH_RECORDING_GROUP:
         said = "the driver's estimate from joint torques, less the loads that it knows"
-        more = (*more, f"{ESTIMATED_WRENCH_GROUP_NAME} is {said}: use it in place of efforts, not beside them")
+        more = (*more, f"{ESTIMATED_WRENCH_RECORDING_GROUP} is {said}: use it in place of efforts, not beside them")
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and distance is None:
@@ -240,7 +240,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         options["joint_topics"] = states
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
         notes.append("poses have orientations: --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
-    units, why = base.guess_units(_for_guess(bag))
+    units, why = base.guess_non_si_units(_for_guess(bag))
     options |= {key: found for key, found in (("point_names", names), ("units", units)) if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
@@ -271,7 +271,7 @@ def _contents(
             content: Any = reader.deserialize(data, connection.msgtype)
             if connection.topic == own_topic:
                 try:
-                    values = joint_values_at_field_paths(content, paths, f"{path}: {own_topic}")
+                    values = joint_values_from_message_fields(content, paths, f"{path}: {own_topic}")
                 except DataError as error:
                     refused = error
                     break
@@ -368,7 +368,7 @@ def _mounted_sensors(
             own_name = group if len(topics) == 1 else f"{group}_{name}"
             yield from _sensor_group(own_name, name, messages, seconds)
     told = ([replace(m, content=w) for m in e.messages if (w := getattr(m.content, "wrench", None))] for e in groups)
-    yield from _sensor_group(ESTIMATED_WRENCH_GROUP_NAME, "", next(filter(None, told), []), seconds)
+    yield from _sensor_group(ESTIMATED_WRENCH_RECORDING_GROUP, "", next(filter(None, told), []), seconds)
 
 
 def _sensor_group(

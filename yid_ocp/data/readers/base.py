@@ -48,7 +48,7 @@ READERS: Registry[_RecordingReader] = Registry("recording format")
 FILE_PREVIEWERS: Registry[Callable[..., FilePreview]] = Registry("recording format with a preview")
 """Functions that list a file's contents without importing it, by the keys of `READERS`. Each takes a path."""
 
-SKIPPED_COLUMN_MEANING = "skip"
+SKIP_COLUMN_KEYWORD = "skip"
 """Column meaning that omits the column."""
 
 _TO_SI: Mapping[str, Mapping[str, float]] = {
@@ -219,7 +219,7 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
     return factors
 
 
-def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
+def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
     """Guess the units of values that cannot be in SI units. Returns the units, and the reasons as sentences."""
     units: dict[str, str] = {}
     notes = []

@@ -24,7 +24,7 @@ from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
     JointGroup,
     PointGroup,
-    RecordedOrNominalTimes,
+    RecordedOrNominalClock,
     Recording,
     SensorChannelGroup,
 )
@@ -54,7 +54,7 @@ class CsvOptions(base.JointPointAndUnitOptions):
     has_header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # omit lines that are not rows of numbers, and count them in `notes`
     delimiter: str = ""  # one character between cells; found in the first line where empty
-    recorded_or_nominal_times: RecordedOrNominalTimes = "recorded"  # whether the times were measured
+    recorded_or_nominal_times: RecordedOrNominalClock = "recorded"  # whether the times were measured
     point_sensor_name: str = "unknown"  # sensor of the points
     point_frame: str = "world"  # reference frame of the points
     description: str = ""  # what was recorded
@@ -200,7 +200,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         meanings[0] = ("t", "")
     meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # the first of two equal ones
     unclear = (name for name, meaning in zip(names, meanings, strict=True) if name and not meaning)
-    unknown = dict.fromkeys(unclear, base.SKIPPED_COLUMN_MEANING)
+    unknown = dict.fromkeys(unclear, base.SKIP_COLUMN_KEYWORD)
     if "has_header" in options and meanings[0]:
         unknown = {names[0]: "t", **unknown}
     if unknown:
@@ -216,7 +216,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
-        units, why = base.guess_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
+        units, why = base.guess_non_si_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
     notes += [f"{quantity} is in {unit}, by the header" for quantity, unit in stated]
@@ -391,11 +391,11 @@ def _meanings(
             allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z, <link>_force_x, and so on, with a "
             allowed += "unit such as [ms], [deg], [N m], or without"
             hint = f"rename the column, give its meaning (--columns '{name}=position:JOINT'), or leave it out "
-            hint += f"(--columns '{name}={base.SKIPPED_COLUMN_MEANING}')"
+            hint += f"(--columns '{name}={base.SKIP_COLUMN_KEYWORD}')"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
-            hint = f"leave one out: --columns {name}={base.SKIPPED_COLUMN_MEANING}"
+            hint = f"leave one out: --columns {name}={base.SKIP_COLUMN_KEYWORD}"
             raise DataError(what, where=where, allowed="one column for every meaning", hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:
@@ -405,7 +405,7 @@ def _meanings(
 
 
 def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
-    if given == base.SKIPPED_COLUMN_MEANING:
+    if given == base.SKIP_COLUMN_KEYWORD:
         return None
     if given == "t":
         return "t", ""
@@ -413,7 +413,7 @@ def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
     known = (*JOINT_CHANNEL_UNITS, *AXES, *_COMPONENTS)
     if not name or kind not in known:
         what = f"the meaning '{given}' of column '{column}' is unknown"
-        allowed = f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with the name of a joint, point or sensor and the "
+        allowed = f"t, {base.SKIP_COLUMN_KEYWORD}, or KIND:NAME with the name of a joint, point or sensor and the "
         allowed += f"kind {', '.join(known)}"
         hint = nearest_name_question(kind, known) or f"{column}=position:JOINT"
         hint = f"{column}={kind}:NAME" if kind in known else hint
@@ -425,7 +425,7 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
     places = {meaning: i for i, meaning in enumerate(meanings)}
     for meaning in wanted:
         if meaning not in places:
-            what, skip = f"there is no column for {meaning[0]} of '{meaning[1]}'", base.SKIPPED_COLUMN_MEANING
+            what, skip = f"there is no column for {meaning[0]} of '{meaning[1]}'", base.SKIP_COLUMN_KEYWORD
             allowed = "every channel for all joints, position always; x, y and z of every point and every sensor"
             hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
             raise DataError(what, where=where, allowed=allowed, hint=hint)

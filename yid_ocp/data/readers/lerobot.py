@@ -107,7 +107,7 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
         elif name in _BOOKKEEPING:
             own = ("", "numbers frames and tasks")
         sources.append(base.TopicOrColumnSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
-    units, guesses = base.guess_units(Recording(group))
+    units, guesses = base.guess_non_si_units(Recording(group))
     if "position" in units and _widest(group) <= _MAX_NORMALISED:  # degrees or normalised: reading asks which
         del units["position"]
         guesses = tuple(guess for guess in guesses if not guess.startswith("angles"))

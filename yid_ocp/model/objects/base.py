@@ -44,7 +44,7 @@ class MountSettings:
 
 
 @dataclass(frozen=True)
-class ClampPoseDefinition:
+class ClampPoseFromTwoPoints:
     """Definition of a clamp's pose by two measured points: the origin, and a second point on the z axis.
 
     Two points do not determine the roll angle about z. It is zero at the start (x axis perpendicular to world y), and
@@ -114,10 +114,10 @@ class CableTopology:
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
-    def clamp_pose_definitions_from_points(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
+    def clamp_pose_point_names(self) -> tuple[ClampPoseFromTwoPoints, ClampPoseFromTwoPoints]:
         """Pose definitions of the start clamp and the end clamp."""
         a, b, *_, y, z = self.main_branch_vertex_names
-        return ClampPoseDefinition(START_CLAMP, a, b), ClampPoseDefinition(END_CLAMP, y, z)
+        return ClampPoseFromTwoPoints(START_CLAMP, a, b), ClampPoseFromTwoPoints(END_CLAMP, y, z)
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
@@ -125,7 +125,7 @@ class CableTopology:
 
 
 @dataclass(frozen=True)
-class ObjectWithInitialValues:
+class InitialObjectSettings:
     """An object from the command line of `init`, with initial values of its free parameters."""
 
     settings: ObjectBuilder  # without its mount
@@ -136,7 +136,7 @@ class ObjectWithInitialValues:
 
 
 @dataclass(frozen=True)
-class InitObjectTemplate:
+class InitObjectFactory:
     """Default link number and builder of an object that `init --object` can name.
 
     `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
@@ -144,7 +144,7 @@ class InitObjectTemplate:
     """
 
     default_links: int  # per segment
-    build: Callable[[Mapping[str, Any], int], ObjectWithInitialValues]
+    build: Callable[[Mapping[str, Any], int], InitialObjectSettings]
     # further names that `--number NAME=VALUE` accepts, with their meanings
     further_numbers: Mapping[str, str] = field(default_factory=dict)
     has_branches: bool = False
@@ -196,7 +196,7 @@ class ObjectBuilder:
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
     default_link_refinement: ClassVar[bool] = False
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {}  # words of `init --object`
+    init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("kind of object")]
@@ -249,7 +249,7 @@ class ObjectBuilder:
 class ObjectBetweenClamps(Protocol):
     """Interface of objects that form a whole system with clamps, such as a cable. The clamps follow measured points."""
 
-    def topology(self) -> CableTopology:
+    def branch_vertices(self) -> CableTopology:
         """Return the object's vertices and clamps. Raises `DataError` or `ModelError` if they are inconsistent."""
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
@@ -283,6 +283,6 @@ class MountedObjectBuilder(ObjectBuilder):
 OBJECT_KINDS: Registry[type[ObjectBuilder]] = Registry("kind")
 
 
-def init_object_templates() -> dict[str, InitObjectTemplate]:
+def init_object_templates() -> dict[str, InitObjectFactory]:
     """Templates of flexible objects by the value of `init --object` that selects them."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

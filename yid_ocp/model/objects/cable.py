@@ -37,7 +37,7 @@ from yid_ocp.model.system import Grasp, System, SystemBuildArguments, six_joint_
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
-SHAPE_MEMORY_HALVING_SPEED_PARAMETER = "start.speed_scale"
+INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
 # Parameters of a joint whose rest angle follows from the start: its angle [rad] and torque [N m] there.
@@ -47,7 +47,7 @@ INITIAL_RMS_SPEED_PARAMETER = "start.speed"
 
 
 @dataclass(frozen=True)
-class CableBranchRigidityAndLinearDensity:
+class CableBranchRigidityDampingAndDensity:
     """Nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
 
     bend_rigidity: float = 1.5e-3  # a configuration sets this and the next two under `parameters`
@@ -68,10 +68,11 @@ class CableOptions:
     entry have the `default_branch`. `gravity` is in m/s^2.
     """
 
-    branch_density_and_damping: Annotated[
-        Mapping[str, CableBranchRigidityAndLinearDensity], OptionInfo("by name of the branch; the main one is `parent`")
+    branch_properties_by_name: Annotated[
+        Mapping[str, CableBranchRigidityDampingAndDensity],
+        OptionInfo("by name of the branch; the main one is `parent`"),
     ] = field(default_factory=dict)
-    default_branch: CableBranchRigidityAndLinearDensity = field(default_factory=CableBranchRigidityAndLinearDensity)
+    default_branch: CableBranchRigidityDampingAndDensity = field(default_factory=CableBranchRigidityDampingAndDensity)
     radius: Annotated[float, Gt(0), Le(1), OptionInfo("radius of the cylinders for the links' inertia", "m")] = 0.005
     end_clamp_grasp_kind: Annotated[
         Literal["axis", "weld"],
@@ -104,7 +105,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
 
 
-def parameters_from_edge_lengths(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+def length_parameters_from_edges(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of a cable's length parameters from its edge lengths [m]."""
     values = {f"{START_CLAMP}.length": lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]]}
     for name, chain in cable.vertex_names_by_branch.items():
@@ -167,7 +168,7 @@ def _with_memory(item: flexible.FlexibleObject, memory: float) -> flexible.Flexi
     text = "speed of the vertices at the recording's start"
     speed = Parameter(INITIAL_RMS_SPEED_PARAMETER, 0.0, "m/s", 0.0, np.inf, text)
     text = "start speed at which the memory counts half"
-    scale = Parameter(SHAPE_MEMORY_HALVING_SPEED_PARAMETER, 0.3, "m/s", 1e-3, np.inf, text)
+    scale = Parameter(INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
     for spring in item.elastic_joints:
@@ -225,7 +226,7 @@ def _segments(
         carried.append(carried[-1] @ turn)
     segments = []
     for name, chain in cable.vertex_names_by_branch.items():
-        branch = options.branch_density_and_damping.get(name, options.default_branch)
+        branch = options.branch_properties_by_name.get(name, options.default_branch)
         if name == cable.parent_segment:
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
@@ -267,14 +268,14 @@ model:
     undeformed_shape_file: undeformed.csv
     end_clamp_grasp_kind: axis
 """,
-        "model.object.branch_density_and_damping.NAME": """\
+        "model.object.branch_properties_by_name.NAME": """\
 model:
   object:
     kind: cable
     main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
     child_branch_vertex_names: {side: [p2, s1, s2]}
-    branch_density_and_damping:
+    branch_properties_by_name:
       side: {linear_density: 0.03, has_separate_twist_damping: true}    # [kg/m]
 """,
     }
@@ -293,18 +294,18 @@ model:
         OptionInfo("CSV table with the columns point, x, y, z [m]"),
     ]
 
-    def topology(self) -> CableTopology:
+    def branch_vertices(self) -> CableTopology:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
         found = CableTopology(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
-        for name in self.branch_density_and_damping:
-            where = f"model.object.branch_density_and_damping.{name}"
+        for name in self.branch_properties_by_name:
+            where = f"model.object.branch_properties_by_name.{name}"
             require_known_names([name], found.vertex_names_by_branch, "branch", where, ModelError)
         return found
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
-        return clamped_cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
+        return clamped_cable_system(edge_lengths, self.branch_vertices(), replace(self, gravity=gravity))
 
     def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         if not self.has_edge_lengths_per_recording:
             return {}
-        return parameters_from_edge_lengths(self.topology(), edge_lengths)
+        return length_parameters_from_edges(self.branch_vertices(), edge_lengths)

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectTemplate, MountedObjectBuilder, ObjectWithInitialValues
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitialObjectSettings, InitObjectFactory, MountedObjectBuilder
 from yid_ocp.options import OptionInfo
 
 _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]
@@ -34,10 +34,10 @@ def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObje
     return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     names = [f"{segment.name}.{quantity}" for segment in foam_y_segments() for quantity in ("bend", "twist")]
     values, text = dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]"
-    return ObjectWithInitialValues(_FoamY(links=links), values, text, True)
+    return InitialObjectSettings(_FoamY(links=links), values, text, True)
 
 
 @OBJECT_KINDS.register("foam_y")
@@ -45,7 +45,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialVal
 class _FoamY(MountedObjectBuilder):
     """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the position of that experiment."""
 
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {"foam_y": InitObjectTemplate(4, _init_object)}
+    init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {"foam_y": InitObjectFactory(4, _init_object)}
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: foam_y": """\
 model:

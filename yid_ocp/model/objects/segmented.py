@@ -13,7 +13,7 @@ from yid_ocp.files import attributes_to_dict
 from yid_ocp.model.flexible import FlexibleSegment
 from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectTemplate, MountedObjectBuilder, ObjectWithInitialValues
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitialObjectSettings, InitObjectFactory, MountedObjectBuilder
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -85,20 +85,20 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
     return SegmentGeometrySettings(values_given_as_rigidities=True, clamped_at_base=more.get("parent") is None, **more)
 
 
-def _init_object(word: str, segments: Mapping[str, SegmentGeometrySettings]) -> ObjectWithInitialValues:
+def _init_object(word: str, segments: Mapping[str, SegmentGeometrySettings]) -> InitialObjectSettings:
     item = _SegmentedObject(named_segments=segments)
     start = base.initial_parameters_with_comments(item.segment_definitions(), _RIGIDITY_RATIO[word])
-    return ObjectWithInitialValues(item, start)
+    return InitialObjectSettings(item, start)
 
 
-def _cable(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
+def _cable(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_AND_MASS_DESCRIPTIONS)
     section = _section(numbers)
     segment = _init_segment(links, length, mass, None if section else radius, cross_section_size=section)
     return _init_object("cable", {"cable": segment})
 
 
-def _beam(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
+def _beam(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     sizes = {name: base.SIZE_AND_MASS_DESCRIPTIONS[name] for name in ("length", "mass")}
     length, mass = base.required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
@@ -109,7 +109,7 @@ def _beam(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
     return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section_size=section)})
 
 
-def _tree(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
+def _tree(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     if numbers.get("branch"):
         return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
     if not numbers.get("branches"):
@@ -170,10 +170,10 @@ class _SegmentedObject(MountedObjectBuilder):
     """A flexible object built from segments (cable, beam, tube with branches), on a robot or fixed in the world."""
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
-        "cable": InitObjectTemplate(8, _cable),
-        "beam": InitObjectTemplate(6, _beam),
-        "tree": InitObjectTemplate(4, _tree, has_branches=True),
+    init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {
+        "cable": InitObjectFactory(8, _cable),
+        "beam": InitObjectFactory(6, _beam),
+        "tree": InitObjectFactory(4, _tree, has_branches=True),
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: segments": """\

@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectTemplate, MountedObjectBuilder, ObjectWithInitialValues
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitialObjectSettings, InitObjectFactory, MountedObjectBuilder
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -21,12 +21,12 @@ _SEGMENT = "rod"
 _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> ObjectWithInitialValues:
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     length, mass, radius, tip = base.required_object_numbers(
         "a tapered rod", numbers, base.SIZE_AND_MASS_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return ObjectWithInitialValues(item, base.initial_parameters_with_comments(item.segment_definitions(), 1.0))
+    return InitialObjectSettings(item, base.initial_parameters_with_comments(item.segment_definitions(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
@@ -39,8 +39,8 @@ class TaperedRod(MountedObjectBuilder):
     """
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
-        "tapered_rod": InitObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
+    init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {
+        "tapered_rod": InitObjectFactory(8, _init_object, _FURTHER_NUMBERS)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: tapered_rod": """\

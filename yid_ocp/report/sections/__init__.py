@@ -12,7 +12,7 @@ from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import EpisodeAndPrediction
+from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.registry import Registry
 from yid_ocp.report.animation import AnimationData
 from yid_ocp.solvers import Solution
@@ -34,7 +34,7 @@ class ReportData:
     result: Mapping[str, Any]
     problem: EstimationProblem | None = None
     solution: Solution | None = None
-    held_out: Sequence[EpisodeAndPrediction] = ()
+    held_out: Sequence[PredictedEpisodeOrFailure] = ()
     animations: Sequence[AnimationData] = ()
     robot: str | None = None
     section_data: Mapping[str, Any] = field(default_factory=dict)

@@ -328,7 +328,7 @@ def _curves(
                     squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
                     part = sensor.output_names[column].removeprefix(channel).lstrip(".")
                     name = f"{channel}, {part}" if part else channel
-                    pair = figures.prediction_and_residual_plot_data(name, sensor.unit, t, y, std, lines)
+                    pair = figures.channel_prediction_and_residual_plot_data(name, sensor.unit, t, y, std, lines)
                     found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, pair))
     if not found:
         return None
@@ -349,10 +349,10 @@ def _curves(
 
 
 def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
-    if not finding.accepted_effects or not finding.nominal_changes:
+    if not finding.accepted_effects or not finding.nominal_parameters_before_and_after:
         return None
     rows, moved = [], []
-    for name, entry in finding.nominal_changes.items():
+    for name, entry in finding.nominal_parameters_before_and_after.items():
         std, before, after = finding.nominal_model.std.get(name, 0.0), entry["before"], entry["after"]
         values = {"fitted without the effects": (before, std), _EXTENDED_LABEL: (after, entry["std"])}
         rows.append((name, entry["unit"], values))

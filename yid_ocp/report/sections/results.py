@@ -209,7 +209,7 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
     for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
         if not isinstance(prediction, str):
-            shared, _ = problem.unpack_unknown_vector(solution.x, i)
+            shared, _ = problem.unpack_episode_unknowns(solution.x, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
             yield _PredictedEpisode(role, problem, theta, episode, prediction)
 
@@ -279,7 +279,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
         t = grid.start_time + grid.time_step * (samples.node + samples.fraction)
         if sensor.point_names and len(t) < grid.steps / 2:
             # readings of a slow sensor at every node
-            values = own.problem.predictor.state_values_at_nodes(own.prediction.rollout)
+            values = own.problem.predictor.rollout_node_values(own.prediction.rollout)
             course = own.problem.model_functions.compiled_sensor_function(sensor)(values, own.theta).output
         names, width = sensor.channel_names, sensor.outputs_per_channel
         parts = {name: range(width * c, width * (c + 1)) for c, name in enumerate(names)} if width > 1 else {}
@@ -289,7 +289,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
                 name = sensor.output_names[i].rsplit(".", 1)[1]
                 told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
-                curves += figures.prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
+                curves += figures.channel_prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
             yield title, curves
 
 
