@@ -515,14 +515,14 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
     shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
     with contextlib.suppress(DataError):
         fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
+        seen = [s for s in early.measurements if s.node[0] * episode.grid.time_step <= _MAX_RESTING_TIME]
+        seen = [replace(s, node=np.zeros(1, np.int64), fraction=np.zeros(1)) for s in seen]
         # an equilibrium near this configuration has the details
-        fitted_shape = fit(at, early.measurements, own, _MAX_RESTING_TIME, episode.prescribed_path, roughly=True)
-        shapes.append(fitted_shape.state[:n])
+        shapes.append(fit(at, seen, own, _MAX_RESTING_TIME, episode.prescribed_path, roughly=True).state[:n])
     others = [predictor.initial_state_and_derivative(episode, own, offset, (), shape).state[:n] for shape in shapes]
     errors = [_first_points_error(predictor, replace(early, equilibrium_guess=q), theta) for q in others]
-    best = int(np.argmin(errors))
-    is_better = errors[best] < _MAX_REMAINING_ERROR_FRACTION * error
-    return replace(episode, equilibrium_guess=others[best]) if is_better else episode
+    best, enough = int(np.argmin(errors)), _MAX_REMAINING_ERROR_FRACTION * error
+    return replace(episode, equilibrium_guess=others[best]) if errors[best] < enough else episode
 
 
 def _until_first_points(episode: Episode) -> Episode | None:
