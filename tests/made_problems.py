@@ -57,7 +57,7 @@ class MadeUp:
         priors: Mapping[str, float] | None = None,
     ) -> None:
         self._rows, self._stated, self._weak, self.duration = rows, stated, weak, duration
-        self.rms_noise_of_data_residuals = noise
+        self.stated_rms_noise_of_data_residuals = noise
         self.initial_unknowns = np.array(start, float)
         size = len(self.initial_unknowns)
         self.unknown_names = tuple(f"k{i}" for i in range(size))
@@ -91,7 +91,7 @@ class MadeUp:
         data = (self._count - self._stated - self._weak) if i == 0 else 0
         node = np.linspace(0, steps, data).astype(int)
         group = samples(
-            ("points.tip",), np.full((data, 1), self.rms_noise_of_data_residuals),
+            ("points.tip",), np.full((data, 1), self.stated_rms_noise_of_data_residuals),
             positive_weight_mask=np.ones((data, 1), bool), value=np.zeros((data, 1)), node=node,
             fraction=np.zeros(data), n_residuals=data,
         )  # fmt: skip

@@ -59,7 +59,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 
 @contextlib.contextmanager
-def limit_process_memory() -> Iterator[None]:
+def process_memory_limit() -> Iterator[None]:
     """Limit this process to 1.75 GiB beyond its present memory use (context manager; effective on Linux only).
 
     It protects against libraries that unpack input files: a larger request raises MemoryError.

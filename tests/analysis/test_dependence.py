@@ -9,9 +9,9 @@ from small_problems import pendulum_step
 
 from yid_ocp.analysis.discretisation import min_gap_by_grasp_at_robot_posture, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
-    linearise_step_equations,
     parameter_equations_and_responses,
     step_complexity_summary,
+    step_equation_jacobians_at_state,
 )
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -42,7 +42,7 @@ def judged(problem):
     rest = EquilibriumSolver(step).solve(episode.initial_known_coordinates, problem.theta, torque)
     assert rest.is_converged
     path = episode.initial_known_coordinates[len(system.driven) :]
-    rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
+    rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, problem.theta, path)
     symbols = NamedStepEquations.from_equations(step.equations)
     found = parameter_equations_and_responses(step, symbols, episode, rest.state, problem.theta, rows)
     return {entry.parameter: entry for entry in found}, rest, rows
@@ -174,7 +174,7 @@ def test_without_sensors_only_rows_are_said(hanging):
     symbols = NamedStepEquations.from_equations(step.equations)
     theta = step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
-    rows = linearise_step_equations(step, rest.state, rest.holding_torque, theta, np.zeros(0))
+    rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, theta, np.zeros(0))
     found = {e.parameter: e for e in parameter_equations_and_responses(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].observable_rows is None
     assert (found["T1.twist"].max_change_from_rest, found["T1.twist"].seconds) == (None, 0.0)

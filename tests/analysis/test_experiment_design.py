@@ -379,7 +379,7 @@ def drawn_motion(monkeypatch):
             row[:, feedback.state_indices] -= s.state_by_torque @ gain
         return [(np.stack(rows), None)]
 
-    monkeypatch.setattr(propagation, "next_state_and_effort_derivatives", maps)
+    monkeypatch.setattr(propagation, "iterate_step_derivatives", maps)
     monkeypatch.setattr(
         propagation, "applied_torque_derivative_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )

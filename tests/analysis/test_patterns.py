@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_recordings import holding_pendulum
 
-from yid_ocp.analysis.step_diagnostics import linearise_step_equations, step_sparsity_patterns
+from yid_ocp.analysis.step_diagnostics import step_equation_jacobians_at_state, step_sparsity_patterns
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -38,7 +38,7 @@ def test_patterns_of_a_step_hold_its_matrices(step):
     torque = rest.holding_torque + rng.normal(size=sizes["nu"])
     pair = (path, path) if len(path) else None
     a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
-    rows = linearise_step_equations(step, state, torque, theta, path)
+    rows = step_equation_jacobians_at_state(step, state, torque, theta, path)
     kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), step.system.prescribed_coordinate_indices)
     found = step_sparsity_patterns(symbols)
     for name, matrix in (

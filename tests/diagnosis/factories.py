@@ -30,7 +30,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult
-from yid_ocp.inference.smoother import GapLocation, SmoothedEstimates, SmoothedUnknownsResult
+from yid_ocp.inference.smoother import GapLocation, SmoothedDisturbances, SmoothedUnknownsResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation
@@ -164,12 +164,12 @@ READ_FORCE, BIAS = SmoothedUnknownGroup("elbow", "force", True), SmoothedUnknown
 OFFSET = SmoothedUnknownGroup("left", "offset")
 
 
-def trace(sources: Sequence[SmoothedUnknownGroup], mean, std, recording="run") -> SmoothedEstimates:
+def trace(sources: Sequence[SmoothedUnknownGroup], mean, std, recording="run") -> SmoothedDisturbances:
     """Unknowns of a recording, one column each, over intervals of half a second."""
     mean, std = np.asarray(mean, float), np.asarray(std, float)
     edges = 0.5 * np.arange(len(mean) + 1)
     names = tuple(f"{source.location}.{i}" for i, source in enumerate(sources))
-    return SmoothedEstimates(recording, edges, names, tuple(sources), np.ones(len(sources)), mean, std)
+    return SmoothedDisturbances(recording, edges, names, tuple(sources), np.ones(len(sources)), mean, std)
 
 
 def smoothed(

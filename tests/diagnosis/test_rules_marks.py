@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.blind_scores import (
     score_blind_case,
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.refit import EffectSearchResults
+from yid_ocp.diagnosis.refit import EffectSearchRecord
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
@@ -310,7 +310,7 @@ def diagnosed(decrease=180.0, there=0.5):
     refits[f"{FRICTION.label} on the held-out recordings"] = model([FRICTION], 1.0, 50.0, there)
     beside = screening([score(WEAK, p=0.5), score(STRANGE, p=0.6)])
     known = {"screening": screening(ranked), "nominal_model": fit((), loss(3.0, 3.2), 100.0, {"k": 2.0})}
-    record = EffectSearchResults(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
+    record = EffectSearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
     named = {"single_effect_models": (refits[FRICTION.label],), "selected_effects": (added(FRICTION),)}
     return finding(**named, record=record, located_gap=(place("elbow"),), **known)
 

@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.select import (
     _refit_shortlist,
     bic_difference,
     held_out_gap_closure,
-    held_out_improvement,
+    held_out_improvement_and_error,
     select_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -91,11 +91,11 @@ def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks():
 
 def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
     before, after = loss(3.0, 4.0, 2.0, count=10.0), loss(2.0, 2.0, 2.0, count=10.0)
-    gained, error = held_out_improvement(before, after)
+    gained, error = held_out_improvement_and_error(before, after)
     assert gained == pytest.approx(1.0)
     # blocks differ by 10, 20 and 0: their standard deviation is 10, and there are three of them
     assert error == pytest.approx(math.sqrt(3) * 10.0 / 30.0)
-    assert held_out_improvement(after, before) == pytest.approx((-gained, error))
+    assert held_out_improvement_and_error(after, before) == pytest.approx((-gained, error))
 
 
 SMALL = effect("small@x", amplitude())
@@ -469,7 +469,7 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     spring = fit([effect("spring@elbow", amplitude("a"), amplitude("b"))], loss(1.0, 1.0), cost=100.0)
     offset = fit([effect("offset@elbow")], loss(1.01, 1.01), cost=101.0)
     spring, offset = (replace(own, residual_count=100) for own in (spring, offset))
-    assert held_out_improvement(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
+    assert held_out_improvement_and_error(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
     assert bic_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
     assert near(spring, offset) == ["offset@elbow", "spring@elbow"]
@@ -627,6 +627,6 @@ def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
     counts = np.full(8, 10.0)
     before, after = HeldOutLoss(2 * counts, counts, {}, 800.0), HeldOutLoss(3 * counts, counts, {}, 0.0)
     assert (before.chi2_per_sample, after.chi2_per_sample) == (12.0, 3.0)
-    assert held_out_improvement(before, after) == (pytest.approx(9.0), 0.0)
+    assert held_out_improvement_and_error(before, after) == (pytest.approx(9.0), 0.0)
     found = held_out_gap_closure(before, after)
     assert (found.fraction, found.ci_low, found.ci_high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))

@@ -163,7 +163,7 @@ def searched(limits, rounds=50):
     read = {"sensitivities_to_unknowns": line, "sensitivity_derivatives_by_coefficients": slopes}
     experiment = SimpleNamespace(simulator=simulator, **read)
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
-    kept = SimpleNamespace(limit_rows=bounded, limited_quantity_values=lambda rolled, w: values(w.ravel()))
+    kept = SimpleNamespace(limit_rows=bounded, limited_values_and_jacobian=lambda rolled, w: values(w.ravel()))
     search = InformativeMotionSearch(experiment, kept, DOptimalityCriterion((0, 1), (0, 1)))
     return search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
 

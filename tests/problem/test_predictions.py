@@ -14,8 +14,8 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     _noisy,
+    measured_point_positions,
     naive_cable_predictions,
-    recorded_point_positions,
     rmse_unit_and_count_by_channel,
 )
 
@@ -205,7 +205,7 @@ CABLE = CableTopology(PARENT, CHILDREN, dict.fromkeys(NAMES, (0.0, 0.0, 0.0)))
 
 def test_stay_repeats_the_last_given_frame(recording):
     predicted = naive_cable_predictions(recording, CABLE, NAMES)["stays"]
-    np.testing.assert_array_equal(predicted[:2], recorded_point_positions(recording, NAMES)[:2])
+    np.testing.assert_array_equal(predicted[:2], measured_point_positions(recording, NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from small_problems import joints, recording, seen
 
 from yid_ocp.errors import DataError
-from yid_ocp.model.objects.base import ClampPoseFromTwoPoints
+from yid_ocp.model.objects.base import ClampPosePointNames
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,
@@ -190,7 +190,7 @@ def clamped(origin, towards, t=None):
 
 
 def path_of(made, grid):
-    return prescribed_coordinates_at_nodes(made, moving(*AXES), grid, PLAIN, (ClampPoseFromTwoPoints("end", "o", "d"),))
+    return prescribed_coordinates_at_nodes(made, moving(*AXES), grid, PLAIN, (ClampPosePointNames("end", "o", "d"),))
 
 
 AXES = tuple(f"end_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))

@@ -9,7 +9,7 @@ from small_problems import efforts, joints, measured, points, recording, seen
 from yid_ocp.errors import DataError
 from yid_ocp.problem.measurements import (
     TimeGrid,
-    huber_loss_and_residual_factors,
+    huber_loss_and_sqrt_weights,
     measurements_located_on_grid,
     measurements_with_paper_weights,
     rollout_time_grid,
@@ -47,11 +47,11 @@ def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
 
 def test_hubers_loss_is_square_first_and_then_straight():
     residual = np.array([-1.0, 2.0, 3.0, -8.0, 0.0])
-    cost, factor = huber_loss_and_residual_factors(residual, 2.0)
+    cost, factor = huber_loss_and_sqrt_weights(residual, 2.0)
     assert cost == pytest.approx(0.5 + 2.0 + 2.0 * (3.0 - 1.0) + 2.0 * (8.0 - 1.0))
     assert factor == pytest.approx([1.0, 1.0, math.sqrt(2 / 3), 0.5, 1.0])
     for scale, cost, factor in ((math.inf, 0.5e12, 1.0), (0.0, 0.0, 0.0)):
-        assert huber_loss_and_residual_factors(np.array([1e6]), scale) == (pytest.approx(cost), pytest.approx([factor]))
+        assert huber_loss_and_sqrt_weights(np.array([1e6]), scale) == (pytest.approx(cost), pytest.approx([factor]))
 
 
 TWO = measured(efforts("a", "b"), [0, 1], [0.0, 0.0], [[1.0, NAN], [3.0, 4.0]], [[2.0, 0.0], [0.5, 10.0]])

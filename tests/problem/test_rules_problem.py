@@ -187,14 +187,14 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
     evaluation = problem.evaluate(problem.initial_unknowns + np.array([0.0, 2.0, 0.0]))
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
-    assert problem.rms_noise_of_data_residuals == pytest.approx(noise)
+    assert problem.stated_rms_noise_of_data_residuals == pytest.approx(noise)
     residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     data = problem.residual_rows.data
     np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
     np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)
     assert residual[-1] == 2.0
     assert jacobian[-1].tolist() == [0.0, 1.0, 0.0]
-    assert make().rms_noise_of_data_residuals == 1.0
+    assert make().stated_rms_noise_of_data_residuals == 1.0
 
 
 def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):

@@ -259,7 +259,7 @@ def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, 
     Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has
     the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).
     """
-    if not evaluation.ok or evaluation.jacobian is None or problem.rms_noise_of_data_residuals != 1.0:
+    if not evaluation.ok or evaluation.jacobian is None or problem.stated_rms_noise_of_data_residuals != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}
     found = [*_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]

@@ -423,7 +423,8 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
         return math.inf
     rows = problem.residual_rows.data
     change = np.zeros((len(view.nuisance), 1))
-    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.rms_noise_of_data_residuals
+    moved = evaluation.residual[rows] - view.evaluation.residual[rows]
+    change[rows, 0] = moved / problem.stated_rms_noise_of_data_residuals
     return float(np.linalg.norm(_orthogonal_part(change, view.nuisance))) / view.inflation
 
 

@@ -135,7 +135,7 @@ def evaluate_for_each_parameter_at_optimum(
     names: Sequence[str],
     progress: Progress,
 ) -> dict[str, _Found]:
-    """Minimise the cost once from `x`; call `judged` in parallel with each name, the minimum and its evaluation."""
+    """Minimise the cost from `x`, then call `judged`(name, minimum, its evaluation) in parallel for every name."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 

@@ -30,7 +30,7 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
     return {"sizes": step.sizes, **counts, "functions": found}
 
 
-def linearise_step_equations(
+def step_equation_jacobians_at_state(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepResidualsAndJacobians:
     """Linearise the step equations, also by all parameters, at a state (nx,), torque (nu,) [N m] and path (nc,)."""

@@ -39,7 +39,7 @@ class SectionVariants:
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
     def variants_for_entry(self, name: str, where: str) -> SectionVariants:
-        """Settings classes for a mapping's entry `name`: the class of that name, or all classes."""
+        """Settings class of a mapping's entry `name`, or all classes if another key than the name selects the class."""
         if self.selector_key != "name":
             return self
         if name not in self.classes:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.sensors.base import EffortSamplingKind, additional_channel_kinds_of_group
+from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_of_sensor_group
 
 RecordedOrNominalClock = Literal["recorded", "nominal"]
 
@@ -106,7 +106,7 @@ class JointGroup(ReprMixin):
 
     @property
     def effort_sampling_kind_or_default(self) -> EffortSamplingKind:
-        """Meaning of effort samples (`effort_kind`). The default is `sample`, which is what robot drivers publish."""
+        """Whether effort samples are values or means (`effort_kind`). The default is `sample`, as drivers publish."""
         return self.effort_kind or "sample"
 
     def _summary(self) -> ReprTexts:
@@ -470,7 +470,7 @@ def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
 
 def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    declared = {channel.quantity: channel for channel in additional_channel_kinds_of_group(group.name)}
+    declared = {channel.quantity: channel for channel in channel_kinds_of_sensor_group(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
     allowed, hint = ", ".join(declared), "add a dataset of this name, or leave the group out"

@@ -19,7 +19,7 @@ import scipy.stats
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
-from yid_ocp.diagnosis.refit import EffectSearchResults, RefitContext, RefitStatistics
+from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import (
     EMPTY_SCREENING_RESULT,
     CandidateDetectability,
@@ -512,7 +512,7 @@ class _RecordedCase:
         self.evidence = NominalModelGapEvidence(nominal, before, held, screened, data["has_left_baseline"])
         located = data["located_gap"] or {"locations": ()}
         self.located_gap = tuple(restored(GapLocation, place) for place in located["locations"])
-        self.record = EffectSearchResults(
+        self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
             {

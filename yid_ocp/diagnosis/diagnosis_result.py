@@ -13,7 +13,7 @@ from yid_ocp.diagnosis.baseline import CounterfactualErrorsOfFoundEffects, Param
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.law import GapLaw
-from yid_ocp.diagnosis.refit import EffectSearchResults, RefitStatistics, RefittedModel
+from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.select import (
     UNDEFINED_GAP_CLOSURE,
@@ -67,7 +67,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     summary: str = ""
     truncated_recordings: tuple[HeldOutTruncation, ...] = ()
     located_gap: tuple[GapLocation, ...] = ()  # of the nominal model, by the smoother
-    record: EffectSearchResults = field(default_factory=EffectSearchResults)
+    record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first
     search_seconds: float = 0.0  # from the start to the end of the search for effects

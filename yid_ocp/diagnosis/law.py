@@ -18,7 +18,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import KEPT_FRACTIONS_BEFORE_FAILURE, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
-from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement
+from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement_and_error
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.law import (
     TORQUE_LAW_QUANTITY_UNITS,
@@ -155,7 +155,7 @@ def find_gap_law(
             best = better[0]
     closure = held_out_gap_closure(before.held_out_loss, best.loss)
     least = _MIN_LEFTOVER_CLOSURE if last.effects else search.thresholds.min_gap_closed
-    gained, error = held_out_improvement(before.held_out_loss, best.loss)
+    gained, error = held_out_improvement_and_error(before.held_out_loss, best.loss)
     if not (gained > error and closure.ci_low > least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
@@ -198,7 +198,7 @@ def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw],
     """Whether a refit's held-out chi2/n is close to the best (the first), with the fewest quantities of such refits."""
 
     def is_as_good(own: _RefittedLaw) -> bool:
-        gained, error = held_out_improvement(own.loss, found[0].loss)
+        gained, error = held_out_improvement_and_error(own.loss, found[0].loss)
         return gained <= max(2 * error, slack)
 
     fewest = min(len(own.law.quantities) for own in found if is_as_good(own))

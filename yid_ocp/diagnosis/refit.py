@@ -150,7 +150,7 @@ class NominalSolutionAndRefitStore:
 
 
 @dataclass(frozen=True)
-class EffectSearchResults:
+class EffectSearchRecord:
     """All results that a search for effects requested, by name. Other rules can reuse them without refits."""
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
@@ -169,7 +169,7 @@ class RefitContext:
     store: RefitStore = NO_REFIT_STORE
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
-    record: EffectSearchResults = field(default_factory=EffectSearchResults)  # likewise
+    record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
 
     def record_skip_if_past_deadline(self, *what: str) -> bool:

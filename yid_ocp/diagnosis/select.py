@@ -86,7 +86,7 @@ def _leaves_little(nominal: RefitStatistics, fit: RefitStatistics, limits: Thres
     return fit.held_out_loss.excess_chi2_per_sample < most
 
 
-def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
+def held_out_improvement_and_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
     """Decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
     total = float(before.block_sample_counts.sum())
     difference = before.block_chi2 - after.block_chi2
@@ -153,7 +153,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     parameters outweigh a larger loss as in BIC, with blocks as samples.
     """
     loss, best = fit.held_out_loss, other.held_out_loss
-    (lost, error), count = held_out_improvement(loss, best), len(best.block_chi2)
+    (lost, error), count = held_out_improvement_and_error(loss, best), len(best.block_chi2)
     fewer = other.total_effect_parameter_count - fit.total_effect_parameter_count
     fewer *= best.chi2_per_sample > _MODEL_ERROR_CHI2
     if lost <= math.expm1(fewer * math.log(count) / count) * best.chi2_per_sample:
@@ -183,7 +183,7 @@ def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better."""
     before, after = without.held_out_loss, fit.held_out_loss
-    gained, error = held_out_improvement(before, after)
+    gained, error = held_out_improvement_and_error(before, after)
     is_clear = gained > max(error, limits.min_gap_closed * before.excess_chi2_per_sample)
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor

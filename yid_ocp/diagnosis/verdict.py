@@ -190,7 +190,7 @@ def _verdict_and_reason(
 def judge(
     search: RefitContext, evidence: NominalModelGapEvidence, finished: Callable[[str], None] = lambda _: None
 ) -> Judgement:
-    """Decide the verdict from the evidence for a gap and from the results of a search for effects.
+    """Search for effects if there is evidence for a gap, and decide the verdict.
 
     Refits and screenings are requested by name and can come from a record, so the verdict depends on numbers alone.
     `finished` is called with the name of each stage.

@@ -167,7 +167,7 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
 def support_in_export_format_by_parameter(
     system: System, effects: Mapping[str, FeatureExportSupport], form: str
 ) -> dict[str, FeatureExportSupport]:
-    """Support of the export format `form` for each parameter. Parameters of an effect have its support in `effects`."""
+    """Whether the format `form` can hold each parameter. Parameters of an effect have its support in `effects`."""
     found = {}
     for entry in system.parameters:
         owner = entry.name.rpartition(".")[0]

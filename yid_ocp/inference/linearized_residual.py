@@ -166,7 +166,7 @@ def residual_and_jacobian_without_weak_priors(
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
     units = np.ones(len(evaluation.residual))
-    units[rows.data] = problem.rms_noise_of_data_residuals
+    units[rows.data] = problem.stated_rms_noise_of_data_residuals
     units = units[kept := rows.slice_without_weak_priors]
     return evaluation.residual[kept] / units, evaluation.jacobian[kept] / units[:, None]
 
@@ -198,7 +198,7 @@ def predicted_cost_reduction_by_step(jacobian: Array, residual: Array, step: Arr
 
 def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
     """Whether no step from `x` predicts a relevant cost reduction. Returns False without a Jacobian."""
-    noise = problem.rms_noise_of_data_residuals**2
+    noise = problem.stated_rms_noise_of_data_residuals**2
     worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * noise)
     return achievable_cost_reduction(problem, x, evaluation) <= worth
 

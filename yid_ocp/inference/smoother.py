@@ -54,7 +54,7 @@ _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promisin
 
 
 @dataclass(frozen=True)
-class SmoothedEstimates:
+class SmoothedDisturbances:
     """Smoothed unknown forces, offsets and biases of one recording, with mean and standard deviation per interval."""
 
     recording: str
@@ -70,7 +70,7 @@ class SmoothedEstimates:
 class SmoothedUnknownsResult:
     """Result of the weak-constraint smoother: smoothed unknowns and the evidence for each group."""
 
-    smoothed_unknowns: tuple[SmoothedEstimates, ...]
+    smoothed_unknowns: tuple[SmoothedDisturbances, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # variance at the largest evidence [squared reference]
     log_evidence_drop: dict[SmoothedUnknownGroup, float]  # fall of the log evidence without the group
     detectable_std: dict[SmoothedUnknownGroup, float]  # smallest detectable size by the model alone [reference]
@@ -397,13 +397,12 @@ def force_log_likelihood_coefficients(
     return products[split:, 0] - cross @ weighed[:, 0], products[split:, split:] - cross @ weighed[:, 1:]
 
 
-def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedEstimates:
+def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedDisturbances:
     """The unknowns of one recording, with the free parameters' own uncertainty."""
-    by_theta = done.mean[:, :, 1:]
-    smoothed = done.mean[:, :, 0] - by_theta @ state.shift
-    spread = done.covariance + np.sum((by_theta @ state.spread) * by_theta, axis=2)
+    smoothed, by_theta = done.mean[:, :, 0] - done.mean[:, :, 1:] @ state.shift, done.mean[:, :, 1:]
+    spread = np.sqrt(np.maximum(done.covariance + np.sum((by_theta @ state.spread) * by_theta, axis=2), 0.0))
     named = model.unknown_names, model.unknown_groups, model.reference_std
-    return SmoothedEstimates(model.recording, model.interval_edges, *named, smoothed, np.sqrt(np.maximum(spread, 0.0)))
+    return SmoothedDisturbances(model.recording, model.interval_edges, *named, smoothed, spread)
 
 
 def _explained(models: _Models, variance: _Variances, plain: _State, state: _State) -> tuple[float, float, float, int]:
@@ -487,7 +486,7 @@ def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tupl
     return _by_share(found)
 
 
-def smoothed_unknown_significance_mask(trace: SmoothedEstimates, columns: Sequence[int]) -> BoolArray:
+def smoothed_unknown_significance_mask(trace: SmoothedDisturbances, columns: Sequence[int]) -> BoolArray:
     """Mask (J, columns) of the unknowns of `trace` that are more than `SIGNIFICANT_Z` stds from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > SIGNIFICANT_Z * std)
@@ -560,7 +559,7 @@ def z_scores_of_smoothed_unknowns(
     return trace.interval_edges, trace.unknown_names, values
 
 
-def smoothed_unknown_units(system: System, trace: SmoothedEstimates) -> tuple[str, ...]:
+def smoothed_unknown_units(system: System, trace: SmoothedDisturbances) -> tuple[str, ...]:
     """SI unit of every smoothed unknown in `trace`: of a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}

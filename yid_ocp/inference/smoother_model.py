@@ -31,7 +31,7 @@ from yid_ocp.inference.linearized_residual import (
 )
 from yid_ocp.integrator.step import (
     input_or_servo_torques_of_rollout,
-    next_state_and_effort_derivatives,
+    iterate_step_derivatives,
     reachable_and_observable_state_mask,
 )
 from yid_ocp.model.kinematics import forward_kinematics
@@ -299,7 +299,7 @@ def _steps(
         # as that of this step)
         followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
         inputs = feedback.gain @ followed
-    for pair in next_state_and_effort_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
+    for pair in iterate_step_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
         push, done = pushes[done : done + len(pair[0])], done + len(pair[0])
         by_state = (one[:, :, moving] for one in pair)
         by_load = [one[:, :, nx : nx + width] + one[:, :, nx + width :] for one in pair]

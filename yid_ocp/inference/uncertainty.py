@@ -291,7 +291,7 @@ def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation)
     """Cost of data (in noise units) and stated priors, without weak priors."""
     rows = problem.residual_rows
     weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
-    return (evaluation.cost - weak - stated) / problem.rms_noise_of_data_residuals**2 + stated
+    return (evaluation.cost - weak - stated) / problem.stated_rms_noise_of_data_residuals**2 + stated
 
 
 def parameter_verdict(

@@ -43,7 +43,7 @@ from yid_ocp.inference.linearized_residual import (
     ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import next_state_and_effort_derivatives, reachable_and_observable_state_mask
+from yid_ocp.integrator.step import iterate_step_derivatives, reachable_and_observable_state_mask
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -212,7 +212,7 @@ def _filter_steps(
     moves, blocks = np.empty((count, ns, len(columns))), list[Array]()
     observe, by_torque, projected = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu)), np.empty((ends[-1], na))
     along = course.model_functions.step, course.theta, course.rollout
-    for state, effort in next_state_and_effort_derivatives(*along, inputs, feedback):
+    for state, effort in iterate_step_derivatives(*along, inputs, feedback):
         span = slice(begun, begun + len(state))
         move = moves[span]
         move[:] = state if ns == nx else state[:, kept[:, None], columns]

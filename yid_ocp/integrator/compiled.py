@@ -227,10 +227,10 @@ class CompiledKernel:
         self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
 
-    def next_state_and_effort_derivatives(
+    def iterate_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, in C; see `step.next_state_and_effort_derivatives`."""
+        """Derivatives of a rollout's steps, in C; see `step.iterate_step_derivatives`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)

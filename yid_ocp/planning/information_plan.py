@@ -194,7 +194,7 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
             allowed = "positions within the limits of the joints"
             hint = "set plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
-    values, _ = limits.limited_quantity_values(mover.simulate_path(still), still)
+    values, _ = limits.limited_values_and_jacobian(mover.simulate_path(still), still)
     broken = limits.worst_value_and_bound_by_violated_limit(values)
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
@@ -360,7 +360,7 @@ def _active(
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
-    values = limits.limited_quantity_values(mover.simulate_path(w), w)[0]
+    values = limits.limited_values_and_jacobian(mover.simulate_path(w), w)[0]
     for rows, own in limits.split_values_by_limit_kind(values):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)

@@ -252,7 +252,7 @@ def _outcome(
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
     course = rows.desired_point_trajectory
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
-    broken = rows.worst_value_and_bound_by_violated_limit(rows.limited_quantity_values(rollout, shot.w)[0])
+    broken = rows.worst_value_and_bound_by_violated_limit(rows.limited_values_and_jacobian(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
         message += f"; {name} passes its limit of {what}: {value:.4g} where {bound:.4g} is allowed"

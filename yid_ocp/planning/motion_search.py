@@ -106,7 +106,7 @@ class PlanResidualAndLimitFunctions:
             parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
         return parts
 
-    def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
+    def limited_values_and_jacobian(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
         """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
         Also returns their Jacobian (rows, K nc) with respect to the spline coefficients, K for each of nc prescribed
@@ -216,7 +216,7 @@ class MotionToTargetSearch:
         pairs = zip(self._cases, rollouts, strict=True)
         parts = [rows for case, rollout in pairs for rows in case._goal_residual(rollout, w)]
         value, slope = (np.concatenate(rows) / np.sqrt(len(self._cases)) for rows in zip(*parts, strict=True))
-        limited, by_w = self._cases[0].limited_quantity_values(rollouts[0], w)
+        limited, by_w = self._cases[0].limited_values_and_jacobian(rollouts[0], w)
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
@@ -381,7 +381,7 @@ class InformativeMotionSearch:
 
     def _limited_values(self, w: Array) -> tuple[Array, bool]:
         """Limited quantities of a motion over their limits, and whether its rollout succeeds and satisfies them."""
-        value = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w), w)[0] / self._unit
+        value = self.limits.limited_values_and_jacobian(self.experiment.simulator.simulate_path(w), w)[0] / self._unit
         flat = w.ravel()
         within = np.all((value <= self._high) & (value >= self._low))  # False for values that are not finite
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
@@ -407,7 +407,7 @@ class InformativeMotionSearch:
         while rows is not None and done < rounds and not finished:
             done += 1
             slopes = self.experiment.sensitivity_derivatives_by_coefficients(w, rows)
-            limited, by_w = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w, True), w)
+            limited, by_w = self.limits.limited_values_and_jacobian(self.experiment.simulator.simulate_path(w, True), w)
             if slopes is None or by_w is None:
                 break
             bounded = limited / self._unit, by_w / self._unit[:, None]

@@ -43,7 +43,7 @@ from yid_ocp.problem.evaluation import (
     stated_prior_stds_of_unknowns,
     whitened_prediction_residual,
 )
-from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_residual_factors
+from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_sqrt_weights
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
@@ -212,7 +212,7 @@ class EstimationProblem(ReprMixin):
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0) & ~may_vanish
 
     @property
-    def rms_noise_of_data_residuals(self) -> float:
+    def stated_rms_noise_of_data_residuals(self) -> float:
         """RMS noise of all data residuals: 1 for whitened residuals, else the noise of the points [m]."""
         if self.options.weighting != "paper":
             return 1.0
@@ -301,7 +301,7 @@ class EstimationProblem(ReprMixin):
             pulls = []
             for k, samples in enumerate(self.episodes[i].measurements):
                 raw = samples.whitened_residual(result.predicted_outputs[k])
-                _, factor = huber_loss_and_residual_factors(raw, self.options.huber_threshold)
+                _, factor = huber_loss_and_sqrt_weights(raw, self.options.huber_threshold)
                 pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
             theta, offset = self.unpack_episode_unknowns(x, i)
             own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, theta, offset, pulls)

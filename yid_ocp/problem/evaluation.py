@@ -20,7 +20,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleE
 from yid_ocp.problem.measurements import (
     ResidualAndJacobian,
     SensorMeasurements,
-    huber_loss_and_residual_factors,
+    huber_loss_and_sqrt_weights,
     whiten_against_sensor_biases,
     whitened_measurement_sensitivities_to_sensor_errors,
 )
@@ -139,7 +139,7 @@ def whitened_prediction_residual(
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
         columns = whiten_against_sensor_biases(by_constants, columns)
-    cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
+    cost, factor = huber_loss_and_sqrt_weights(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
 

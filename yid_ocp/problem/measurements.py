@@ -170,7 +170,7 @@ class SensorMeasurements:
     ) -> ResidualAndJacobian:
         """Residual block with Huber weights, and with a Jacobian if `slopes` (M, k, d) of the prediction are given."""
         raw = self.whitened_residual(predicted)
-        cost, factor = huber_loss_and_residual_factors(raw, threshold)
+        cost, factor = huber_loss_and_sqrt_weights(raw, threshold)
         seen, jacobian = self.positive_weight_mask, None
         robust = factor[seen]
         if slopes is not None:
@@ -262,7 +262,7 @@ def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid)
     return replace(made, noise_correlation=None, change_by_clock=None)
 
 
-def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
+def huber_loss_and_sqrt_weights(residual: Array, scale: float) -> tuple[float, Array]:
     """Huber loss sum rho(r) of whitened residuals, and the least-squares factors sqrt(rho'(r)/r).
 
     Beyond `scale` [standard deviations] the loss is linear. An infinite `scale` gives plain least squares.

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.integrator.step import Step
-from yid_ocp.model.objects.base import CableTopology, ClampPoseFromTwoPoints
+from yid_ocp.model.objects.base import CableTopology, ClampPosePointNames
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeightingName
 from yid_ocp.sensors import SensorOptions as SensorOptions
@@ -128,7 +128,7 @@ class ProblemOptions:
         ),
     ] = 0.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
-    clamp_pose_point_names: tuple[ClampPoseFromTwoPoints, ...] = ()
+    clamp_pose_point_names: tuple[ClampPosePointNames, ...] = ()
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)

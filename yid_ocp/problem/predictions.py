@@ -68,17 +68,17 @@ def naive_cable_predictions(
         "moves_with_clamps": (held, np.full((len(points), len(held)), 1.0 / len(held))),
         "linear_carry": (ends, np.stack([np.interp(places, between, row) for row in np.eye(len(ends))], axis=1)),
     }
-    found = {"stays": np.array(recorded_point_positions(recording, points))}
+    found = {"stays": np.array(measured_point_positions(recording, points))}
     found |= {name: found["stays"].copy() for name in shares}
     for predicted in found.values():
         predicted[_GIVEN_FRAMES:] = start
     for name, (known, share) in shares.items():
-        moved = recorded_point_positions(recording, known) - _start_frame(recording, known)
+        moved = measured_point_positions(recording, known) - _start_frame(recording, known)
         found[name][_GIVEN_FRAMES:] += np.einsum("pk,mkx->mpx", share, moved)[_GIVEN_FRAMES:]
     return found
 
 
-def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
+def measured_point_positions(recording: Recording, points: Sequence[str]) -> Array:
     """Measured positions (M, len(points), 3) [m] of points of one group of a recording."""
     group = _group_with_points(recording, points)
     return group.position[:, [group.names.index(point) for point in points]]
@@ -86,7 +86,7 @@ def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Arr
 
 def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
     """Positions (len(points), 3) [m] in the last of the frames that predictions without a model start from."""
-    at, where = recorded_point_positions(recording, points), f"recording '{recording.name}'"
+    at, where = measured_point_positions(recording, points), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
         what, allowed = f"there are {len(at)} frames of the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
         raise DataError(what, where=where, allowed=allowed, hint="leave the recording out")

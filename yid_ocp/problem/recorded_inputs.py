@@ -14,13 +14,13 @@ from yid_ocp.data.channel_checks import median_sample_period, seen_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.model.objects.base import ClampPoseFromTwoPoints
+from yid_ocp.model.objects.base import ClampPosePointNames
 from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX, MOTOR_OFF_COMMAND, PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors import CHANNEL_KINDS, measuring_camera_pose, recorded_joint_column_indices
-from yid_ocp.sensors.base import additional_channel_kinds_of_group
+from yid_ocp.sensors.base import channel_kinds_of_sensor_group
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
@@ -246,7 +246,7 @@ def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
             if any(channel.matches_group_name(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
         for group in recording.channel_groups:
-            of_vectors = [c.group for c in additional_channel_kinds_of_group(group.name) if c.components]
+            of_vectors = [c.group for c in channel_kinds_of_sensor_group(group.name) if c.components]
             mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
         if any(measuring_camera_pose(group) is not None for group in recording.points):
             found.add("camera")
@@ -272,7 +272,7 @@ def prescribed_coordinates_at_nodes(
     system: System,
     grid: TimeGrid,
     low_pass: ZeroPhaseLowPassFilter,
-    clamps: tuple[ClampPoseFromTwoPoints, ...] = (),
+    clamps: tuple[ClampPosePointNames, ...] = (),
 ) -> Array:
     """Prescribed coordinates (steps + 1, nc) at every node, from smoothed recorded joints and clamp points.
 
@@ -295,7 +295,7 @@ def prescribed_coordinates_at_nodes(
 
 
 def _clamp_course(
-    recording: Recording, clamp: ClampPoseFromTwoPoints, grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter
+    recording: Recording, clamp: ClampPosePointNames, grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter
 ) -> Mapping[str, Array]:
     origin = _smoothed_point_path(recording, clamp.origin_point_name, grid, low_pass)
     direction = _smoothed_point_path(recording, clamp.z_axis_point_name, grid, low_pass) - origin

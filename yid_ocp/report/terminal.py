@@ -16,7 +16,7 @@ from yid_ocp.inference.uncertainty import (
     goodness_of_fit_message,
     value_and_uncertainty_text,
 )
-from yid_ocp.sensors.base import additional_channel_kinds_of_group
+from yid_ocp.sensors.base import channel_kinds_of_sensor_group
 
 if TYPE_CHECKING:
     from yid_ocp.data.readers import FilePreview
@@ -224,7 +224,7 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
         return [f"{name} [{JOINT_CHANNEL_UNITS[name]}]" for name in group.values_by_channel]
     if isinstance(group, PointGroup):
         return ["position [m]"]
-    kinds = {kind.quantity: kind.unit for kind in additional_channel_kinds_of_group(group.name)}
+    kinds = {kind.quantity: kind.unit for kind in channel_kinds_of_sensor_group(group.name)}
     return [f"{name} [{kinds[name]}]" for name in group.values_by_quantity]
 
 

@@ -106,7 +106,7 @@ CHANNEL_KINDS: Registry[RecordedChannelSpec] = Registry("recorded channel")
 """Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def additional_channel_kinds_of_group(group: str) -> tuple[RecordedChannelSpec, ...]:
+def channel_kinds_of_sensor_group(group: str) -> tuple[RecordedChannelSpec, ...]:
     """Channel kinds registered for a recording's group of this name; empty for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))

@@ -161,7 +161,7 @@ def _saved(problem: EstimationProblem, history: Sequence[base.Iterate], now: Eva
     if len(history) <= _PATIENCE_STEPS:
         return None
     before, last = history[-1 - _PATIENCE_STEPS], history[-1]
-    saved, unit = before.cost - last.cost, problem.rms_noise_of_data_residuals**2
+    saved, unit = before.cost - last.cost, problem.stated_rms_noise_of_data_residuals**2
     if saved > _NEGLIGIBLE_COST_REDUCTION * unit:
         return None
     if achievable_cost_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit:

@@ -263,7 +263,7 @@ class _Watch(ca.Callback):
         self._problem, self._program, self._functions = problem, program, functions
         self.stop_request: base.StopSearch | None = None
         cost = float(functions(program.initial_guess, program.parameter_values)[0])
-        self.unit = max(cost, 0.5 * program.residual.numel() * problem.rms_noise_of_data_residuals**2)
+        self.unit = max(cost, 0.5 * program.residual.numel() * problem.stated_rms_noise_of_data_residuals**2)
         nw, ng = program.w.numel(), program.g.numel()
         self._sizes = {"x": nw, "f": 1, "g": ng, "lam_x": nw, "lam_g": ng, "lam_p": program.p.numel()}
         self.construct("watch", {})

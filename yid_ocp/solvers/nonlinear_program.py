@@ -107,7 +107,7 @@ class MappedFunctionTerm:
 
     @property
     def n_values(self) -> int:
-        """Number ny K of output values at all K places."""
+        """Number of output values in all: ny of each of K places."""
         return len(self.row_names) * len(self.variable_indices)
 
     def _map_over_places(self, function: ca.Function, w: ca.MX, p: ca.MX, *more: ca.MX) -> ca.MX:

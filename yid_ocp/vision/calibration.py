@@ -376,7 +376,7 @@ class _Calibrator:
             return robust_gradient_and_hessian(rows, reach)
 
         for _ in range(rounds):
-            hessian, gradient, _ = cost(state).weighted_hessian_gradient_and_weight(self.precision)
+            hessian, gradient, _ = cost(state).corrected_hessian_gradient_and_factor(self.precision)
             pull = gradient + self.precision @ state.difference_from(self.told)
             step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
             state = state.with_state_increment(step)

@@ -104,7 +104,7 @@ class CameraState:
         return result
 
     def with_state_increment(self, change: Array) -> CameraState:
-        """Camera state after a change of rotation (world axes), translation, log depth scale, depth and clock."""
+        """Camera state after a change of rotation, translation, log depth scale, depth, clock offset and drift."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
@@ -237,7 +237,7 @@ class RobustCostDerivatives:
     # (counted twice), and at least the last sum (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
 
-    def weighted_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
+    def corrected_hessian_gradient_and_factor(self, precision: Array) -> tuple[Array, Array, float]:
         """Return weight * Hessian, weight * gradient, and the weight. `precision` is the prior's inverse covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
@@ -247,7 +247,7 @@ class RobustCostDerivatives:
 
     def state_covariance(self, precision: Array) -> Array:
         """Covariance (10, 10) of the state that minimises data and prior cost."""
-        hessian, _, weight = self.weighted_hessian_gradient_and_weight(precision)
+        hessian, _, weight = self.corrected_hessian_gradient_and_factor(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 

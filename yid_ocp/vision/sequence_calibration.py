@@ -200,7 +200,7 @@ class TubeDimensionEstimates:
 
     @property
     def contradicted_model_value_mask(self) -> BoolArray:
-        """Mask (2 s,) of the model's dimensions of s tubes that contradict the frames."""
+        """Whether the frames contradict each of the model's dimensions: lengths and radii of s tubes, (2 s,)."""
         off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
         return np.asarray(self.determined_dimension_mask & off)
 

@@ -29,7 +29,7 @@ from yid_ocp.model.objects.base import CableTopology, ObjectBetweenClamps
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
-from yid_ocp.sensors.base import additional_channel_kinds_of_group
+from yid_ocp.sensors.base import channel_kinds_of_sensor_group
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role, unknown_name_error
 
@@ -135,7 +135,7 @@ def arms_are_estimated_states(run: RunSettings) -> bool:
         return False
     recordings = read_recordings_of_role(run)
     for group in (group for recording in recordings for group in recording.channel_groups):
-        of_vectors = (kind.quantity for kind in additional_channel_kinds_of_group(group.name) if kind.components)
+        of_vectors = (kind.quantity for kind in channel_kinds_of_sensor_group(group.name) if kind.components)
         for quantity in (quantity for quantity in of_vectors if quantity in group.values_by_quantity):
             said = run.sensors.get(f"{group.name}.{quantity}")
             if said is None or said.use is not False:

@@ -27,12 +27,12 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model import System
-from yid_ocp.model.objects.base import CableTopology, ClampPoseFromTwoPoints, ObjectBetweenClamps
+from yid_ocp.model.objects.base import CableTopology, ClampPosePointNames, ObjectBetweenClamps
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import DividedLinksModel, RefinementKind
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
-from yid_ocp.sensors.base import additional_channel_kinds_of_group
+from yid_ocp.sensors.base import channel_kinds_of_sensor_group
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
@@ -79,7 +79,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         # gains in the settings take precedence over recorded ones
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
-    clamps: tuple[ClampPoseFromTwoPoints, ...] = ()
+    clamps: tuple[ClampPosePointNames, ...] = ()
     if cable is not None and isinstance(run.model.object, ObjectBetweenClamps):
         clamps = cable.clamp_pose_point_names
         for name in {group.name for group in groups}:
@@ -224,7 +224,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
             where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_SENSOR_KEY}"
             raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
-        constants = next((c.constants for c in additional_channel_kinds_of_group(group) if c.quantity == quantity), {})
+        constants = next((c.constants for c in channel_kinds_of_sensor_group(group) if c.quantity == quantity), {})
         for constant in said.constants:
             if constant not in constants:
                 details = unknown_name_error_arguments(constant, constants)

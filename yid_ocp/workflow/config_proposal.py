@@ -20,7 +20,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.sensors.base import RecordedChannelSpec, additional_channel_kinds_of_group
+from yid_ocp.sensors.base import RecordedChannelSpec, channel_kinds_of_sensor_group
 from yid_ocp.sensors.joints import is_noise_std_stated
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
@@ -440,7 +440,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
 
 def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, RecordedChannelSpec]]:
     for group in recording.channel_groups:
-        for kind in additional_channel_kinds_of_group(group.name):
+        for kind in channel_kinds_of_sensor_group(group.name):
             if kind.components and kind.quantity in group.values_by_quantity:
                 yield f"{group.name}.{kind.quantity}", group, kind
 

@@ -44,7 +44,7 @@ class MountSettings:
 
 
 @dataclass(frozen=True)
-class ClampPoseFromTwoPoints:
+class ClampPosePointNames:
     """Definition of a clamp's pose by two measured points: the origin, and a second point on the z axis.
 
     Two points do not determine the roll angle about z. It is zero at the start (x axis perpendicular to world y), and
@@ -114,10 +114,10 @@ class CableTopology:
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
-    def clamp_pose_point_names(self) -> tuple[ClampPoseFromTwoPoints, ClampPoseFromTwoPoints]:
+    def clamp_pose_point_names(self) -> tuple[ClampPosePointNames, ClampPosePointNames]:
         """Pose definitions of the start clamp and the end clamp."""
         a, b, *_, y, z = self.main_branch_vertex_names
-        return ClampPoseFromTwoPoints(START_CLAMP, a, b), ClampPoseFromTwoPoints(END_CLAMP, y, z)
+        return ClampPosePointNames(START_CLAMP, a, b), ClampPosePointNames(END_CLAMP, y, z)
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
