@@ -4,34 +4,19 @@ import math
 from dataclasses import replace
 from typing import get_args
 
+import factories as f
 import pytest
-from factories import (
-    absorbing,
-    added,
-    amplitude,
-    carried,
-    closed,
-    effect,
-    finding,
-    fit,
-    loss,
-    outcome,
-    place,
-    score,
-    screening,
-    visible,
-)
 
 from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates, diagnosis_summary_text
 from yid_ocp.diagnosis.verdict import UnknownVerdictReason
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel
 
-FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
+FRICTION, OFFSET = f.effect("friction@elbow"), f.effect("offset@wrist", f.amplitude(lower=-9.0))
 
 
 @pytest.mark.parametrize("verdict", ["effect", "confusable", "unknown", "no_gap", "insufficient_data"])
 def test_effects_count_only_where_the_verdict_names_them(verdict):
-    made = finding(verdict, selected_effects=(added(FRICTION, [OFFSET]),))
+    made = f.finding(verdict, selected_effects=(f.added(FRICTION, [OFFSET]),))
     result = made.to_dict()
     named = verdict in ("effect", "confusable")
     assert made.final_model is (made.selected_effects[-1].refitted_model if named else made.nominal_model)
@@ -44,8 +29,8 @@ def test_effects_count_only_where_the_verdict_names_them(verdict):
 
 
 def test_numbers_that_are_not_finite_become_null():
-    moved = absorbing(FRICTION, std=math.inf, **{"T1.bend": (1.0, 2.0)})
-    result = finding(gap_closure=closed(0.9, math.nan, math.inf), **moved).to_dict()
+    moved = f.absorbing(FRICTION, std=math.inf, **{"T1.bend": (1.0, 2.0)})
+    result = f.finding(gap_closure=f.closed(0.9, math.nan, math.inf), **moved).to_dict()
     assert result["gap"]["closure_ci"] == [None, None]
     assert result["absorption"] == {"T1.bend": {"before": 1.0, "after": 2.0, "std": None, "unit": "N m/rad"}}
 
@@ -57,9 +42,9 @@ statistics summary absorption steps unseen untried baseline counterfactual secon
 def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
     errors = {"points.tip": (0.03, "m"), "points.end": (0.02, "m"), "joints.effort.elbow": (0.5, "N m")}
     levels = (("points.tip", "m", 0.0169, 3), ("points.end", "m", 0.001, 3), ("joints.effort.elbow", "N m", 0.6, 1))
-    made = finding(
+    made = f.finding(
         "unknown",
-        nominal_model=fit(lost=loss(2.0, channels=errors)),
+        nominal_model=f.fit(lost=f.loss(2.0, channels=errors)),
         noise_floor=tuple(AssumedChannelNoiseLevel(*own) for own in levels),
     )
     size = math.sqrt(0.02**2 - 3 * 0.001**2)
@@ -68,13 +53,13 @@ def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
 
 
 def test_the_result_holds_what_was_found():
-    made = finding(
+    made = f.finding(
         "confusable",
-        selected_effects=(added(FRICTION, [OFFSET]), added(OFFSET)),
-        gap_locations=(place("T1", 0.7, True, ((0.0, 1.0),)),),
-        remaining_gap_locations=(place("T2", 0.3, False),),
-        remaining_test=outcome(p=0.4, chi2=1.02),
-        screening=screening([score(FRICTION)], seen=[visible(FRICTION), visible(OFFSET, seen=False)]),
+        selected_effects=(f.added(FRICTION, [OFFSET]), f.added(OFFSET)),
+        gap_locations=(f.place("T1", 0.7, True, ((0.0, 1.0),)),),
+        remaining_gap_locations=(f.place("T2", 0.3, False),),
+        remaining_test=f.outcome(p=0.4, chi2=1.02),
+        screening=f.screening([f.score(FRICTION)], seen=[f.visible(FRICTION), f.visible(OFFSET, seen=False)]),
         is_split_in_blocks=True,
     )
     result = made.to_dict()
@@ -96,18 +81,18 @@ def test_the_result_holds_what_was_found():
 
 
 def test_candidates_are_listed_with_what_was_added_first():
-    third = effect("third@x")
-    alone = fit([OFFSET], loss(1.3, 1.4), values={"offset@wrist.a": 0.3})
-    best = fit([FRICTION], loss(1.0, 1.1), values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": math.inf})
-    made = finding(
-        nominal_model=fit(lost=loss(2.0, 2.0)),
+    third = f.effect("third@x")
+    alone = f.fit([OFFSET], f.loss(1.3, 1.4), values={"offset@wrist.a": 0.3})
+    best = f.fit([FRICTION], f.loss(1.0, 1.1), values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": math.inf})
+    made = f.finding(
+        nominal_model=f.fit(lost=f.loss(2.0, 2.0)),
         single_effect_models=(alone, best),
-        selected_effects=(added(FRICTION, fitted=best),),
-        screening=screening(
+        selected_effects=(f.added(FRICTION, fitted=best),),
+        screening=f.screening(
             [
-                score(third, p=0.2, statistic=7.0, step={"third@x.a": 0.7}),
-                score(OFFSET, p=0.1, statistic=8.0),
-                score(FRICTION, p=0.05, statistic=9.0),
+                f.score(third, p=0.2, statistic=7.0, step={"third@x.a": 0.7}),
+                f.score(OFFSET, p=0.1, statistic=8.0),
+                f.score(FRICTION, p=0.05, statistic=9.0),
             ]
         ),
     )
@@ -121,41 +106,43 @@ def test_candidates_are_listed_with_what_was_added_first():
     assert listed[2]["closure_ci"] == [None, None]
     # the statistic is that of the best of three tries
     assert made.to_dict()["statistics"]["candidate"] == pytest.approx(3 * 0.05)
-    chance = screening([score(OFFSET, p=0.8), score(FRICTION, p=0.9)])
-    assert finding(screening=chance).to_dict()["statistics"]["candidate"] == 1.0
+    chance = f.screening([f.score(OFFSET, p=0.8), f.score(FRICTION, p=0.9)])
+    assert f.finding(screening=chance).to_dict()["statistics"]["candidate"] == 1.0
     # of an unknown gap, refits before scores
-    made = finding(
-        "unknown", single_effect_models=(fit([OFFSET]), fit([third])), screening=screening([score(FRICTION, 0.1)])
+    made = f.finding(
+        "unknown",
+        single_effect_models=(f.fit([OFFSET]), f.fit([third])),
+        screening=f.screening([f.score(FRICTION, 0.1)]),
     )
     told = [(entry["kind"], entry["p_value"]) for entry in _ranked_candidates(made, made)]
     assert told == [("offset", 1.0), ("third", 1.0), ("friction", 0.1)], "what has no score is not sure of anything"
 
 
 def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
-    told = finding("unknown", unknown_reason="stand_in", transfer_checks=(carried(),)).to_dict()
+    told = f.finding("unknown", unknown_reason="stand_in", transfer_checks=(f.carried(),)).to_dict()
     [rejected] = told["rejected_candidates"]
     assert (rejected["kind"], rejected["location"], rejected["closure"]) == ("friction", "elbow", 0.9)
     assert rejected["reason"].startswith(
         "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ±"
     )
     assert (told["reason"], told["effects"]) == ("stand_in", [])
-    assert finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []
+    assert f.finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []
     # several fail together, by the checks of all
-    other = replace(carried("b"), effect_label="offset@wrist")
-    chosen, checks = tuple(map(added, (FRICTION, OFFSET))), (carried(), other, carried("c", agrees=True))
-    told = finding("unknown", unknown_reason="stand_in", selected_effects=chosen, transfer_checks=checks).to_dict()
-    both = f"{carried().both_estimates_text}; {other.both_estimates_text}"
+    other = replace(f.carried("b"), effect_label="offset@wrist")
+    chosen, checks = tuple(map(f.added, (FRICTION, OFFSET))), (f.carried(), other, f.carried("c", agrees=True))
+    told = f.finding("unknown", unknown_reason="stand_in", selected_effects=chosen, transfer_checks=checks).to_dict()
+    both = f"{f.carried().both_estimates_text}; {other.both_estimates_text}"
     assert [entry["reason"] for entry in told["rejected_candidates"]] == [both, both]
 
 
 def test_every_reason_has_a_sentence_of_its_own():
     reasons = [reason for reason in get_args(UnknownVerdictReason) if reason]
-    assert len({diagnosis_summary_text(finding("unknown", unknown_reason=reason)) for reason in reasons}) == len(
+    assert len({diagnosis_summary_text(f.finding("unknown", unknown_reason=reason)) for reason in reasons}) == len(
         reasons
     )
 
 
 def test_a_result_shows_itself_in_one_line_and_a_table():
-    made = finding()
+    made = f.finding()
     assert repr(made) == "<DiagnosisResult: effect, friction@elbow, 90 % of the held-out gap closed>"
     assert "<td>friction@elbow</td><td>a = 0.5 N m</td>" in made._repr_html_()

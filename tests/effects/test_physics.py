@@ -267,6 +267,19 @@ def test_friction_works_against_the_motion(kind, values, extra, rate) -> None:
     assert effort == pytest.approx(extra(rate), rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.parametrize("use_compiler", [True, False])
+def test_a_joint_breaks_loose_where_friction_falls_faster_than_inertia_over_step(use_compiler) -> None:
+    system = hinge("driven")
+    sizes = {"joint_coulomb": {"tau_c": 0.3}, "joint_stribeck": {"tau_s": 1.0, "v_stribeck": 0.05}}
+    rubbing = system.with_effects([make_effect(kind, "left_a", system, own) for kind, own in sizes.items()])
+    step, torque = compile_step(rubbing, H, use_compiler=use_compiler), np.linspace(0.0, 2.0, 101)[:, None]
+    rollout = simulate(step, rubbing.parameters.vector(), np.zeros(step.sizes["nx"]), 101, torque)
+    assert rollout.status.is_converged
+    speed = np.diff(rollout.state[:, 0]) / H
+    assert np.max(np.abs(speed[torque[:, 0] < 0.9])) < 0.05
+    assert np.min(speed[torque[:, 0] > 1.3]) > 0.2
+
+
 TAU = 0.8
 
 

@@ -178,8 +178,7 @@ class VariantPositionSensitivities:
     """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
-    with respect to the nx unknowns and to the episode's q torque-error unknowns (see
-    `sensitivities_and_information`).
+    with respect to the nx unknowns and to the episode's q torque-error unknowns (see `sensitivities_and_information`).
     """
 
     problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node

@@ -157,10 +157,9 @@ class FixedGainKalmanFilter:
     ) -> tuple[Array, Array, Array | None]:
         """Filter all steps: normalized innovations (r, c) and final means (nx, c).
 
-        With `keep_means`, the means before each step (k, nx, c) are returned too.
-        `mean` is the mean before all steps, `measured` (r, c) the measurements. `push` (k, m, c) is added to the
-        parameters during a step's transition. `shift` (k, nx - ns) is added to the parameters of the first column after
-        the step.
+        With `keep_means`, the means before each step (k, nx, c) are returned too. `mean` is the mean before all steps,
+        `measured` (r, c) the measurements. `push` (k, m, c) is added to the parameters during a step's transition.
+        `shift` (k, nx - ns) is added to the parameters of the first column after the step.
         """
         if (library := _library()) is not None:
             seen = np.empty((len(self.moves), *mean.shape)) if keep_means else None

@@ -466,8 +466,7 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tuple[GapLocation, ...]:
     """Rank all locations by their share of the log evidence. At equal shares, observable locations come first.
 
-    The time windows of a location are those in which one of its unknowns is over three standard deviations from
-    zero.
+    The time windows of a location are those in which one of its unknowns is over three standard deviations from zero.
     """
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:

@@ -88,9 +88,9 @@ class InterpretedKernel:
         return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 
     def _newton(
-        self, value: _PointEvaluator, slope: _PointEvaluator, point: Array
+        self, value: _PointEvaluator, slope: _PointEvaluator, point: Array, leap: float
     ) -> tuple[NewtonStatusCode, float, int]:
-        """Solve for the unknowns in the point, with the natural monotonicity test (Deuflhard 2011, section 3.3)."""
+        """Solve for the unknowns in the point, by Newton's method with leaps as in kernel.c."""
 
         def largest(change: Array) -> float:
             return float(np.abs(change[: self._coordinates]).max(initial=0.0))
@@ -117,7 +117,11 @@ class InterpretedKernel:
                 if (after := largest(further)) <= (1 - 0.25 * factor) * error:
                     break
                 if factor < 1e-4:
-                    return NewtonStatusCode.NOT_CONVERGED, error, iteration
+                    if leap < 1e3 * tolerance:
+                        return NewtonStatusCode.NOT_CONVERGED, error, iteration
+                    trial, leap = point.copy(), 0.2 * leap
+                    trial[self._unknown] += 5 * leap / error * change
+                    break
                 # near the tolerance, a correction that no step length reduces is rounding
                 noise, factor = error < 1e3 * tolerance, 0.5 * factor
             if noise:
@@ -148,10 +152,11 @@ class InterpretedKernel:
             guess = x if k == 0 else 2 * x - state[k - 1]
             if k > 1:
                 guess[:n] += x[:n] - 2 * state[k - 1, :n] + state[k - 2, :n]
-            for first, pull in ((guess, lam), (x, np.zeros_like(lam))):
+            for first, pull, leap in ((guess, lam, 0.0), (x, 0 * lam, 0.5)):
                 point = self._point(theta, x, first, pull, u)
                 point[self._fixed] = path[k + 1]
-                code, error, spent = self._newton(value, slope, point)
+                end, error, spent = self._newton(value, slope, point, leap)
+                code = end if not leap or end == NewtonStatusCode.OK else code
                 total += spent
                 if code == NewtonStatusCode.OK:
                     break

@@ -415,8 +415,9 @@ static mask newton_chord(Work *k, const Point *a, real tolerance, int limit, mas
 }
 
 #if SIMD_WIDTH == 1
-/* Full Newton, damped by the natural monotonicity test (Deuflhard 2011, section 3.3). */
-static int newton_damped(Work *k, const Point *a, double tolerance, int limit, double *error) {
+/* Full Newton, damped by the natural monotonicity test (Deuflhard 2011, section 3.3). Where it stalls, as where friction
+ * falls more steeply with the speed than inertia grows, it goes on beyond, after a leap of at most `leap`. */
+static int newton_damped(Work *k, const Point *a, double tolerance, int limit, double leap, double *error) {
     double q_keep[ONE(N)], z_keep[ONE(NZ)], lam_keep[ONE(M)], step[ONE(NY)], trial[ONE(NY)], previous = INFINITY;
     for (int it = 0; it < limit; it++) {
         k->iterations++;
@@ -449,9 +450,14 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, d
             memcpy(a->lam, lam_keep, sizeof(double) * M);
             if (factor < 1e-4) {
                 /* so near the end only rounding keeps a correction from getting smaller */
-                if (norm > 1e3 * tolerance || !evaluate(k, a)) return NOT_CONVERGED;
-                settle_multipliers(k, a, step, EVERY);
-                return OK;
+                if (norm <= 1e3 * tolerance && evaluate(k, a)) {
+                    settle_multipliers(k, a, step, EVERY);
+                    return OK;
+                }
+                if (leap < 1e3 * tolerance) return NOT_CONVERGED;
+                advance(a, step, leap / norm, EVERY);
+                leap *= 0.2;
+                break;
             }
             factor *= 0.5;
         }
@@ -490,8 +496,9 @@ static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at
             for (int i = 0; i < NF; i++) a->q1[free_index[i]] = a->q0[free_index[i]];
         for (int i = 0; i < NZ; i++) a->z1[i] = attempt ? a->z0[i] : z_guess[i];
         for (int i = 0; i < M; i++) a->lam[i] = attempt ? 0.0 : lam_guess[i];
-        *status = newton_damped(k, a, tolerance, limit, error);
-        good = *status == OK;
+        const int end = newton_damped(k, a, tolerance, limit, attempt ? 0.5 : 0.0, error);
+        good = end == OK;
+        if (good || !attempt) *status = end; /* leaps that lead nowhere end anyhow */
     }
 #endif
     k->factored &= good;

@@ -36,7 +36,6 @@ from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, Zer
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
 _MAX_RESTING_TIME = 1.0  # latest time at which a point's first sample still shows the shape of the equilibrium [s]
-_STEPS_AFTER_FIRST_POINTS = 2  # so many steps a first sample between two nodes needs
 # root mean square error of first points above which another equilibrium is sought [stds], and the part that may remain
 _POOR_EQUILIBRIUM_RMSE, _MAX_REMAINING_ERROR_FRACTION = 5.0, 0.5
 
@@ -500,9 +499,7 @@ def episode_at_equilibrium_with_denoised_gear_loads(
 def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
     """Episode with the equilibrium near its first points, if the equilibrium of least energy is far from them."""
     fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
-    if fitted or not predictor.system.grasps:
-        return episode
-    early = _until_first_points(episode)
+    early = None if fitted or not predictor.system.grasps else _until_first_points(episode)
     if early is None:
         return episode
     own, n = predictor.theta_with_episode_values(episode, theta), predictor.system.n_coordinates
@@ -536,7 +533,7 @@ def _until_first_points(episode: Episode) -> Episode | None:
             first.append(replace(samples, **parts, noise_correlation=None, change_by_clock=change))
     if not first:
         return None
-    steps = max(int(samples.node[0]) for samples in first) + _STEPS_AFTER_FIRST_POINTS
+    steps = max(int(samples.node[0]) for samples in first) + 2  # a sample may lie between two nodes
     return truncate_episode(replace(episode, measurements=tuple(first)), steps)
 
 

@@ -311,8 +311,7 @@ class _SensorReadings(NamedTuple):
 class ModelFunctions:
     """Compiled functions of a system: sensor readings, equilibrium, initial state fit and input corrections.
 
-    `names` are the parameters for which derivatives are available. `start_parameters` are fitted with initial
-    states.
+    `names` are the parameters for which derivatives are available. `start_parameters` are fitted with initial states.
     """
 
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:

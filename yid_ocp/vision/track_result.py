@@ -94,11 +94,6 @@ class TrackResult:
         """Number of frames dropped for each reason."""
         return count_dropped_frames_by_reason(self.frame_reports)
 
-    @property
-    def dimension_and_foreign_object_notes(self) -> tuple[str, ...]:
-        """Messages about the object's dimensions and about foreign objects."""
-        return (*self.dimensions.messages, *(thing.text for thing in self.foreign_objects))
-
     def to_point_group(self) -> PointGroup:
         """Convert the points to the point group `points_camera` of a recording."""
         pose, words = self.camera_calibration.camera_state.pose, "depth camera, fitted shape"
