@@ -2,27 +2,13 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
+import factories as f
 import pytest
-from factories import (
-    BIAS,
-    FORCE,
-    READ_FORCE,
-    added,
-    amplitude,
-    carried,
-    cases,
-    closed,
-    effect,
-    fit,
-    loss,
-    outcome,
-    score,
-    screening,
-    shape,
-    smoothed,
-)
+from factories import added, carried, cases, closed, effect, fit
 
+from yid_ocp.diagnosis import verdict as verdict_module
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -35,6 +21,7 @@ from yid_ocp.diagnosis.verdict import (
     _inflate_fit_stds_by_disagreement,
     _probability,
     _verdict_and_reason,
+    judge,
 )
 from yid_ocp.display import NULL_PROGRESS
 
@@ -45,11 +32,11 @@ LOADS = effect("load@elbow", alone=True), effect("load@wrist", alone=True)
 
 
 def scored(*p_values):
-    return [score(effect(f"kind{i}@x"), p=p) for i, p in enumerate(p_values)]
+    return [f.score(effect(f"kind{i}@x"), p=p) for i, p in enumerate(p_values)]
 
 
 def seen(tests, scores=()):
-    return NominalModelGapEvidence(fit(), *tests, screening(scores))
+    return NominalModelGapEvidence(fit(), *tests, f.screening(scores))
 
 
 @cases(
@@ -67,7 +54,7 @@ def seen(tests, scores=()):
     },
 )
 def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
-    tests = [outcome(p=p, chi2=chi2, channels={"a": 1.0}) for p, chi2 in (before, held_out)]
+    tests = [f.outcome(p=p, chi2=chi2, channels={"a": 1.0}) for p, chi2 in (before, held_out)]
     assert seen(tests).may_have_gap(LIMITS) is seen(tests).exceeds_noise(LIMITS) is gap
 
 
@@ -82,7 +69,7 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
     },
 )
 def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
-    evidence, limits = seen((outcome(), outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
+    evidence, limits = seen((f.outcome(), f.outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
     assert (evidence.may_have_gap(limits), evidence.exceeds_noise(limits)) == (gap, False)
 
 
@@ -134,6 +121,19 @@ def judged(changed):
     effects = tuple(replace(entry, cumulative_closure=said["total"]) for entry in said["added"])
     found = Judgement("", "", (), effects, said["explained"], checks, 0.0)
     return _verdict_and_reason(found, said["gap"], said["enough"], LIMITS)
+
+
+@pytest.mark.parametrize(("alone", "verdict"), [(0.6, "effect"), (0.4, "unknown")])
+def test_a_further_effect_that_explains_too_little_is_no_doubt_about_the_first(alone, verdict, monkeypatch):
+    both = (added(ONE, part=closed(0.3, 0.2)), added(OTHER, fitted=fit([ONE, OTHER]), part=closed(0.3, 0.2)))
+    monkeypatch.setattr(verdict_module, "select_effects", lambda *_: ((), both))
+    monkeypatch.setattr(
+        verdict_module, "_explained_fraction", lambda _, last, limits: [alone, 0.7][len(last.effects) - 1]
+    )
+    evidence = Mock(nominal_model=fit(), exceeds_noise=Mock(return_value=True))
+    said = judge(Mock(thresholds=LIMITS, refit_on_held_out=Mock(return_value=None)), evidence)
+    assert (said.verdict, said.unknown_reason) == (verdict, "" if verdict == "effect" else "little")
+    assert said.selected_effects == (both[:1] if verdict == "effect" else both)
 
 
 @pytest.mark.parametrize(
@@ -188,33 +188,33 @@ def test_equivalent_effects_share_the_probability_of_their_set():
 )
 def test_what_effects_explain_of_what_exceeds_the_noise(costs, count, left, part):
     """Fall of r'r less what one parameter takes, over its excess over the number of residuals."""
-    nominal, last = replace(fit(cost=costs[0]), residual_count=count), fit([ONE], loss(left, left), cost=costs[1])
+    nominal, last = replace(fit(cost=costs[0]), residual_count=count), fit([ONE], f.loss(left, left), cost=costs[1])
     assert _explained_fraction(nominal, last, LIMITS) == pytest.approx(part)
 
 
 @cases("before, left, part", {"part": (1.12, 1.09, 38 / 78), "third": (1.14, 1.09, 1.0), "noise": (1.005, 1.009, 1.0)})
 def test_a_gap_that_is_small_itself_is_explained_where_a_third_of_it_goes(before, left, part):
-    nominal = replace(fit(lost=loss(before, before, count=1e4), cost=100.0), residual_count=122)
-    last = fit([ONE], loss(left, left, count=1e4), cost=80.5)
+    nominal = replace(fit(lost=f.loss(before, before, count=1e4), cost=100.0), residual_count=122)
+    last = fit([ONE], f.loss(left, left, count=1e4), cost=80.5)
     assert _explained_fraction(nominal, last, LIMITS) == pytest.approx(part)
 
 
 @cases(
     "weight, plant, sensor, both, side",
     {
-        "nothing": ({FORCE: 0.0}, 0.0, 0.0, 0.0, "none"),
-        "worse than nothing": ({FORCE: 9.0}, -1.0, -2.0, -1.0, "none"),
-        "plant": ({FORCE: 9.0, BIAS: 0.0}, 9.0, 3.0, 9.0, "plant"),
-        "sensor": ({FORCE: 0.0, BIAS: 9.0}, 3.0, 9.0, 9.0, "sensor"),
-        "both by chance": ({FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 14.0, "plant"),
-        "both": ({FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 14.1, "both"),
-        "both, mostly the sensor": ({FORCE: 3.0, BIAS: 9.0}, 3.0, 9.0, 14.1, "both"),
-        "an effort's bias would do the same": ({READ_FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 20.0, "either"),
-        "another force weighs more": ({READ_FORCE: 3.0, FORCE: 9.0}, 9.0, 0.0, 9.0, "plant"),
+        "nothing": ({f.FORCE: 0.0}, 0.0, 0.0, 0.0, "none"),
+        "worse than nothing": ({f.FORCE: 9.0}, -1.0, -2.0, -1.0, "none"),
+        "plant": ({f.FORCE: 9.0, f.BIAS: 0.0}, 9.0, 3.0, 9.0, "plant"),
+        "sensor": ({f.FORCE: 0.0, f.BIAS: 9.0}, 3.0, 9.0, 9.0, "sensor"),
+        "both by chance": ({f.FORCE: 9.0, f.BIAS: 3.0}, 9.0, 3.0, 14.0, "plant"),
+        "both": ({f.FORCE: 9.0, f.BIAS: 3.0}, 9.0, 3.0, 14.1, "both"),
+        "both, mostly the sensor": ({f.FORCE: 3.0, f.BIAS: 9.0}, 3.0, 9.0, 14.1, "both"),
+        "an effort's bias would do the same": ({f.READ_FORCE: 9.0, f.BIAS: 3.0}, 9.0, 3.0, 20.0, "either"),
+        "another force weighs more": ({f.READ_FORCE: 3.0, f.FORCE: 9.0}, 9.0, 0.0, 9.0, "plant"),
     },
 )
 def test_the_side_of_a_gap_by_evidence(weight, plant, sensor, both, side):
-    assert smoothed(weight, evidence={"plant": plant, "sensor": sensor, "both": both}).plant_or_sensor_origin == side
+    assert f.smoothed(weight, evidence={"plant": plant, "sensor": sensor, "both": both}).plant_or_sensor_origin == side
 
 
 @cases(
@@ -229,11 +229,11 @@ def test_the_side_of_a_gap_by_evidence(weight, plant, sensor, both, side):
     },
 )
 def test_the_part_of_a_gap_that_can_be_explained_at_all(chi2, degrees, part):
-    assert smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable_gap_fraction == pytest.approx(part)
+    assert f.smoothed({f.FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable_gap_fraction == pytest.approx(part)
 
 
-SPRING = effect("spring@elbow", amplitude("k", lower=-9.0, expected=(0.0, 10.0)), shape("s"))
-SHIFT = effect("shift@grasp", *(amplitude(n, lower=-9.0, expected=(-1.0, 1.0), unit="m") for n in "xy"))
+SPRING = effect("spring@elbow", f.amplitude("k", lower=-9.0, expected=(0.0, 10.0)), f.shape("s"))
+SHIFT = effect("shift@grasp", *(f.amplitude(n, lower=-9.0, expected=(-1.0, 1.0), unit="m") for n in "xy"))
 
 
 def of(label, values, stds, effects=(SPRING,)):

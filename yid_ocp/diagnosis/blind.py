@@ -302,8 +302,7 @@ class BlindCaseGenerator:
         composed = AllCandidatesProblem.from_problem(problem, effects, [other])
         nominal = fit_nominal_model(problem, composed, limits=self._limits)
         # whitened by all noise, including torque noise
-        composed = replace(composed, problem=nominal.problem)
-        return linearize_candidates(composed, (), nominal.values)
+        return linearize_candidates(replace(composed, problem=nominal.problem), (), nominal.values)
 
     @cached_property
     def _detectable(self) -> tuple[_Detectable, ...]:

@@ -404,8 +404,7 @@ def _after(
         rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits))
     windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
     closed = judged.accepted_effects_closure_by_location
-    where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
-    return tests[1], where, rest
+    return tests[1], smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows), rest
 
 
 def fit_nominal_model(

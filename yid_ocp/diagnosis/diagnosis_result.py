@@ -224,11 +224,9 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     for rivals in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
+        varied = f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording."
         advice = (
-            (
-                aspects,
-                f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording.",
-            ),
+            (aspects, varied),
             (places, f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."),
             (rivals, f"Vary {aspects[0]} over a wider range."),
         )
@@ -286,7 +284,7 @@ def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
 def _listed(beginning: str, names: Iterable[str], end: str = ".") -> str:
     """Sentence on names, similar ones merged. Empty if there are none."""
     text = abbreviated_names_text([*names])
-    return f"{beginning}{text}{end}" if text else ""
+    return f"{beginning}{text}{end}" * bool(text)
 
 
 def _p_value_relation(p_value: float) -> str:

@@ -90,8 +90,7 @@ class GapLaw:
             for t in self.tables
             for x, f, s in zip(t.knots.tolist(), t.torque.tolist(), t.torque_std.tolist(), strict=True)
         ]
-        keys = ("location", "depends_on", "closure")
-        rival = None if self.runner_up is None else dict(zip(keys, self.runner_up, strict=True))
+        rival = self.runner_up and dict(zip(("location", "depends_on", "closure"), self.runner_up, strict=True))
         found = {
             "location": self.location,
             "depends_on": self.depends_on,
@@ -227,8 +226,7 @@ def _neutral_law(model: RefittedModel, place: str, names: Sequence[str], system:
 
 
 def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:
-    rollout = prediction.rollout
-    own = {"state": rollout.state, "torque": rollout.torque, "multipliers": rollout.multipliers}
+    own = {name: getattr(prediction.rollout, name) for name in ("state", "torque", "multipliers")}
     return own | {"time_step": np.array(step)}
 
 

@@ -6,6 +6,7 @@ parameters on all recordings. The held-out recordings are therefore fitted too, 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -196,24 +197,30 @@ def judge(
     `finished` is called with the name of each stage.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
-    fits: tuple[RefitStatistics, ...] = ()
-    added: tuple[SelectedEffect, ...] = ()
+    exceeds, suffice = evidence.exceeds_noise(limits), evidence.are_data_sufficient(limits)
+    fits, added = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...]()
     if evidence.warrants_search(limits):
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
     finished("refits")
-    carried: tuple[EffectAmplitudeTransferCheck, ...] = ()
-    explained = 1.0
-    if added:
-        last = added[-1].refitted_model
-        explained = _explained_fraction(nominal, last, limits)
-        carried = _check_effect_amplitude_transfer(search, last)
-        added = (*added[:-1], replace(added[-1], refitted_model=_inflate_fit_stds_by_disagreement(last, carried)))
+
+    def judged(chosen: tuple[SelectedEffect, ...]) -> Judgement:
+        carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
+        if chosen:
+            last = chosen[-1].refitted_model
+            explained = _explained_fraction(nominal, last, limits)
+            carried = _check_effect_amplitude_transfer(search, last)
+            last = _inflate_fit_stds_by_disagreement(last, carried)
+            chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
+        said = Judgement("", "", fits, chosen, explained, carried, 0.0)
+        verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
+        return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, exceeds, limits))
+
+    attempts = (judged(added[:count]) for count in range(len(added), -1, -1))
+    whole = next(attempts)
+    # a further effect that only corrects errors of the others is no reason to doubt them
+    said = next((own for own in itertools.chain([whole], attempts) if own.verdict != "unknown"), whole)
     finished("carry_over")
-    said = Judgement("", "", fits, added, explained, carried, 0.0)
-    exceeds, suffice = evidence.exceeds_noise(limits), evidence.are_data_sufficient(limits)
-    verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
-    probability = _probability(said, exceeds, limits)
-    return replace(said, verdict=verdict, unknown_reason=reason, probability=probability)
+    return said
 
 
 def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> float:

@@ -230,8 +230,7 @@ def _filter_steps(
         projected[own] = steps.projected_covariance
         begun = span.stop
     known = (ends.tolist(), moves, inputs.shape[2] - nu, decay, observe, np.concatenate(blocks), projected)
-    kalman = FixedGainKalmanFilter(*known)
-    return _FilterPart(0, order, step_of_row, kalman, by_torque), covariance
+    return _FilterPart(0, order, step_of_row, FixedGainKalmanFilter(*known), by_torque), covariance
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
