@@ -1,9 +1,7 @@
 """Compare a diagnosis with earlier runs, use their estimates as priors, and predict without the effects found.
 
 In a linear model with the prior N(m, C0), an estimate x with covariance C shifts by x - m. If nothing changed, the
-shift has the covariance C0 - C. A misfit that multiplies the data's noise variance by k adds (k - 1) C (1 - C/C0). An
-effect is understood if removing it predicts recordings made without it, and adding it predicts recordings made with
-it.
+shift has the covariance C0 - C. A misfit that multiplies the data's noise variance by k adds (k - 1) C (1 - C/C0).
 """
 
 from __future__ import annotations

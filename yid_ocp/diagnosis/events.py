@@ -3,8 +3,7 @@
 At prescribed joints with compared efforts, the unknown force is measured minus required torque, sample by sample.
 Elsewhere it is the smoother's linear model of the force at one coordinate, with all other unknowns at their estimates.
 `detect_force_pulses` searches both for pulses on a background that depends on load. One to three outlying samples of a
-sensor are an event of that sensor. Events are removed before anything else is judged: their torques are added to the
-recorded ones, and samples in their windows are excluded.
+sensor are an event of that sensor. Events are removed before anything else is judged.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Estimate a law for a gap that no named effect explains: a torque as a smooth function of known quantities.
-
-Functions compete with each other, and with a function of time, by the evidence of a linearised fit. The best few are
-refitted with the nominal parameters and judged on held-out recordings like any effect.
-"""
+"""Estimate a law for a gap that no named effect explains: a torque as a smooth function of known quantities."""
 
 from __future__ import annotations
 

@@ -362,7 +362,20 @@ def _with_closures(
         again = f"{join_effect_labels(effects[:i])} again"
         fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
         closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        rivals, distances = zip(*chosen.rivals[effect.label], strict=True)
-        weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
-        found.append(SelectedEffect(effect, fit, closed, rivals, tuple(weights / weights.sum())))
+        found.append(_with_rivals(SelectedEffect(effect, fit, closed, (), ()), chosen.rivals[effect.label]))
     return tuple(found)
+
+
+def _with_rivals(entry: SelectedEffect, rivals: Sequence[tuple[EffectBase, float]]) -> SelectedEffect:
+    effects, distances = zip(*rivals, strict=True)
+    weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
+    return replace(entry, equivalent_effects=effects, shares=tuple(weights / weights.sum()))
+
+
+def selected_effect_alone(
+    entry: SelectedEffect, nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
+) -> SelectedEffect:
+    """The first selected effect without the others, with its equivalent effects among the `fits` of single effects."""
+    near = [(fit.effects[-1], distance) for fit, distance in _near_best_models(nominal, fits, limits)]
+    known = {effect.label: (effect, distance) for effect, distance in ((entry.effect, 0.0), *near)}
+    return _with_rivals(entry, [*known.values()])

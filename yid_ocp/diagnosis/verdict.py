@@ -1,8 +1,4 @@
-"""Decide whether there is a gap, whether effects transfer to held-out recordings, and the verdict.
-
-Two or three effects together can imitate almost any gap on the recordings used to fit them. True effects have the same
-parameters on all recordings. The held-out recordings are therefore fitted too, and the estimates are compared.
-"""
+"""Decide whether there is a gap, whether effects transfer to held-out recordings, and the verdict."""
 
 from __future__ import annotations
 
@@ -14,7 +10,13 @@ from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, select_effects, total_gap_closure
+from yid_ocp.diagnosis.select import (
+    GapClosure,
+    SelectedEffect,
+    select_effects,
+    selected_effect_alone,
+    total_gap_closure,
+)
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
@@ -215,10 +217,11 @@ def judge(
         verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
         return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, exceeds, limits))
 
-    attempts = (judged(added[:count]) for count in range(len(added), -1, -1))
-    whole = next(attempts)
-    # a further effect that only corrects errors of the others is no reason to doubt them
-    said = next((own for own in itertools.chain([whole], attempts) if own.verdict != "unknown"), whole)
+    whole = judged(added)
+    alone = (selected_effect_alone(own, nominal, fits, limits) for own in added[: len(added) > 1])
+    # a further effect that only corrects errors of the first is no reason to doubt this one
+    attempts = itertools.chain([whole], (judged((first,)) for first in alone))
+    said = next((own for own in attempts if own.verdict != "unknown"), whole)
     finished("carry_over")
     return said
 

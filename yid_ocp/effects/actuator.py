@@ -1,8 +1,7 @@
 """Effects between a motor and its recorded signals, such as backlash, encoder offsets and delays.
 
-For inputs of the model (torques and angles of driven joints, angles of prescribed joints) an effect acts through
-`true_value_from_reading`. For the effort of a prescribed joint, which is compared with the record, it acts through
-`reading_from_true_value`.
+Inputs of the model (torques and angles of driven joints, angles of prescribed joints) go through
+`true_value_from_reading`, compared efforts of prescribed joints through `reading_from_true_value`.
 """
 
 from __future__ import annotations

@@ -9,8 +9,7 @@ a weak constraint, with Q and gamma given by a standard deviation s and a memory
 smoother make the cost linear in the number of intervals (de Jong 1989, doi:10.2307/2290075). Free parameters are
 regression effects of the filter: the unknowns only explain what the parameters cannot. Groups of unknowns (forces of a
 segment or a joint, biases of a camera, ...) are added one after another, the one that raises the evidence most first.
-Their standard deviations s maximise the evidence (MacKay 1992, doi:10.1162/neco.1992.4.3.415). The result is the
-smallest set of locations that explains the residual.
+Their standard deviations s maximise the evidence (MacKay 1992, doi:10.1162/neco.1992.4.3.415).
 """
 
 from __future__ import annotations

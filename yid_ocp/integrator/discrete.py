@@ -8,11 +8,8 @@ Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h) and q_m
 The symmetric force split has f- = f+ = (h/2) F, the left one f- = h F and f+ = 0. s = 0 puts the constraint force at
 the node, s = 1/2 at the midpoint.
 
-The constraint force has a stiffness of its own, lam times the constraint's curvature. With s = 0 this stiffness has the
-weights (0, 1, 0) on three neighbouring configurations. If it exceeds 4 M/h^2 (a light twist under tension), the motion
-grows with alternating sign. With s = 1/2 the weights are those of a spring, (1/4, 1/2, 1/4), and the motion is stable
-under any tension. The two rules are equal if Dphi is constant. In general they differ by h/4 (d Dphi/dt)' (lam_k -
-lam_{k-1}) and a term of order h^2, so both have order two.
+With s = 1/2 the motion is stable under any tension, with s = 0 only if lam times the constraint's curvature is below
+4 M/h^2 (docs/design/constraints.md). Both rules have order two.
 
 The first equation holds for free coordinates. At a prescribed coordinate its left side is -h times the effort that the
 motion requires at node k. Both equations of a compliant coordinate are multiplied by its compliance, and so is its

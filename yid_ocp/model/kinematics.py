@@ -1,8 +1,7 @@
 """Symbolic kinematics and rigid-body mechanics of a kinematic tree in world-frame screw coordinates.
 
 A spatial velocity consists of the angular velocity and the linear velocity of the body point at the world origin. A
-wrench consists of the moment about the world origin and the force. With both in one fixed frame, the derivatives of the
-Lagrangian have the closed forms of `LagrangianFirstDerivatives`, which make the compiled step cheap.
+wrench consists of the moment about the world origin and the force. In one fixed frame the derivatives are cheap.
 """
 
 from __future__ import annotations

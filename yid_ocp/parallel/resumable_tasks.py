@@ -3,8 +3,7 @@
 A task is a call of a module-level function with plain data and paths. Its result is one JSON file, which its worker
 writes in one operation. The file name is the hash of the function's name, the sources that it depends on, and the
 arguments. A path enters the hash by file name and content, not by folder. A finished task is therefore never run again,
-whatever happened to the run. Any `concurrent.futures.Executor` is suitable if its workers share the file system. A task
-that runs twice, because its first worker was considered lost, gives the same file.
+whatever happened to the run. Any `concurrent.futures.Executor` is suitable if its workers share the file system.
 """
 
 from __future__ import annotations

@@ -6,8 +6,7 @@ are satisfied.
 
 To maximise information, each round linearises the sensitivities J(w) and the limits, and SLSQP (Kraft 1988, DFVLR-FB
 88-28) maximises the criterion of the linear J within a trust region (Burke and Ferris 1995, doi:10.1007/BF01585997).
-All iterates satisfy the limits. Each parameter has a prior standard deviation of `MAX_WEAK_RELATIVE_STD` of its value;
-it keeps the criterion finite if no measurement informs the parameter.
+All iterates satisfy the limits. Each parameter has a prior standard deviation of `MAX_WEAK_RELATIVE_STD` of its value.
 """
 
 from __future__ import annotations

@@ -497,29 +497,32 @@ def episode_at_equilibrium_with_denoised_gear_loads(
 
 
 def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Episode with the equilibrium near its first points, if the equilibrium of least energy is far from them."""
+    """Episode with an equilibrium near its first points, kept at all parameters: of least energy at `theta` if near."""
     fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
     early = None if fitted or not predictor.system.grasps else _until_first_points(episode)
     if early is None:
         return episode
     own, n = predictor.theta_with_episode_values(episode, theta), predictor.system.n_coordinates
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
-    error = _first_points_error(predictor, early, theta)
-    if not error > _POOR_EQUILIBRIUM_RMSE:
-        return episode
+    least = predictor.initial_state_and_derivative(episode, own, offset, ()).state[:n]
+    shapes, errors = [least], [_first_points_error(predictor, early, theta)]
+    if not errors[0] > _POOR_EQUILIBRIUM_RMSE:
+        return replace(episode, equilibrium_guess=least)
     elastic = [predictor.system.mechanism.joint_index(spring.joint_name) for spring in predictor.system.elastic_joints]
-    shapes = [predictor.initial_state_and_derivative(episode, own, offset, ()).state[:n].copy()]
-    shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
+    shapes.append(least.copy())
+    shapes[1][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
     with contextlib.suppress(DataError):
         fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
         seen = [s for s in early.measurements if s.node[0] * episode.grid.time_step <= _MAX_RESTING_TIME]
         seen = [replace(s, node=np.zeros(1, np.int64), fraction=np.zeros(1)) for s in seen]
         # an equilibrium near this configuration has the details
         shapes.append(fit(at, seen, own, _MAX_RESTING_TIME, episode.prescribed_path, roughly=True).state[:n])
-    others = [predictor.initial_state_and_derivative(episode, own, offset, (), shape).state[:n] for shape in shapes]
-    errors = [_first_points_error(predictor, replace(early, equilibrium_guess=q), theta) for q in others]
-    best, enough = int(np.argmin(errors)), _MAX_REMAINING_ERROR_FRACTION * error
-    return replace(episode, equilibrium_guess=others[best]) if errors[best] < enough else episode
+    for i, shape in enumerate(shapes[1:], 1):
+        shapes[i] = predictor.initial_state_and_derivative(episode, own, offset, (), shape).state[:n]
+        errors.append(_first_points_error(predictor, replace(early, equilibrium_guess=shapes[i]), theta))
+    errors[0] *= _MAX_REMAINING_ERROR_FRACTION
+    best = int(np.argmin(errors))
+    return replace(episode, equilibrium_guess=shapes[best]) if errors[best] < math.inf else episode
 
 
 def _until_first_points(episode: Episode) -> Episode | None:

@@ -197,7 +197,7 @@ class Episode:
     fixed_initial_state: FixedInitialState | None = None  # given or fitted to points; else it is an equilibrium
     # index of the estimation episode whose initial state and local parameters this held-out part of it shares
     initial_state_shared_with: int | None = None
-    equilibrium_guess: Array | None = None  # near the initial equilibrium, if that is not of least energy, (n,)
+    equilibrium_guess: Array | None = None  # near the initial equilibrium; None: that of least energy, (n,)
 
     @property
     def tracking_feedback_to_smoothed_reference(self) -> TrackingFeedback | None:

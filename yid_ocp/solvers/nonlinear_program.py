@@ -3,8 +3,7 @@
     min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
 
 f is half the sum of squares (or the Huber loss) of residuals, g the values of constraint terms. The module does not
-depend on mechanics or recordings. A term is one local function evaluated at many places, with directly assembled
-derivatives. CasADi would obtain the same derivatives by colouring the whole Jacobian, many times more slowly.
+depend on mechanics or recordings. A term is one local function evaluated at many places, with assembled derivatives.
 """
 
 from __future__ import annotations

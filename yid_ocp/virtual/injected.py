@@ -3,8 +3,7 @@
 Effects for which MuJoCo has a term (joint damping, armature, inertias, sites) are set in its model. Other forces are
 computed here in NumPy at every inner step. Sensor and clock errors are applied to the finished recording. The equations
 of `yid_ocp.effects` are not used, except for effects that only change the description of the system (masses, lengths,
-rest angles, gravity, grasp positions). Effects outside the library, whose correct verdict is `unknown`, exist only
-here.
+rest angles, gravity, grasp positions). Effects outside the library exist only here.
 """
 
 from __future__ import annotations

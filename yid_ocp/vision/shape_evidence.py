@@ -1,8 +1,7 @@
 """Assess a shape by a frame's cloud: own points, foreign points, and links without points.
 
 Points away from the tubes' surface form a foreign cluster if they are connected and as many as on a piece of tube as
-long as its diameter. If the cluster's surface continues the shape's, points within two tube radii of the contact are
-contested and not used. A tube station without own points is either hidden or visibly empty.
+long as its diameter. Where it continues the shape's surface, points within two tube radii are contested and not used.
 """
 
 from __future__ import annotations

@@ -8,9 +8,8 @@ of the parent. Every edge is a rigid link. The joint before each link bends abou
 The first edge is fixed to `clamp_start`, whose six coordinates follow two measured points. `clamp_end` holds the last
 edge with five equations (position and direction, free roll) or six.
 
-Motion capture measures neither force nor mass: if masses, rigidities and dampings are multiplied by one factor, the
-motion does not change. The linear density is therefore fixed at a nominal value, and every result is relative to it: a
-bending rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight.
+Motion capture measures neither force nor mass, so every result is relative to the nominal linear density rho: a
+bending rigidity of B means B/rho [N m^2 per kg/m].
 """
 
 from __future__ import annotations
