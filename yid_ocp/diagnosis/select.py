@@ -367,6 +367,7 @@ def _with_closures(
 
 
 def _with_rivals(entry: SelectedEffect, rivals: Sequence[tuple[EffectBase, float]]) -> SelectedEffect:
+    """The entry with equivalent effects, given with their distances, and their shares of its probability."""
     effects, distances = zip(*rivals, strict=True)
     weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
     return replace(entry, equivalent_effects=effects, shares=tuple(weights / weights.sum()))

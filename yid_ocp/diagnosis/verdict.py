@@ -218,10 +218,9 @@ def judge(
         return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, exceeds, limits))
 
     whole = judged(added)
-    alone = (selected_effect_alone(own, nominal, fits, limits) for own in added[: len(added) > 1])
     # a further effect that only corrects errors of the first is no reason to doubt this one
-    attempts = itertools.chain([whole], (judged((first,)) for first in alone))
-    said = next((own for own in attempts if own.verdict != "unknown"), whole)
+    alone = (judged((selected_effect_alone(own, nominal, fits, limits),)) for own in added[: len(added) > 1])
+    said = next((own for own in itertools.chain([whole], alone) if own.verdict != "unknown"), whole)
     finished("carry_over")
     return said
 

@@ -498,7 +498,7 @@ static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at
         for (int i = 0; i < M; i++) a->lam[i] = attempt ? 0.0 : lam_guess[i];
         const int end = newton_damped(k, a, tolerance, limit, attempt ? 0.5 : 0.0, error);
         good = end == OK;
-        if (good || !attempt) *status = end; /* leaps that lead nowhere end anyhow */
+        if (good || !attempt) *status = end; /* where leaps end says nothing */
     }
 #endif
     k->factored &= good;

@@ -505,24 +505,23 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
     own, n = predictor.theta_with_episode_values(episode, theta), predictor.system.n_coordinates
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
     least = predictor.initial_state_and_derivative(episode, own, offset, ()).state[:n]
-    shapes, errors = [least], [_first_points_error(predictor, early, theta)]
-    if not errors[0] > _POOR_EQUILIBRIUM_RMSE:
+    error = _first_points_error(predictor, early, theta)
+    if not error > _POOR_EQUILIBRIUM_RMSE:
         return replace(episode, equilibrium_guess=least)
     elastic = [predictor.system.mechanism.joint_index(spring.joint_name) for spring in predictor.system.elastic_joints]
-    shapes.append(least.copy())
-    shapes[1][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
+    shapes = [least.copy()]
+    shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
     with contextlib.suppress(DataError):
         fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
         seen = [s for s in early.measurements if s.node[0] * episode.grid.time_step <= _MAX_RESTING_TIME]
         seen = [replace(s, node=np.zeros(1, np.int64), fraction=np.zeros(1)) for s in seen]
         # an equilibrium near this configuration has the details
         shapes.append(fit(at, seen, own, _MAX_RESTING_TIME, episode.prescribed_path, roughly=True).state[:n])
-    for i, shape in enumerate(shapes[1:], 1):
-        shapes[i] = predictor.initial_state_and_derivative(episode, own, offset, (), shape).state[:n]
-        errors.append(_first_points_error(predictor, replace(early, equilibrium_guess=shapes[i]), theta))
-    errors[0] *= _MAX_REMAINING_ERROR_FRACTION
+    others = [predictor.initial_state_and_derivative(episode, own, offset, (), shape).state[:n] for shape in shapes]
+    errors = [_first_points_error(predictor, replace(early, equilibrium_guess=q), theta) for q in others]
+    errors.append(_MAX_REMAINING_ERROR_FRACTION * error)
     best = int(np.argmin(errors))
-    return replace(episode, equilibrium_guess=shapes[best]) if errors[best] < math.inf else episode
+    return replace(episode, equilibrium_guess=[*others, least][best]) if errors[best] < math.inf else episode
 
 
 def _until_first_points(episode: Episode) -> Episode | None:

@@ -51,7 +51,7 @@ from yid_ocp.problem.recorded_inputs import select_path_cutoff
 
 _HELD_OUT_START_WINDOW = 0.2
 """Duration of a sensor's first samples from which a held-out recording's initial state is estimated [s]."""
-_HELD_OUT_ITERATIONS = 3  # gauss-Newton iterations of this nearly linear estimate
+_HELD_OUT_ITERATIONS = 3  # Gauss-Newton iterations of this nearly linear estimate
 
 
 class EstimationProblem(ReprMixin):
