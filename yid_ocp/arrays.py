@@ -1,4 +1,4 @@
-"""Types of NumPy arrays: floats, integers and booleans."""
+"""Types of NumPy arrays of floats, integers and booleans."""
 
 from __future__ import annotations
 

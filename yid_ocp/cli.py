@@ -1,4 +1,4 @@
-"""Command-line interface: commands, their arguments and shell completion.
+"""Command-line interface with commands, arguments and shell completion.
 
 `workflow` implements the commands. A command's module is imported when it runs; `--help` loads no numerical library.
 """
@@ -357,7 +357,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_argument_parser() -> argparse.ArgumentParser:
-    """Build the argument parser of all commands. Invalid arguments raise `ConfigError`."""
+    """Build the parser for the arguments of all commands. Invalid arguments raise `ConfigError`."""
     from yid_ocp import __version__
 
     top = _Parser(prog="yid-ocp", description="Stiffness of flexible objects from robot recordings.")

@@ -16,14 +16,14 @@ _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows
 
 @dataclass(frozen=True)
 class ReprTexts:
-    """Texts that represent an object: one line without the class name, and rows of a notebook table, header first."""
+    """The texts that represent an object: a line without class name, and rows of a notebook table (header first)."""
 
     one_line: str
     table_rows: Sequence[Sequence[str]] = ()
 
 
 class ReprMixin:
-    """Mixin that makes `__repr__` and a notebook table from `_summary`. A dataclass with it needs `repr=False`."""
+    """A mixin class that creates `__repr__` and a notebook table from `_summary`. Dataclasses need `repr=False`."""
 
     def _summary(self) -> ReprTexts:
         raise NotImplementedError
@@ -48,12 +48,12 @@ def _row(cells: Sequence[str], kind: str) -> str:
 
 
 def count_with_noun(number: int, noun: str) -> str:
-    """Format a number with its noun, such as `1 joint` and `2 joints`."""
+    """Return a number with its noun in singular or plural, such as `1 joint` or `2 joints`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def abbreviated_names_text(names: Sequence[str]) -> str:
-    """Join names in one line. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
+    """Join names to one line of text. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
 
     A long line is cut, with the number of omitted names.
     """
@@ -82,7 +82,7 @@ def abbreviated_names_text(names: Sequence[str]) -> str:
 
 
 class Progress:
-    """Base class of receivers of progress reports, called by one thread at a time. It ignores all reports."""
+    """A base class for receivers of progress reports, which ignores all reports. One thread at a time calls it."""
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Report that a new stage of the work begins.
@@ -93,13 +93,13 @@ class Progress:
         """
 
     def report_iterate(self, entry: Any) -> None:
-        """Report an accepted iterate of a search (`solvers.base.Iterate`)."""
+        """Report a new accepted point of a search (`solvers.base.Iterate`)."""
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Report that `done` of `total` parts of the stage are finished. `text` names the last or next part."""
 
     def renew_results_table(self, rows: Sequence[Sequence[str]]) -> None:
-        """Report a table of all results so far: header first, then the best result. It replaces the previous table."""
+        """Replace the table of all results so far. Its header comes first, then the best result."""
 
 
 NULL_PROGRESS = Progress()
@@ -121,14 +121,14 @@ class LoggingProgress(Progress):
 
 
 class PartsDoneCounter:
-    """Thread-safe counter of a stage's `total` parallel parts. It reports every count, zero with the text `first`."""
+    """A thread-safe counter of a stage's `total` parallel parts. It reports every count, zero with the text `first`."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()
         progress.report_parts_done(0, total, first)
 
     def count_done(self, text: str, table: Callable[[], Sequence[Sequence[str]]] | None = None) -> None:
-        """Report one more finished part, and the table of results if given. Any thread may call it."""
+        """Report that one more part is finished, with the table of results if given. Any thread may call it."""
         with self._lock:
             self._count += 1
             self._progress.report_parts_done(self._count, self._total, text)

@@ -24,7 +24,7 @@ class YidError(Exception):
         super().__init__(what)
 
     def message_parts(self) -> dict[str, str]:
-        """The keys what, where, allowed and hint as the user sees them. Missing parts have general texts."""
+        """Return the four parts of the message (what, where, allowed, hint). Missing parts have general texts."""
         said = {
             "what": self.what,
             "where": self.where or "the arguments of this command or function",
@@ -44,29 +44,29 @@ class YidError(Exception):
 
 
 class ConfigError(YidError):
-    """Raised when the configuration file, or a value that overrides it, is invalid."""
+    """An error that is raised when the configuration file, or a value that overrides it, is invalid."""
 
     _usual_allowed = "the keys and values in docs/reference/settings.md"
 
 
 class DataError(YidError):
-    """Raised when a recording or another input file is missing, malformed or does not fit the model."""
+    """An error that is raised when an input file is missing, malformed or does not fit the model."""
 
     _usual_allowed = "data in a format that docs/reference/recordings.md or docs/howto/import.md describes"
 
 
 class ModelError(YidError):
-    """Raised when the mechanical model cannot be built as described."""
+    """An error that is raised when the mechanical model cannot be built as described."""
 
     _usual_allowed = "a model as the section `model` of docs/reference/settings.md describes it"
 
 
 class SolverError(YidError):
-    """Raised when a method does not support the task, or when a solver finds no usable solution."""
+    """An error that is raised when a method does not support the task, or a solver finds no usable solution."""
 
 
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
-    """Make the `SolverError` for a model that cannot be simulated."""
+    """Create the `SolverError` for a model that cannot be simulated."""
     allowed, hint = "values at which the simulation succeeds", "choose other initial values, or a smaller time step"
     return SolverError(f"the model cannot be simulated: {reason}", where=where, allowed=allowed, hint=hint)
 
@@ -75,13 +75,13 @@ _Error = TypeVar("_Error", bound=YidError)
 
 
 def missing_package_error(kind: type[_Error], what: str, extra: str) -> _Error:
-    """Make the error for a missing package of the optional dependencies `extra`."""
+    """Create the error for a missing package, which belongs to the optional dependencies `extra`."""
     where, hint = f"the Python environment {sys.prefix}", f"pip install 'yid-ocp[{extra}]'"
     return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
 
 
 def import_optional(module: str, extra: str, what: str, kind: type[YidError] = DataError) -> ModuleType:
-    """Import a module of the optional dependencies `extra`. Raises an error of `kind` (`what`) if it is missing."""
+    """Import a module from the optional dependencies `extra`. Raises an error of `kind` (`what`) if it is missing."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -89,18 +89,18 @@ def import_optional(module: str, extra: str, what: str, kind: type[YidError] = D
 
 
 class OutputError(YidError):
-    """Raised when a result cannot be written to its destination."""
+    """An error that is raised when a result cannot be written to its destination."""
 
     _usual_allowed = "a new name in a writable folder, on a disk with free space"
     _usual_hint = "choose another path"
 
 
 class ParallelWorkError(YidError):
-    """Raised when workers cannot be reached, are unsuitable for their tasks, or fail in them for a known cause."""
+    """An error raised when workers cannot be reached, are unsuitable for their tasks, or fail for a known cause."""
 
 
 class InsufficientMemoryError(YidError):
-    """Raised when the machine has too little memory."""
+    """An error that is raised when the machine has too little memory."""
 
 
 _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
@@ -121,7 +121,7 @@ _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none i
 
 
 def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str = "") -> dict[str, str]:
-    """Arguments `allowed` and `hint` for an error about an unknown name. Long lists of names are shortened.
+    """Return the arguments `allowed` and `hint` for an error about an unknown name. Long lists are shortened.
 
     The hint is the most similar known name; `otherwise` if no name is similar.
     """
@@ -133,7 +133,7 @@ def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str
 def require_known_names(
     names: Iterable[str], known: Collection[str], noun: str, where: str, kind: type[YidError]
 ) -> None:
-    """Raise an error of `kind`, "there is no NOUN 'NAME'" with the nearest known name, if a name is not known."""
+    """Raise an error of `kind` if any name is unknown: "there is no NOUN 'NAME'", with the nearest known name."""
     for name in names:
         if name not in known:
             raise kind(f"there is no {noun} '{name}'", where=where, **unknown_name_error_arguments(name, known))
@@ -145,7 +145,7 @@ def _close(name: str, names: Sequence[str], count: int) -> list[str]:
 
 
 def nearest_name_question(name: str, names: Iterable[str]) -> str:
-    """Ask for the most similar known name. Empty if no name is similar."""
+    """Return the question whether the user meant the most similar known name. Empty if no name is similar."""
     close = _close(name, [*names], 1)
     return f"did you mean '{close[0]}'?" if close else ""
 

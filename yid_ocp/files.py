@@ -60,7 +60,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 @contextlib.contextmanager
 def process_memory_limit() -> Iterator[None]:
-    """Limit this process to 1.75 GiB beyond its present memory use (context manager; effective on Linux only).
+    """Limit the additional memory of this process to 1.75 GiB inside a `with` block (on Linux only).
 
     It protects against libraries that unpack input files: a larger request raises MemoryError.
     """
@@ -111,7 +111,7 @@ def read_input_json(path: Path) -> Any:
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Write a file atomically (context manager). The yielded temporary file replaces `path` on success.
+    """Write a file completely or not at all, in a `with` block. The yielded temporary file replaces `path` on success.
 
     Raises `OutputError` if the folder is missing or the file cannot be written.
     """
@@ -147,7 +147,7 @@ def write_strict_json(path: Path, data: Any) -> None:
 
 
 def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Path:
-    """Make a folder with its missing parents. Raises `OutputError`, which calls the folder `what`, if that fails."""
+    """Create a folder and its missing parents. Raises `OutputError`, which calls the folder `what`, if that fails."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -158,12 +158,12 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
 
 
 def is_file(path: Path) -> bool:
-    """Whether the path is an existing file. Also False for names that are too long or invalid."""
+    """Check whether the path is an existing file. Returns False also for names that are too long or invalid."""
     return os.path.isfile(path)
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 (hexadecimal) of a file, or of all files of a folder. Raises `DataError` if a file is unreadable."""
+    """Compute the SHA-256 (hexadecimal) of a file or a folder's files. Raises `DataError` if a file is unreadable."""
     digest = hashlib.sha256()
     for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
         with check_input_file(entry).open("rb") as file:
@@ -173,7 +173,7 @@ def file_sha256(path: Path) -> str:
 
 
 def json_sha256(data: Any) -> str:
-    """SHA-256 of plain data as JSON, 64 hexadecimal digits. The order of keys has no influence."""
+    """Compute the SHA-256 of plain data as JSON, 64 hexadecimal digits. The order of keys has no influence."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -208,12 +208,12 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 
 def attributes_to_dict(value: Any, names: str) -> dict[str, Any]:
-    """Return attributes of `value` listed in `names` (blank-separated), by name. `key=name` stores one under `key`."""
+    """Return attributes of `value` as a dictionary. `names` lists them, separated by blanks; `key=name` renames one."""
     return {key: getattr(value, name or key) for key, _, name in [name.partition("=") for name in names.split()]}
 
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
-    """Restore a dataclass instance from data of `to_lossless_plain_data`."""
+    """Restore a dataclass instance from data that `to_lossless_plain_data` returned."""
     return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})
 
 
@@ -242,6 +242,6 @@ def _value(hint: Any, value: Any) -> Any:
 
 
 def os_error_reason(error: Exception) -> str:
-    """Reason text of an operating system or HDF5 error."""
+    """Return the reason for an operating system or HDF5 error as text."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error).strip("'\"")

@@ -1,4 +1,4 @@
-"""Handle signals that end a command. Suppressed signals are raised again; finally the process is killed."""
+"""Handling of signals that end a command. Suppressed signals are raised again; finally the process is killed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TERMINATION_SIGNALS = [number for number in signal.Signals if number.name in ("
 
 
 class InterruptedBySignal(KeyboardInterrupt):
-    """Raised when a signal ends the command."""
+    """An exception that is raised when a signal ends the command."""
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(signal.Signals(signal_number).name)
@@ -39,19 +39,19 @@ _STATE = _State()
 
 
 def received_signal_number() -> int | None:
-    """Number of the signal that requested the end of the command, or None."""
+    """Return the number of the signal that requested the end of the command, or None."""
     return _STATE.asked
 
 
 def raise_if_interrupted() -> None:
-    """Raise `InterruptedBySignal` if a signal has requested the end of the command but a library suppressed it."""
+    """Raise `InterruptedBySignal` if a signal asked the command to end, but a library suppressed the signal."""
     if _STATE.asked is not None:
         raise InterruptedBySignal(_STATE.asked)
 
 
 @contextlib.contextmanager
 def defer_interruption() -> Iterator[None]:
-    """Delay the handling of termination signals until a short block has ended (context manager)."""
+    """Delay the handling of termination signals until a short `with` block has ended."""
     _STATE.deferring += 1
     before = _STATE.asked
     try:
@@ -64,7 +64,7 @@ def defer_interruption() -> Iterator[None]:
 
 @contextlib.contextmanager
 def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
-    """Remove a folder if the process is killed during a block (context manager)."""
+    """Remove a folder if the process is killed inside a `with` block."""
     _STATE.unfinished.add(folder)
     try:
         yield
@@ -74,7 +74,7 @@ def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def raise_on_termination_signals() -> Iterator[None]:
-    """Raise `InterruptedBySignal` for SIGINT, SIGTERM and SIGHUP during a block (context manager).
+    """Raise `InterruptedBySignal` when SIGINT, SIGTERM or SIGHUP arrives inside a `with` block.
 
     The exception is raised again every `_RERAISE_INTERVAL` seconds, because it can be lost in garbage collection, in
     callbacks of libraries, or in a call that does not return. After `_FORCED_EXIT_DELAY` seconds the process is ended

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt method for dense least-squares problems of some dozen coordinates, such as chain shapes.
+"""Levenberg-Marquardt method for small dense least-squares problems, such as the shape of a chain.
 
 docs/design/solvers.md compares it with SciPy's method.
 """
@@ -20,14 +20,14 @@ _MAX_STEP = 0.5  # largest change of a component in one step
 
 @dataclass(frozen=True)
 class LocalQuadraticModel:
-    """Quadratic model of a cost about one point: value, gradient (n,) and positive definite Hessian (n, n)."""
+    """A quadratic model of a cost near one point: value, gradient (n,) and positive definite Hessian (n, n)."""
 
     cost: float
     gradient: Array
     hessian: Array
 
     def damped_step(self, damping: float) -> Array:
-        """Step (n,) that minimises the model with Levenberg-Marquardt damping."""
+        """Compute the step (n,) that minimises the model with Levenberg-Marquardt damping."""
         return np.asarray(-np.linalg.solve(self.hessian + damping * np.diag(np.diag(self.hessian)), self.gradient))
 
 

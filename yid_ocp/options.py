@@ -1,4 +1,4 @@
-"""Annotations of options that users may set.
+"""Annotations of the options that users can set.
 
 An option is a field of a frozen dataclass, annotated with its bounds and with `OptionInfo`:
 
@@ -35,7 +35,7 @@ _TYPE_WORDS = {float: "a number", int: "a whole number", bool: "true or false", 
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """Meaning and SI unit of an option. `is_path` marks a file path relative to the configuration."""
+    """The meaning and SI unit of an option. `is_path` marks a file path relative to the configuration."""
 
     description: str = ""
     unit: str = ""
@@ -44,7 +44,7 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """Annotation of a type whose setting names a registered class, by `selector_key` or by a mapping entry's key."""
+    """An annotation of a type whose setting names a registered class, by `selector_key` or by a mapping entry's key."""
 
     registry: Registry[Any]
     default_name: str = ""
@@ -53,7 +53,7 @@ class RegistryChoice:
 
 @dataclass(frozen=True)
 class Option:
-    """Annotated type, default and dataclass field name of an option. The default `MISSING` means that there is none."""
+    """The annotated type, default and dataclass field name of an option. `MISSING` means that there is no default."""
 
     type_hint: Any
     default_value: Any
@@ -62,7 +62,7 @@ class Option:
 
 @functools.cache
 def options_by_key(kind: type) -> Mapping[str, Option]:
-    """Options of a dataclass (fields with an `OptionInfo`), by key. A key is the field name without a trailing `_`."""
+    """Return the options of a dataclass by key. A key is the name of an `OptionInfo` field without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
     found = {}
     for entry in dataclasses.fields(kind):
@@ -83,7 +83,7 @@ def split_annotated(hint: Any) -> tuple[Any, list[Any]]:
 
 
 def non_none_union_members(hint: Any) -> tuple[Any, ...]:
-    """Member types of a union, without None. For another type, the type itself."""
+    """Return the member types of a union, without None. For another type, return the type itself."""
     bare, _ = split_annotated(hint)
     if get_origin(bare) in (Union, types.UnionType):
         return tuple(member for member in get_args(bare) if member is not type(None))
@@ -91,20 +91,20 @@ def non_none_union_members(hint: Any) -> tuple[Any, ...]:
 
 
 def mapping_value_type(hint: Any) -> Any:
-    """Value type of a mapping type; None for other types."""
+    """Return the value type of a mapping type, or None for other types."""
     found = (split_annotated(member)[0] for member in non_none_union_members(hint))
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
 def variadic_tuple_entry_type(hint: Any) -> Any:
-    """Entry type of a tuple type of any length; None for other types."""
+    """Return the entry type of a tuple type of any length, or None for other types."""
     bare, _ = split_annotated(hint)
     arguments = get_args(bare)
     return arguments[0] if get_origin(bare) is tuple and arguments[-1] is Ellipsis else None
 
 
 def describe_type(hint: Any) -> str:
-    """Describe a type with its range and unit for messages."""
+    """Describe a type, its range and its unit in words, for messages."""
     bare, markers = split_annotated(hint)
     unit = next((marker.unit for marker in markers if isinstance(marker, OptionInfo) and marker.unit), "")
     limits = [f"{word} {limit:g}" for limit, _, word in _bounds(markers)]
@@ -131,7 +131,7 @@ def _words(hint: Any) -> str:
 
 
 def check_option_bounds(options: Any, where: str) -> None:
-    """Raise `ConfigError` if a number in an options dataclass is outside its annotated bounds."""
+    """Check that all numbers in an options dataclass are within their annotated bounds. Raises `ConfigError`."""
     kind: Any = type(options)
     for name, option in options_by_key(kind).items():
         value = getattr(options, option.field_name)

@@ -11,14 +11,14 @@ _Entry = TypeVar("_Entry")
 
 
 class Registry(Generic[_Entry]):
-    """A table from name to implementation, filled by decorators. `entry_noun` names an entry in error messages."""
+    """A table of implementations by name, which decorators fill. `entry_noun` names an entry in error messages."""
 
     def __init__(self, entry_noun: str) -> None:
         self.entry_noun = entry_noun
         self._entries: dict[str, _Entry] = {}
 
     def register(self, name: str) -> Callable[[_Entry], _Entry]:
-        """Return a decorator that registers its argument under `name`."""
+        """Return a decorator that registers a function or class under `name`."""
 
         def enter(entry: _Entry) -> _Entry:
             if name in self._entries:
@@ -31,7 +31,7 @@ class Registry(Generic[_Entry]):
         return enter
 
     def unregister_names(self, names: Iterable[str]) -> None:
-        """Remove entries, such as those of a module whose import failed."""
+        """Remove the entries with the given names, for example after the import of a module failed."""
         for name in names:
             self._entries.pop(name, None)
 

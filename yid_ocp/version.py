@@ -1,4 +1,4 @@
-"""Versions of this package, its sources and its numerical dependencies."""
+"""The versions of this package, its sources and its numerical dependencies."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _NUMERICAL_PACKAGES = ("casadi", "numpy", "scipy", "h5py")  # whose versions are
 
 
 def package_version() -> str:
-    """Version of this package, or `0+unknown` if it is not installed."""
+    """Return the version of this package, or `0+unknown` if it is not installed."""
     return _version("yid-ocp", "0+unknown")
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of Python, this package and its numerical dependencies, by name."""
+    """Return the versions of Python, this package and its numerical dependencies, and the platform, by name."""
     result = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
     return result | {name: _version(name, "not installed") for name in ("yid-ocp", *_NUMERICAL_PACKAGES)}
 
 
 def sha256_of_source_files(folder: Path) -> str:
-    """SHA-256 of all source files in a folder and its subfolders, 64 hexadecimal digits."""
+    """Compute the SHA-256 of all source files in a folder and its subfolders, 64 hexadecimal digits."""
     digest = hashlib.sha256()
     for file in sorted(path for path in folder.rglob("*") if path.suffix in _SOURCE_SUFFIXES):
         content = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -35,12 +35,12 @@ def sha256_of_source_files(folder: Path) -> str:
 
 @functools.cache
 def package_source_hash() -> str:
-    """SHA-256 of this package's source files at the first call in this process, 64 hexadecimal digits."""
+    """Return the SHA-256 of this package's source files at the first call in this process, 64 hexadecimal digits."""
     return sha256_of_source_files(Path(__file__).parent)
 
 
 def software_fingerprint() -> dict[str, str]:
-    """Versions and source hash that two processes must share to compute the same numbers."""
+    """Return the versions and the source hash that two processes must share to compute the same numbers."""
     python = ".".join(platform.python_version_tuple()[:2])
     own = {name: text for name, text in installed_versions().items() if name in ("yid-ocp", *_NUMERICAL_PACKAGES)}
     return {"python": python, **own, "code": package_source_hash()}

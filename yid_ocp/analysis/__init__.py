@@ -1,1 +1,1 @@
-"""Analyses of a model and of an estimation: identifiability, data quality, convergence. None changes its input."""
+"""Analyses of a model or a fit, such as identifiability, intervals and data checks. None changes its input."""

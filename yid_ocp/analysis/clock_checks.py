@@ -1,4 +1,4 @@
-"""Checks of point clocks for offset and drift relative to the joint clock, also with the residuals of a fit.
+"""Checks of the clocks of measured points for an offset or drift relative to the clock of the joints.
 
 A point with the time stamp t was measured at the time t - late - drift (t - middle), where `middle` is the middle of
 the group in time. To first order
@@ -118,7 +118,7 @@ def robot_held_point_clock_issues(
     std: float,
     path: PositionsAtTimesFunction,
 ) -> Iterator[Issue]:
-    """Yield an issue if the clock of points held by the robot has an offset or drift relative to the joints' clock.
+    """Yield an issue if the clock of points on the robot has an offset or drift relative to the clock of the joints.
 
     The measured positions `seen` (N, np, 3) [m] at the times `t` (N,) are compared with the positions that `path`
     computes from the joint angles at given times. `by_angle` (N, np, 3, k) is the derivative of these positions with
@@ -172,14 +172,14 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSe
 
 
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
-    """Text on how to correct time stamps t that are `late` [s] at t = `middle` and drift by the fraction `drift`."""
+    """Return advice on how to correct time stamps with a delay (`late` [s] at the time `middle`) and a `drift`."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
 def clock_offset_drift_and_rms_distance(
     path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float, float]:
-    """Find the clock offset [s] and relative drift at which points are nearest to a known path, and how near [m] (rms).
+    """Find the clock offset [s] and drift that bring points nearest to a known path, and the remaining rms error [m].
 
     The search goes from coarse to fine steps. The path is known from the first to the last time in `knots` [s]. The
     points `seen` (N, np, 3) [m] were measured at the times `t` (N,). With `drifts`, a drift of up to `_MAX_DRIFT` is
@@ -213,7 +213,7 @@ def clock_offset_drift_and_rms_distance(
 
 
 def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[EstimationProblem, list[Issue]]:
-    """Correct points whose clock offset is uncertain by more than half a sample to where a fit has them, and say so.
+    """Correct the times of points if their clock offset is uncertain by over half a sample, and report it as an issue.
 
     So large an offset is not linear in the residual. Fits, with what is left of it as a linear error of unknown size,
     alternate with steps along the predicted paths, also of held-out recordings, which keep `clock_offset_std`.
@@ -254,7 +254,7 @@ def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[Estima
 
 
 def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
-    """Find drifting clocks and overstated noise in the residuals of a fit.
+    """Return issues about drifting clocks and overstated sensor noise, found in the residuals of a fit.
 
     Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has
     the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).

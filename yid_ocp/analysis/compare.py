@@ -1,4 +1,4 @@
-"""Comparison of estimation methods on one problem, and with published results."""
+"""Comparison of several estimation methods on one problem, and with published results."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class _MethodResult:
 
 @dataclass(frozen=True)
 class MethodsComparisonResult:
-    """Results of all estimation methods on one problem, with disagreements on identifiable parameters."""
+    """The results of all estimation methods on one problem, with the identifiable parameters that differ."""
 
     method_results: tuple[_MethodResult, ...]
     reference_method: str  # method of lowest cost, with which the other methods are compared
@@ -62,7 +62,7 @@ class MethodsComparisonResult:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether all methods agree on every identifiable parameter."""
+        """True if all methods agree on every identifiable parameter."""
         return not any(self.disagreements.values())
 
 

@@ -1,4 +1,4 @@
-"""Errors from finite links and time steps, natural frequencies, open grasps and numerical stability."""
+"""Errors due to finite links and time steps, natural frequencies, gaps at grasps, and numerical stability."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def _gauss_newton_step_in_finer_model(
 def predicted_refit_residual_at_finer_step(
     fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> Array | None:
-    """Predict the whitened residual of a fit with a shorter time step, or return None if the prediction fails.
+    """Predict the whitened residual that a fit with a shorter time step would have, or return None if this fails.
 
     `fine` is the problem with the shorter time step. One Gauss-Newton step is made from the coarse fit `x` (nx,), where
     `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without, `fine` is
@@ -156,7 +156,7 @@ def predicted_refit_residual_at_finer_step(
 def problem_corrected_for_few_links(
     problem: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
 ) -> EstimationProblem | None:
-    """Subtract from all data, held-out ones included, what twice the links change in the predictions of a fit.
+    """Subtract from all data the amount by which the predictions change if each link is divided in two.
 
     `at_x` is the evaluation at the fit `x` (nx,), with Jacobian. The finer model is refitted first if the change is
     much larger than the residual: a linear step is too inaccurate there. Returns None if a refit would not lower r'r by
@@ -205,7 +205,7 @@ def _with_data_shifted(episode: Episode, before: EpisodePrediction | str, after:
 
 
 def longest_accurate_time_step(problem: EstimationProblem) -> float:
-    """Find the longest time step [s] whose error is small compared with the residual at the initial unknowns.
+    """Find the longest time step [s] whose error is small compared with the residual at the initial values.
 
     Starting at 20 ms, the step is halved, at most five times, until a further halving changes the predictions by at
     most 3 % of the larger of residual and noise (root mean squares of whitened values). A poor initial guess has a
@@ -273,7 +273,7 @@ def estimate_shifts_by_discretisation(
     *,
     model_difference_only: bool = False,
 ) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
-    """Measure how estimates shift if every link is divided in two, and if the time step is halved.
+    """Measure how much estimates change if every link is divided in two, and if the time step is halved.
 
     `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. If `x`
     is not a minimum of the cost, set `model_difference_only`. Returns the shifts of every shared free parameter (empty
@@ -329,7 +329,7 @@ def estimates_with_discretisation_error(
     found: Mapping[str, EstimateShiftByLinksAndTimeStep],
     sizes: Mapping[str, float],
 ) -> dict[str, ParameterEstimate]:
-    """Add the discretisation error to the standard deviations, intervals and verdicts of estimates.
+    """Return estimates whose standard deviations, intervals and verdicts include the discretisation error.
 
     The error is taken from the shifts `found` at finer discretisations. A verdict can only get worse. `sizes` are
     typical sizes, as in `inference.uncertainty.parameter_verdict`.
@@ -359,7 +359,7 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 @dataclass(frozen=True)
 class StepMapNaturalFrequencies:
-    """Natural frequencies of a system about an equilibrium, with the robot fixed, as the integrator reproduces them.
+    """The natural frequencies of a system near an equilibrium, as the integrator reproduces them with a fixed robot.
 
     Unstable modes grow from step to step although damping is included: the equilibrium is unstable, or the time step is
     too long for the tension of the object.
@@ -379,7 +379,7 @@ def step_map_natural_frequencies(
     constraint_force_at: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
 ) -> StepMapNaturalFrequencies:
-    """Compute the natural frequencies of a system about an equilibrium, as one integration step reproduces them.
+    """Compute the natural frequencies that the integrator reproduces near an equilibrium of a system.
 
     The frequencies follow from the eigenvalues of the linearised step without damping. The driven and prescribed
     coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts at `guess` (n,).
@@ -417,7 +417,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 def min_gap_by_grasp_at_robot_posture(
     system: System, configuration: Mapping[str, float], theta: Array, near: Array | None = None
 ) -> dict[str, float]:
-    """Compute the smallest possible gap of each grasp [m], with the robot's joints fixed and the object free to bend.
+    """Compute the smallest gap [m] that each grasp can reach if the robot is fixed and the object can bend freely.
 
     `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths. The search starts
     at the configuration `near` (n,), if given.
@@ -458,7 +458,7 @@ _MAX_GROWTH_DECADES = 6.0
 
 @dataclass(frozen=True)
 class AlternatingErrorGrowth:
-    """Growth of numerical errors that alternate in sign from step to step along one motion.
+    """The growth of numerical errors that change their sign at every step of a motion.
 
     A mode of the linearised step alternates if its eigenvalue has a negative real part. Such a mode is a numerical
     artefact, because physical motion keeps its direction for several steps. If the eigenvalue's magnitude exceeds one,
@@ -473,12 +473,12 @@ class AlternatingErrorGrowth:
 
     @property
     def keeps_errors_below_resolution(self) -> bool:
-        """Whether alternating errors grow by at most six decades, so that rounding stays below sensor resolution."""
+        """True if alternating errors grow by at most a factor of 10^6, and thus stay below the sensors' resolution."""
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
     @property
     def stability_message(self) -> str:
-        """Sentence that states whether the time step is stable, with a remedy if it is not."""
+        """A sentence that states whether the time step is stable, with a remedy if it is not."""
         step = f"{self.recording_name}: the step of {self.time_step:g} s is"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along the motion"
@@ -527,7 +527,7 @@ def _alternating_mode_magnitude(
 
 
 def alternating_error_growth_of_worst_recording(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
-    """Largest alternating error growth of all recordings at x, up to a failed step. None if no rollout can start."""
+    """Return the largest growth of alternating errors in any rollout at `x` (until it fails). None if none starts."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)

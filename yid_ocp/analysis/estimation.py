@@ -1,4 +1,4 @@
-"""Parameter estimation with complete uncertainty and checks, as in the command `solve`."""
+"""Parameter estimation with uncertainties and checks, as the command `solve` performs it."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def solve(
 def add_intervals_and_checks(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
-    """Add profile intervals, discretisation errors, held-out predictions and data checks to a fit. See `solve`."""
+    """Add confidence intervals, discretisation errors, held-out predictions and data checks to a fit. See `solve`."""
     start, problem = problem, solution.problem or problem
     if solution.evaluation is not None:
         problem = _with_equilibrium_guesses(problem, solution.evaluation.episode_predictions, ())
@@ -177,7 +177,7 @@ _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 @dataclass(frozen=True)
 class CableMemoryChoice:
-    """Chosen fit, with or without cable memory (`*.memory`). `message` is the reason, empty if there was no choice."""
+    """The chosen fit, with or without shape memory of the cable. `message` is the reason, empty without a choice."""
 
     problem: EstimationProblem
     solution: Solution
@@ -190,7 +190,7 @@ def choose_cable_memory_fit(
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> CableMemoryChoice:
-    """Choose between the fit with and a refit without cable memory, if recordings start in motion.
+    """Decide whether to keep the cable's shape memory in the fit, if the cable already moves when a recording starts.
 
     The load of a cable that moves at the start of a recording is unknown, and this motion can be mistaken for memory.
     Leave-one-out prediction decides: each such recording is predicted from all others, with and without memory (by one
@@ -216,7 +216,7 @@ def choose_cable_memory_fit(
 
 
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
-    """Return the problem with the cable's shape memory fractions (`SEGMENT.memory`) fixed at zero."""
+    """Return the problem with the shape memory of all cable segments (`SEGMENT.memory`) fixed at zero."""
     memory = _memory_parameters(problem)
     free = tuple(name for name in problem.free if name not in (*memory, INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER))
     return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))
@@ -257,14 +257,14 @@ _N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the tor
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
-    """Unit of a channel, or of the first member of a group, in `units` by channel; empty if unknown."""
+    """Return the unit of a channel, or of the first channel in a group, from `units`. Empty if it is unknown."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
 def prediction_errors_units_and_fit_errors(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
-    """Prediction and baseline errors of all recordings (held-out first), units and fit errors by channel."""
+    """Return the prediction errors of every recording (held-out first), and the unit and fit error of every channel."""
     residuals: Mapping[str, Any] = {}
     pairs = list(held_out)
     if solution.evaluation is not None:
@@ -361,7 +361,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
 def channels_worse_than_naive_prediction(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Channels that a baseline predicts clearly better than the model, of `prediction_errors_units_and_fit_errors`."""
+    """List the channels that a simple guess without a model predicts clearly better than the model does."""
     worse = []
     for entry in entries:
         for channel in entry["rmse"]:

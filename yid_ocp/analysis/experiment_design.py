@@ -1,4 +1,4 @@
-"""Fisher information of hypothetical variants of a recorded experiment: grasps, arms, motions and sensors."""
+"""The information that a recorded experiment would give if its grasps, arms, motions or sensors were changed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 @dataclass(frozen=True)
 class PointObservationSchedule:
-    """Sample times and standard deviations of one frame that a point group observes."""
+    """The sample times and standard deviations of one point in a group of measured points."""
 
     point_group: str
     frame: str
@@ -60,7 +60,7 @@ class PointObservationSchedule:
 
 @dataclass(frozen=True)
 class UnchangedExperiment:
-    """A recorded experiment before any change: its problem, unknowns and prior knowledge."""
+    """A recorded experiment before any change, with its problem, unknowns and prior knowledge."""
 
     problem: EstimationProblem
     x: Array  # unknowns at which the information is evaluated, shape (nx,)
@@ -70,17 +70,17 @@ class UnchangedExperiment:
 
     @property
     def parameter_values(self) -> dict[str, float]:
-        """Values of all model parameters at `x`."""
+        """The values of all model parameters at the unknowns `x`."""
         theta, _ = self.problem.unpack_episode_unknowns(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Points seen by a camera (None without), frame times [s] and typical std [m], or their defaults."""
+        """Return the points that a camera sees (or None), their frame times [s] and typical noise [m], or defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: measuring_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_with_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Points measured by arms (None without), sample times [s] and typical std [m], or their defaults."""
+        """Return the points that arms measure (or None), their sample times [s] and typical noise [m], or defaults."""
         t = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor_name == "arm", t, _DEFAULT_ARM_POINT_STD)
 
@@ -92,7 +92,7 @@ class UnchangedExperiment:
         return None, times, std
 
     def existing_point_observation_schedules(self, episode: Episode) -> list[PointObservationSchedule]:
-        """Observation schedule of every point measured in a recording."""
+        """Return the sample times and standard deviations of every point measured in a recording."""
         found = []
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
@@ -120,7 +120,7 @@ def _used_point_groups(problem: EstimationProblem, episode: Episode) -> list[Poi
 
 
 def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
-    """Sample times at `rate` [Hz] from zero to the end of the recording on the time grid `grid`, [s]."""
+    """Return evenly spaced sample times [s] at `rate` [Hz], from zero to the end of a recording."""
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
@@ -134,7 +134,7 @@ class _MeasurablePoint(NamedTuple):
 
 
 def measurable_points(system: System) -> list[_MeasurablePoint]:
-    """List points that could be measured: on segments, or on moving frames and springs if there are none."""
+    """List points that could be measured: on segments or, if there are none, on moving frames and springs."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[_MeasurablePoint] = []
@@ -166,7 +166,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 
 
 def step_with_frames_at_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
-    """Return the step with all measurable frames in its mechanism, and these frames. The equations stay the same."""
+    """Return the step with a frame added at each measurable point, and these points. The equations stay the same."""
     mechanism, seen = step.system.mechanism, measurable_points(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
@@ -175,7 +175,7 @@ def step_with_frames_at_measurable_points(step: Step) -> tuple[Step, list[_Measu
 
 @dataclass
 class VariantPositionSensitivities:
-    """Sensitivities of the positions of all measurable frames in one variant of an experiment.
+    """The derivatives of the positions of all measurable points in one variant of an experiment.
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
     with respect to the nx unknowns and to the episode's q torque-error unknowns (see `sensitivities_and_information`).
@@ -192,7 +192,7 @@ class VariantPositionSensitivities:
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def fisher_information_with_prior(self, views: Sequence[Sequence[PointObservationSchedule]]) -> Array:
-        """Fisher information (nx, nx) of observations plus that of the prior. `views` has one list per recording."""
+        """Sum the Fisher information (nx, nx) of the observations and the prior. `views` has one list per recording."""
         total = self.prior_information.copy()
         nx = len(total)
         for i, episode in enumerate(self.problem.episodes):
@@ -228,7 +228,7 @@ SETUP_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 
 
 class ExperimentVariantSensitivityBuilder:
-    """Computes and caches sensitivities of variants of an experiment, such as with a second arm or another motion."""
+    """A cache that computes sensitivities for variants of an experiment, such as a second arm or another motion."""
 
     def __init__(self, setting: UnchangedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
@@ -236,7 +236,7 @@ class ExperimentVariantSensitivityBuilder:
         self._layouts: dict[frozenset[str], VariantPositionSensitivities | str] = {}
 
     def position_sensitivities_of_variant(self, setup_changes: frozenset[str]) -> VariantPositionSensitivities | str:
-        """Compute the sensitivities of the variant with the changes `setup_changes`, or return why that fails."""
+        """Compute the sensitivities for the experiment with the given changes, or return the reason for a failure."""
         if setup_changes not in self._layouts:
             if setup_changes:
                 words = " and ".join(SETUP_CHANGE_DESCRIPTIONS[name] for name in sorted(setup_changes))
@@ -248,7 +248,7 @@ class ExperimentVariantSensitivityBuilder:
         return self._layouts[setup_changes]
 
     def applicable_setup_changes(self) -> list[str]:
-        """Names of the setup changes that the experiment's system allows."""
+        """List the names of the changes that are possible for this experiment."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos
         measured = any(s.sensor.effort_joints for e in episodes for s in e.measurements)

@@ -1,4 +1,4 @@
-"""Cross-validation of friction laws of increasing complexity, and friction torques from data."""
+"""Cross-validation of friction laws from simple to complex, and measured friction torques."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_CLOUD_POINTS = 1500
 
 @dataclass(frozen=True)
 class CrossValidatedFrictionLawFit:
-    """One friction law fitted to all recordings, with its prediction errors on recordings left out of the fit.
+    """A friction law fitted to all recordings, with its prediction errors on recordings left out of the fit.
 
     `left_out_errors` holds the root mean square prediction error of each recording by a fit without the recordings of
     its kind of motion (NaN if the fit failed). The errors are in the channels' unit, or in standard deviations if units
@@ -39,7 +39,7 @@ class CrossValidatedFrictionLawFit:
 
 
 def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Group recordings by name without final number, or singly if groups are few. Those with motors off are omitted."""
+    """Group recordings whose names differ only in a final number. Motor-off ones are omitted; few groups are split."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
@@ -54,7 +54,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 def cross_validate_over_motion_kinds(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> CrossValidatedFrictionLawFit:
-    """Fit a friction law to all recordings, and refit it without each of the `kinds` of motion to get errors."""
+    """Fit a friction law without each kind of motion in turn, to get its prediction errors for the omitted kind."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
@@ -80,7 +80,7 @@ def cross_validate_over_motion_kinds(
 def mean_and_std_error_over_motion_kinds(
     errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
-    """Mean of the recordings' errors over kinds of motion, and its standard error."""
+    """Return the mean of the prediction errors over all kinds of motion, and the standard error of this mean."""
     by_kind = np.array([np.mean([errors[name] for name in own]) for own in kinds.values()])
     return float(np.mean(by_kind)), float(np.std(by_kind, ddof=1) / np.sqrt(len(by_kind)))
 
@@ -88,7 +88,7 @@ def mean_and_std_error_over_motion_kinds(
 def prediction_error_difference_and_std_error(
     fit: CrossValidatedFrictionLawFit, other: CrossValidatedFrictionLawFit, kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
-    """Mean, over kinds of motion, of one fit's prediction error minus another's, and its standard error."""
+    """Return the mean prediction error of `fit` minus that of `other` over kinds of motion, and its standard error."""
     beyond = {name: own - other.left_out_errors[name] for name, own in fit.left_out_errors.items()}
     return mean_and_std_error_over_motion_kinds(beyond, kinds)
 
@@ -128,7 +128,7 @@ class _FrictionTorqueCloud:
 def measured_and_predicted_friction_torques(
     problem: EstimationProblem, solution: Solution, friction_parameters: Sequence[str]
 ) -> tuple[_FrictionTorqueCloud, ...]:
-    """Measured and predicted friction torques of the driven joints that have some of `friction_parameters`.
+    """Return measured and predicted friction torques of the driven joints to which `friction_parameters` belong.
 
     The measured friction torque is the residual of the discrete equations of motion without friction, along the
     smoothed measured angles. The predicted torque is the change of this residual by the fitted law. The result is empty
@@ -181,7 +181,7 @@ def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: 
 
 
 def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[EstimationProblem]:
-    """Return problems of the same recordings without samples that one of them lacks, so that errors are comparable."""
+    """Keep only the samples that all problems contain, so that the errors of the problems are comparable."""
     found = []
     for problem in problems:
         episodes = []
@@ -196,7 +196,7 @@ def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[
 
 
 def problem_estimating_from_all_recordings(problem: EstimationProblem) -> EstimationProblem:
-    """Return the problem with its held-out recordings among the recordings for estimation."""
+    """Return the problem with its held-out recordings moved to the recordings for estimation."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)
     return problem.with_episodes((*problem.episodes, *added), (), filters, ())

@@ -1,4 +1,4 @@
-"""Identifiability of parameters: Fisher information, correlations, unidentifiable directions and verdicts."""
+"""Identifiability of parameters by the Fisher information, with correlations and unidentifiable directions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that
 
 @dataclass(frozen=True)
 class ParameterStdsAndVerdict:
-    """Value, standard deviations and identifiability verdict of one parameter.
+    """The value, standard deviations and identifiability verdict of one parameter.
 
     The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). `interval` is
     the 95 % profile-likelihood interval, in which all other unknowns are refitted, or None if not requested. The
@@ -78,7 +78,7 @@ class _ParameterDirection:
 
 @dataclass(frozen=True, repr=False)
 class IdentifiabilityResult(ReprMixin):
-    """Identifiability of p free parameters, with correlations, Fisher information and uncertain directions.
+    """The identifiability of p free parameters, with correlations, Fisher information and uncertain directions.
 
     Values and standard deviations in `parameters` are in each parameter's `unit`. Relative standard deviations,
     correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless.
@@ -103,7 +103,7 @@ class IdentifiabilityResult(ReprMixin):
 
     @property
     def unidentifiable_directions(self) -> tuple[_ParameterDirection, ...]:
-        """Directions in parameter space whose verdict is `not_identifiable`."""
+        """The directions in parameter space that the recordings do not identify."""
         return tuple(entry for entry in self.directions if entry.verdict == "not_identifiable")
 
 
@@ -117,7 +117,7 @@ def identifiability(
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     progress: Progress = NULL_PROGRESS,
 ) -> IdentifiabilityResult:
-    """Determine which free parameters the problem's recordings identify, by the Fisher information.
+    """Determine by the Fisher information which free parameters the recordings identify.
 
     With independent Gaussian noise, the Fisher information is I = J' J, where J = d r/d x is the Jacobian of the
     whitened residual r with respect to the unknowns x. The standard deviation of an unknown is the root of the
@@ -201,14 +201,14 @@ def _profiles(
 
 
 def system_with_grasp_offset_effects(system: System) -> System:
-    """Return the system with a neutral `grasp_offset` effect at every grasp that has none."""
+    """Add a `grasp_offset` effect with zero offset to every grasp of a system that has none."""
     there = {effect.location for effect in system.effects if effect.kind == _GRASP_OFFSET_KIND}
     places = [grasp.name for grasp in system.grasps if grasp.name not in there]
     return system.with_effects([make_effect(_GRASP_OFFSET_KIND, place, system) for place in places])
 
 
 def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
-    """Return a problem's unknown vector from a solution, an array or (default) its initial values.
+    """Return the vector of unknowns from a solution or an array; by default, return the initial values.
 
     Raises `SolverError` for a wrong shape or a value that is not finite.
     """
@@ -229,7 +229,7 @@ def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution 
 def free_starts_and_grasps(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
-    """Return the problem with unknown initial states (if `start` is "unknown") and grasp offsets (if `grasp_std`)."""
+    """Add initial states (if `start` is "unknown") and grasp offsets (if `grasp_std` is given) to the unknowns."""
     options, grasps, priors = problem.options, [], dict(problem.options.prior_stds)
     initial = "estimated" if start == "unknown" else options.initial_state
     if grasp_std is not None:
@@ -255,7 +255,7 @@ def free_starts_and_grasps(
 
 
 def unknowns_of_other_problem(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Transfer values of `x` by name to the unknown vector of `other`. Its other entries keep their initial values."""
+    """Copy values of `x` by name to the unknown vector of `other`. Its other entries keep their initial values."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])
 

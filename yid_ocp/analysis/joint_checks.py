@@ -1,4 +1,4 @@
-"""Checks of limits, excitation and efforts of joints with recorded angles, by their kinematics and dynamics."""
+"""Checks of recorded joint motions and efforts against the limits, kinematics and dynamics of the joints."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as s
 
 @dataclass(frozen=True)
 class RecordedJointsModel:
-    """Numeric kinematics and inverse dynamics of the joints whose angles are recorded.
+    """A numeric model of the kinematics and inverse dynamics of the joints whose angles are recorded.
 
     Driven joints come first, then prescribed joints. Unknown coordinates, such as a beam's bending, are zero.
     """
@@ -53,29 +53,29 @@ class RecordedJointsModel:
 
     @staticmethod
     def from_system(system: System, free: Sequence[str] = ()) -> RecordedJointsModel | None:
-        """Return the model of a system's driven and prescribed joints, or None without such joints."""
+        """Return the model of a system's driven and prescribed joints, or None if the system has no such joints."""
         names = (*system.driven, *system.prescribed)
         loads = (effect for effect in system.effects if isinstance(effect, EffectBase) and effect.is_load)
         unknown = tuple(name for effect in loads for name in effect.parameters.names if name in free)
         return RecordedJointsModel(system, names, unknown) if names else None
 
     def has_all_angles_recorded(self, recording: Recording) -> bool:
-        """Whether a recording has all joint angles. Clamps that follow measured points have no recorded angles."""
+        """Check whether a recording contains all joint angles. Clamps that follow measured points have none."""
         return all(name in recording.joint_names for name in self.joint_names)
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """Joints of the model, in the order of `joint_names`."""
+        """The joints of the model, in the order of `joint_names`."""
         mechanism = self.system.mechanism
         return tuple(mechanism.joints[mechanism.joint_index(name)] for name in self.joint_names)
 
     @property
     def system_configuration_indices(self) -> tuple[int, ...]:
-        """Indices of the joints in the system's configuration vector."""
+        """The indices of the joints in the system's configuration vector."""
         return tuple(self.system.mechanism.joint_index(name) for name in self.joint_names)
 
     def is_frame_determined_by_angles(self, frame: str) -> bool:
-        """Whether a frame's position follows from the recorded angles alone."""
+        """Check whether the recorded angles alone determine the position of a frame."""
         tree = self.system.mechanism
         return {*tree.ancestor_joint_indices(tree.frame(frame).joint_index)} <= {*self.system_configuration_indices}
 
@@ -86,7 +86,7 @@ class RecordedJointsModel:
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
-        """Positions (N, nf, 3) [m] of nf frames, and their Jacobian (N, nf, 3, k) with respect to k angles.
+        """Compute positions (N, nf, 3) [m] of nf frames, and their derivatives (N, nf, 3, k) with respect to k angles.
 
         `q` (N, k) holds recorded angles. Every frame must satisfy `is_frame_determined_by_angles`.
         """
@@ -175,7 +175,7 @@ def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMot
 
 
 def joint_limit_issues(arm: RecordedJointsModel, recording: Recording) -> Iterator[Issue]:
-    """Yield issues about recorded angles or speeds beyond the joint limits."""
+    """Yield issues about recorded angles or speeds that exceed the joint limits."""
     joints = recording.joints
     if joints is None:
         return
@@ -220,14 +220,14 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
 
 
 def known_effect_config_line(kind: str, location: str, quantity: str, value: float) -> str:
-    """Configuration line that adds an effect with a known parameter value at a location."""
+    """Return a configuration line that adds an effect with a known parameter value at a location."""
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
 
 def slow_motion_excitation_issues(
     arm: RecordedJointsModel, recording: Recording, effort: SensorOptions
 ) -> Iterator[Issue]:
-    """Yield an issue if a motion is too slow to determine damping, friction and inertia from measured efforts.
+    """Yield an issue if the motion is too slow to reveal damping, friction and inertia in the measured efforts.
 
     Static configurations determine only weight and stiffness. The efforts due to speed and acceleration must exceed the
     noise of measured efforts; they are estimated by inverse dynamics and friction of a typical size. `effort` holds the
@@ -355,7 +355,7 @@ class _Fit(NamedTuple):
 
 
 def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
-    """Find recorded efforts that disagree with the inverse dynamics of the recorded motion."""
+    """Return issues about recorded efforts that disagree with the inverse dynamics of the recorded motion."""
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:

@@ -1,4 +1,4 @@
-"""Comparison of a built model with Pinocchio: mass matrix, gravity forces and inverse dynamics.
+"""Comparison of a model with the library Pinocchio: mass matrix, gravity forces and inverse dynamics.
 
 Pinocchio gets the robot in two ways: from the URDF file, which it reads itself, and joint by joint from the built
 system, including object and effects. The first reveals errors in reading the file, the second errors in the mechanics.
@@ -57,7 +57,7 @@ class _PinocchioComparison:
 
 
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
-    """Check a system with parameters `theta` against Pinocchio's model of the same joints and bodies.
+    """Compare a system that has the parameters `theta` with Pinocchio's model of the same joints and bodies.
 
     The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations.
     """
@@ -75,7 +75,7 @@ def compare_urdf_with_pinocchio(
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
 ) -> _PinocchioComparison:
-    """Check this package's model of a URDF robot against Pinocchio's model of the same file.
+    """Compare this package's model of a URDF robot with Pinocchio's model of the same file.
 
     `mechanism` is the result of `read_urdf` for this file and the same `joints` (movable joints, default all), `locked`
     (positions of the other joints [rad or m]) and `exclude_links` (links removed with their subtrees). `gravity` (3,)

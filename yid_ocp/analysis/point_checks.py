@@ -1,4 +1,4 @@
-"""Checks of measured points for mirroring, exchange, scale, delay and reach, by a model."""
+"""Checks of measured points against a model, to find mirrored, exchanged, wrongly scaled or delayed points."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
 
 
 def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, options: _Choices) -> Iterator[Issue]:
-    """Yield issues about points that disagree with forward kinematics; `options` returns a group's sensor options."""
+    """Yield issues about points that disagree with forward kinematics. `options` returns a group's sensor options."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
         return
@@ -222,7 +222,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 def point_distance_issues(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, options: _Choices
 ) -> Iterator[Issue]:
-    """Yield issues about points farther apart, or farther from the root, than the object's length allows."""
+    """Yield issues about points that are farther apart, or farther from the root, than the object's length allows."""
     mechanism = system.mechanism
     for group in recording.points:
         frames = _point_frames(system, group, options(group.name))
@@ -260,7 +260,7 @@ def point_distance_issues(
 
 
 def object_point_rollout_issues(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
-    """Yield issues about points far from the rollout `result` at initial parameters, relative to `size` [m]."""
+    """Yield an issue if a simple correction moves points to the rollout `result`. Tolerances scale with `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
         if not names or not size > 0:
@@ -299,7 +299,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 
 
 def cable_point_geometry_issues(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
-    """Yield issues about cable points above the clamps, or with edge lengths unlike the undeformed shape."""
+    """Yield issues about cable points that rise too far above the clamps, are exchanged, or have wrong distances."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertex_names if name in group.names}
         edges = [edge for edge in cable.edge_vertex_names if edge[0] in at and edge[1] in at]

@@ -1,4 +1,4 @@
-"""Profile likelihood and confidence interval of one unknown."""
+"""Profile likelihood and confidence interval of one unknown parameter."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 @dataclass(frozen=True)
 class ParameterProfileLikelihood:
-    """Rise of chi2 at fixed values of one unknown with the other unknowns refitted, and the 95 % interval."""
+    """The rise of chi2 at fixed values of one unknown, with all other unknowns refitted, and the 95 % interval."""
 
     name: str
     value: float
@@ -64,14 +64,14 @@ class ParameterProfileLikelihood:
 
     @property
     def interval(self) -> ConfidenceInterval:
-        """Lower and upper end of the 95 % interval. None is an open end."""
+        """The lower and upper end of the 95 % interval. None is an open end."""
         return self.lower, self.upper
 
 
 def compute_profile_likelihood_interval(
     problem: EstimationProblem, x: Array, index: int, std: float, evaluation: Evaluation
 ) -> ParameterProfileLikelihood:
-    """Compute the 95 % profile-likelihood interval of one unknown: the values at which chi2 rises by less than 3.84.
+    """Compute the 95 % profile-likelihood interval of one unknown, in which chi2 rises by less than 3.84.
 
     At each value of the unknown, all other unknowns are refitted by Gauss-Newton, from a prediction along the tangent.
     Chi2 does not include the weak prior. An end of the interval is open if chi2 does not rise by 3.84 before the
@@ -95,7 +95,7 @@ def compute_profile_likelihood_interval(
 def solution_with_profile_intervals(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
-    """Return a solution in which weakly determined parameters have profile-likelihood intervals and matching verdicts.
+    """Return the solution with profile-likelihood intervals and matching verdicts for weakly determined parameters.
 
     The cost of such a parameter is not quadratic, so that a standard deviation does not describe it. The same holds for
     a stiffness that is small compared with its typical size (`mark_near_zero_estimate_unidentifiable`). The solution is
@@ -135,7 +135,7 @@ def evaluate_for_each_parameter_at_optimum(
     names: Sequence[str],
     progress: Progress,
 ) -> dict[str, _Found]:
-    """Minimise the cost from `x`, then call `judged`(name, minimum, its evaluation) in parallel for every name."""
+    """Find the optimum from `x`, then apply `judged`(name, optimum, evaluation) to all parameter names in parallel."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 
@@ -150,11 +150,11 @@ def evaluate_for_each_parameter_at_optimum(
 def mark_near_zero_estimate_unidentifiable(
     problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
 ) -> ParameterEstimate:
-    """Mark a stiffness that is estimated near zero `not_identifiable` if the data allow its typical size too (99.9 %).
+    """Mark a stiffness estimate near zero as `not_identifiable` if the data also allow a stiffness of typical size.
 
     An unobserved twist of a branch can move, and thus fit the noise, only if its stiffness is near zero. The cost
     therefore has a narrow, spurious minimum there. `x` (nx,) is the best fit, `evaluation` its evaluation, `index`
-    selects the unknown, and `size` is its entry of `typical_parameter_magnitudes`.
+    selects the unknown, and `size` is its entry of `typical_parameter_magnitudes`. The test has the level 99.9 %.
     """
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry
@@ -166,7 +166,7 @@ def mark_near_zero_estimate_unidentifiable(
 
 
 def is_small_enough_for_profiles(problem: EstimationProblem) -> bool:
-    """Whether a problem is small enough for profile intervals by default."""
+    """Check whether a problem is small enough to compute profile-likelihood intervals by default."""
     few = len(parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
     return few and len(problem.unknown_names) <= _MAX_UNKNOWNS
 

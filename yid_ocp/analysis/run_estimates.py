@@ -1,4 +1,4 @@
-"""Pool estimates of one model from several runs, and find drifting parameters and outlier runs.
+"""Mean estimates of one model over several runs, drifting parameters and outlier runs.
 
 The mean of estimates x_i of the same n parameters with covariances C_i is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. If the
 parameters are constant over k runs, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. If chi2 is
@@ -22,7 +22,7 @@ _MIN_CORRELATION_EIGENVALUE = 1e-12  # smaller eigenvalues result from rounding
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunEstimates(ReprMixin):
-    """Estimates (n,) of n parameters from one run, with their covariance (n, n), in the parameters' `units`.
+    """The estimates (n,) of n parameters from one run, with covariance (n, n), in the units given by `units`.
 
     If `is_fit_adequate` is False (the model does not explain the recordings), the covariance includes the misfit.
     """
@@ -44,7 +44,7 @@ class RunEstimates(ReprMixin):
 
     @property
     def std(self) -> Array:
-        """Standard deviations of the parameters, shape (n,)."""
+        """The standard deviations of the parameters, shape (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def _only(self, names: Sequence[str]) -> RunEstimates:
@@ -84,7 +84,7 @@ class _RunOutlierTest:
 
 @dataclass(frozen=True)
 class DriftAndOutlierTests:
-    """Tests of several runs of one model for parameter drift and outlier runs. `chi2` covers all differences."""
+    """The results of tests for parameter drift and for outliers among several runs. `chi2` covers all differences."""
 
     run_names: tuple[str, ...]
     parameter_drift_tests: tuple[_ParameterDriftTest, ...]
@@ -96,7 +96,7 @@ class DriftAndOutlierTests:
 
 
 def nearby_positive_definite_covariance(covariance: Array) -> Array:
-    """Raise small correlation eigenvalues until a covariance is invertible. Standard deviations stay the same."""
+    """Raise small eigenvalues of the correlations to make a covariance invertible. Standard deviations remain."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     clipped = (vectors * np.maximum(values, _MIN_CORRELATION_EIGENVALUE)) @ vectors.T
@@ -105,7 +105,7 @@ def nearby_positive_definite_covariance(covariance: Array) -> Array:
 
 
 def pool_estimates_and_chi2(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
-    """Combine the estimates of several runs into one weighted mean.
+    """Compute the weighted mean of the estimates of several runs, and chi2 of the differences between the runs.
 
     Returns the mean, chi2 of the differences between runs, and the degrees of freedom of chi2. Parameters that only
     some runs contain are included. If the runs differ by more than their standard deviations explain, the standard
@@ -136,7 +136,7 @@ def pool_estimates_and_chi2(runs: Sequence[RunEstimates]) -> tuple[RunEstimates,
 
 
 def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
-    """Test which parameters drifted between runs (in order of time), and which run is an outlier.
+    """Test which parameters changed from run to run (in order of time), and which run is an outlier.
 
     A run is an outlier if it disagrees with the other runs and the other runs are consistent, or clearly more
     consistent without it than without any other run. With two runs no outlier is reported. A parameter is tested with

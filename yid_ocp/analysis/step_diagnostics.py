@@ -20,7 +20,7 @@ from yid_ocp.sensors import sensor_function_with_jacobians
 
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
-    """Sizes of a step: vector lengths, Newton unknowns, Jacobian nonzeros, and operations of each function."""
+    """Count the variables, unknowns, Jacobian nonzeros and arithmetic operations of a step and its functions."""
     e, found = step.equations, []
     for f in step.functions.all_functions:
         nonzeros = sum(f.nnz_out(i) for i in range(f.n_out()))
@@ -33,7 +33,7 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
 def step_equation_jacobians_at_state(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepResidualsAndJacobians:
-    """Linearise the step equations, also by all parameters, at a state (nx,), torque (nu,) [N m] and path (nc,)."""
+    """Compute Jacobians of the step equations at a state (nx,), torque (nu,) [N m] and prescribed coordinates (nc,)."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
@@ -51,7 +51,7 @@ _RESPONSE_STEPS = 100
 
 @dataclass(frozen=True)
 class ParameterEquationsAndResponses:
-    """Step equations that contain one parameter, and the sensors' response to the parameter."""
+    """The step equations that contain one parameter, and the response of the sensors to this parameter."""
 
     parameter: str
     unit: str
@@ -72,7 +72,7 @@ def parameter_equations_and_responses(
     theta: Array,
     stages: StepResidualsAndJacobians,
 ) -> tuple[ParameterEquationsAndResponses, ...]:
-    """Find for each parameter the step equations that contain it, and which sensors respond to it.
+    """Find for each parameter the step equations that contain it, and the sensors that respond to it.
 
     For the response, one unit is added to one equation of a step that starts at `state`. The later steps are linear, x'
     = (A - B_u K) x, where K is the first gain of the tracking filter. The equation is observed to first order if a
@@ -168,7 +168,7 @@ _ZERO_RTOL = 1e-14  # entries below this fraction of the largest one are roundin
 
 
 class NamedIndexRange(NamedTuple):
-    """Name of a block of matrix rows or columns, with its first index and its end."""
+    """A named block of matrix rows or columns, with its first index and its end."""
 
     name: str
     start: int
@@ -177,7 +177,7 @@ class NamedIndexRange(NamedTuple):
 
 @dataclass(frozen=True)
 class SparsityPattern:
-    """Structural nonzeros of a matrix with named blocks, rows and columns."""
+    """The possible nonzero entries of a matrix, with named blocks, rows and columns."""
 
     name: str  # used in file names; `title` is for display
     title: str
@@ -190,13 +190,13 @@ class SparsityPattern:
     mark_label: str = ""  # what that means
 
     def with_numerical_nonzeros_marked(self, values: Array, where: str) -> SparsityPattern:
-        """Return a copy of the pattern in which the numerically nonzero entries of the matrix `values` are marked."""
+        """Return a copy of the pattern that marks the entries at which the matrix `values` is not zero."""
         marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
         return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
 
     @property
     def n_nonzeros(self) -> int:
-        """Number of entries of the matrix that can be nonzero."""
+        """The number of matrix entries that can be nonzero."""
         return int(np.count_nonzero(self.nonzero_mask))
 
 
@@ -225,7 +225,7 @@ def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | Non
 
 
 def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
-    """Structural sparsity patterns of the Jacobians of one step, by name.
+    """Compute the sparsity patterns of the Jacobians of one step, by name.
 
     `dR_dy` is the Jacobian of the step's residual with respect to its unknowns. `dR_dtheta` is the Jacobian of all rows
     with respect to the parameters. `A` (state), `B_u` (input) and `B_theta` (parameters) are the Jacobians of the next

@@ -1,4 +1,4 @@
-"""Equations of one step with named rows and columns, and their entries as text."""
+"""The equations of one step with named rows and columns, and their entries as text."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ class _FormulaText:
 
 
 def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
-    """Count the operations that evaluate all expressions of `variables`. Shared subexpressions count once."""
+    """Count the operations needed to evaluate all expressions of `variables`. Shared subexpressions count once."""
     function = _function(expressions, variables)
     skipped = (*_LEAF_OPERATIONS, ca.OP_OUTPUT, ca.OP_PARAMETER)
     return sum(function.instruction_id(i) not in skipped for i in range(function.n_instructions()))
 
 
 def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[str]) -> _FormulaText:
-    """Format scalar expressions as text. `names` are those of the variables (k, 1), their only symbols."""
+    """Convert scalar symbolic expressions to text. `names` are the names of the variables (k, 1), the only symbols."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
     for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
@@ -151,7 +151,7 @@ class _SymbolBlock:
 
 @dataclass(frozen=True)
 class EquationOrDerivativeFormula:
-    """Formula of one step equation or, if a column is named, of its derivative with respect to that variable."""
+    """The formula of one step equation or, if a column is named, of its derivative with respect to that variable."""
 
     row_name: str
     column_name: str
@@ -161,21 +161,21 @@ class EquationOrDerivativeFormula:
 
     @property
     def title(self) -> str:
-        """Name of the equation, or `d ROW / d COLUMN` for a derivative."""
+        """The name of the equation, or `d ROW / d COLUMN` for a derivative."""
         return f"d {self.row_name} / d {self.column_name}" if self.column_name else self.row_name
 
     @property
     def is_identically_zero(self) -> bool:
-        """Whether the expression is zero for every state."""
+        """True if the expression is zero for every state."""
         return bool(self.expression.is_zero())
 
     def numeric_value(self, variables: ca.SX, at: Array) -> float:
-        """Numeric value of the expression at the values `at` (k,) of the variables (k, 1)."""
+        """Compute the value of the expression for the values `at` (k,) of the variables (k, 1)."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
     @property
     def text_lines(self) -> list[str]:
-        """Text lines of the whole formula, shared subexpressions first."""
+        """The lines of text that show the whole formula, with shared subexpressions first."""
         if self.is_identically_zero:
             return [f"{self.title} = 0 whatever the state"]
         said = [_headline(self.title, self.formula.n_operations, self.variable_names)]
@@ -185,7 +185,7 @@ class EquationOrDerivativeFormula:
 
 @dataclass(frozen=True, repr=False)
 class NamedStepEquations(ReprMixin):
-    """Symbolic equations of one time step, with names for rows (equations) and columns (variables).
+    """The symbolic equations of one time step, with a name for each row (equation) and column (variable).
 
     The row blocks are `del` (discrete Euler-Lagrange equations; at a prescribed coordinate the residual is -h times its
     effort, with the time step h), `internal`, `constraint`, and `p1`, the momentum after the step. The column blocks
@@ -204,7 +204,7 @@ class NamedStepEquations(ReprMixin):
 
     @staticmethod
     def from_equations(equations: DiscreteEquations) -> NamedStepEquations:
-        """Build the named rows and columns from the discrete equations of a step."""
+        """Give names to the rows and columns of the discrete equations of a step."""
         e, system = equations, equations.system
         joints, internal = system.mechanism.joint_names, tuple(system.effect_internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
@@ -229,12 +229,12 @@ class NamedStepEquations(ReprMixin):
 
     @property
     def row_names(self) -> tuple[str, ...]:
-        """Full names of all equations in order."""
+        """The full names of all equations, in order."""
         return tuple(name for block in self.row_blocks for name in block.full_names)
 
     @property
     def all_variable_names(self) -> tuple[str, ...]:
-        """Full names of all variables in order."""
+        """The full names of all variables, in order."""
         return tuple(name for block in self.column_blocks for name in block.full_names)
 
     @cached_property
@@ -243,17 +243,17 @@ class NamedStepEquations(ReprMixin):
 
     @cached_property
     def all_variable_symbols(self) -> ca.SX:
-        """Symbols of all variables as one column vector."""
+        """The symbols of all variables, as one column vector."""
         return ca.vertcat(*(block.expressions for block in self.column_blocks))
 
     @cached_property
     def full_jacobian_sparsity_pattern(self) -> ca.Sparsity:
-        """Sparsity of the Jacobian of all equations with respect to all variables."""
+        """The sparsity of the Jacobian of all equations with respect to all variables."""
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.all_variable_symbols)
         return found
 
     def row_or_column_block_slice(self, block: str) -> slice:
-        """Index range of a block among all rows or columns."""
+        """Return the index range of a named block among all rows or columns."""
         blocks = self.row_blocks if any(entry.name == block for entry in self.row_blocks) else self.column_blocks
         names = [entry.name for entry in blocks]
         ends = list(itertools.accumulate((len(entry.labels) for entry in blocks), initial=0))
@@ -261,7 +261,7 @@ class NamedStepEquations(ReprMixin):
         return slice(ends[at], ends[at + 1])
 
     def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:
-        """Return an equation by name or, for `ROW, COLUMN`, its derivative with respect to a variable.
+        """Return the equation with a given name or, for `ROW, COLUMN`, its derivative with respect to a variable.
 
         Examples of `text`: `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]`, `constraint[left.x], T2.length`. Raises
         `ConfigError` if there are not one or two names, or if a name does not exist.
@@ -290,7 +290,7 @@ class NamedStepEquations(ReprMixin):
         return tuple(words)
 
     def text_lines(self) -> list[str]:
-        """Text lines of all equations, then the names of all variables. Only short equations are shown in full."""
+        """Return all equations and then all variable names as lines of text. Only short equations are shown in full."""
         said = []
         place = {self.all_variable_symbols[i].element_hash(): i for i in range(self.all_variable_symbols.numel())}
         for at, name in enumerate(self.row_names):

@@ -1,4 +1,4 @@
-"""Low-rank propagation of torque and encoder errors to all readings of a motion.
+"""Low-rank model of how torque and encoder errors change all readings of a motion.
 
 Torques have an error in every recorded sample and a constant one; angles that a tracking filter follows have an error
 in every step. A recording has some thousands of these unknowns, but sensors only observe smooth motions. The matrix G
@@ -37,7 +37,7 @@ def sensitivities_and_information(
     finest: Mapping[str, float],
     encoders: EstimationProblem | None = None,
 ) -> tuple[dict[tuple[str, str], Array], Array]:
-    """Differentiate point positions by unknowns and input errors, and compute joint sensors' information.
+    """Compute how point positions depend on unknowns and input errors, and the information from joint sensors.
 
     In `problem` every point is seen at every node with unit standard deviation. `evaluation` is the evaluation at the
     unknowns `x` (nx,). `finest` is the smallest standard deviation of each group [m]. `encoders` is the problem with

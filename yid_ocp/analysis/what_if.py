@@ -1,4 +1,4 @@
-"""Ranking of changes of an experiment by the parameters that they make identifiable."""
+"""Ranking of possible changes of an experiment by the parameters that they make identifiable."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _MAX_CHANGE_SET_SIZE = 3
 
 @dataclass(frozen=True)
 class ExperimentChange:
-    """One change of an experiment, such as another setup, another measured frame or a camera rate.
+    """A single change of an experiment, such as another setup, another measured point or another camera rate.
 
     Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
     """
@@ -53,7 +53,7 @@ class ExperimentChange:
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
-    """Predicted identifiability of an experiment with some changes. `verdicts` is empty if the prediction failed.
+    """The predicted identifiability after changes of an experiment. `verdicts` is empty if the prediction failed.
 
     `gain` [nat] is the information gain 1/2 log det(1 + 16 I), where I is the Fisher information of relative changes
     and the prior standard deviation of each parameter is 400 %.
@@ -74,7 +74,7 @@ class ChangedExperimentResult:
 
 @dataclass(frozen=True, repr=False)
 class ExperimentChangesByIdentifiableCount(ReprMixin):
-    """Changes of an experiment, ranked by the number of parameters that they make identifiable.
+    """The possible changes of an experiment, ranked by the number of parameters that they make identifiable.
 
     `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
     last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make every parameter
@@ -109,7 +109,7 @@ def what_if(
     progress: Progress = NULL_PROGRESS,
     evaluate_changes: ChangeSetsEvaluationFunction | None = None,
 ) -> ExperimentChangesByIdentifiableCount:
-    """Rank changes of an experiment by the number of parameters that they make identifiable, without new measurements.
+    """Rank changes of an experiment by how many parameters they make identifiable, without new measurements.
 
     A new sensor observes the simulation of the recorded motion, in which the tracking filter keeps the arms on that
     motion. New motions and a second arm are simulated in MuJoCo; without MuJoCo, the motion of a held-out recording is
@@ -145,7 +145,7 @@ def what_if(
 def evaluate_experiment_change_sets(
     setting: UnchangedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
-    """Predict the result of each of `sets` of named changes. `inflation` multiplies the stated variances."""
+    """Predict the result of each set of experiment changes in `sets`. `inflation` multiplies the stated variances."""
     outcomes = _Outcomes(setting, inflation)
     known = {change.name: change for change in outcomes.possible}
     return outcomes.of_all([[known[name] for name in names] for names in sets])

@@ -1,4 +1,4 @@
-"""Read YAML configuration files and check them against the settings classes, with line numbers."""
+"""Reader that checks YAML configuration files against the settings classes and reports line numbers."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def load_config(
 
 
 def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
-    """List dotted setting keys that begin with `prefix`. Raises `ConfigError` if the file `path` is unreadable."""
+    """List the dotted setting keys that begin with `prefix`. Raises `ConfigError` if the file `path` is unreadable."""
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
     return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
 

@@ -1,4 +1,4 @@
-"""Allowed keys of configuration sections, derived from settings classes, for reader, `--set` and JSON Schema."""
+"""Allowed keys of each configuration section, for the reader, for `--set` and for the JSON Schema."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_erro
 
 @dataclass(frozen=True)
 class SectionVariants:
-    """Alternative settings classes of a configuration section, and the key that selects one."""
+    """The alternative settings classes of a configuration section, and the key that selects one of them."""
 
     classes: Mapping[str, type]  # by the value of the selector key; a single class under the empty name
     selector_key: str = ""  # key that selects a class, empty without a choice
@@ -26,12 +26,12 @@ class SectionVariants:
     is_nullable: bool = False
 
     def selected_variant_name(self, raw: Any) -> Any:
-        """Value of the selector key in the unchecked section `raw`, or `default_variant` without the key."""
+        """Return the selector key's value in the unchecked section `raw`, or `default_variant` if the key is absent."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
     def options_of_variant(self, word: Any = "") -> Mapping[str, options.Option]:
-        """Options, by key, of the settings class that `word` selects (default: the first class)."""
+        """Return all options, by key, of the settings class named `word` (default: the first class)."""
         known = isinstance(word, str) and word in self.classes
         own = options.options_by_key(self.classes[word] if known else next(iter(self.classes.values())))
         if self.selector_key in ("", *own):
@@ -39,7 +39,7 @@ class SectionVariants:
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
     def variants_for_entry(self, name: str, where: str) -> SectionVariants:
-        """Settings class of a mapping's entry `name`, or all classes if another key than the name selects the class."""
+        """Return the class of the entry `name` in a mapping, or all classes if another key selects the class."""
         if self.selector_key != "name":
             return self
         if name not in self.classes:
@@ -47,7 +47,7 @@ class SectionVariants:
         return SectionVariants({"": self.classes[name]})
 
     def unknown_variant_error(self, word: object, where: str) -> ConfigError:
-        """Return the error for the missing or unknown value `word` of the selector key."""
+        """Make the error for a missing or unknown value of the key that selects a settings class."""
         if not word:
             what = f"the key '{self.selector_key}' is missing"
             hint = f"add {self.selector_key}: {next(iter(self.classes))}"
@@ -57,7 +57,7 @@ class SectionVariants:
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
-    """Alternative settings classes that the type annotation `hint` allows; None if it allows no settings class."""
+    """Return the settings classes that the type annotation `hint` allows, or None if there are none."""
     bare, markers = options.split_annotated(hint)
     nullable = type(None) in get_args(bare)
     among = next((marker for marker in markers if isinstance(marker, options.RegistryChoice)), None)
@@ -72,7 +72,7 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
 
 
 def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
-    """Return the error for an unknown key in `within`, with the nearest `known` key and sections that have the key."""
+    """Make the error for an unknown key. It suggests the nearest `known` key and the sections that have this key."""
     known = list(known)
     homes, near = list(dict.fromkeys(_sections_with_key(RunSettings, name))), nearest_name_question(name, known)
     hints = [near] if near else []
@@ -86,7 +86,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
 
 
 def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
-    """Yield completions of a partly typed settings key, up to the next dot or, before a value, to `=`.
+    """Yield the ways to complete a partly typed settings key, up to the next dot or the `=` before a value.
 
     `prefix` is the typed key. `hint` is the type of the value at the key `at`, which ends with a dot. `raw` is the
     file's value at `at`; it supplies names that users choose.
@@ -180,6 +180,6 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
 
 
 def option_info_from_annotation(hint: Any) -> options.OptionInfo:
-    """Return the `OptionInfo` (meaning and unit) in the type annotation `hint`, or an empty one."""
+    """Return the meaning and unit (`OptionInfo`) stated in the type annotation `hint`, or an empty `OptionInfo`."""
     markers = reversed(options.split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())

@@ -1,4 +1,4 @@
-"""Settings of one run: a frozen dataclass for each section of a configuration file, filled by `reader`.
+"""Settings of a run, with one frozen dataclass for each section of a configuration file.
 
 Options of solvers, problem, sensors, cables, tracking and diagnosis are defined in their own modules (see
 `yid_ocp.options`). The sections here contain these classes.
@@ -66,7 +66,7 @@ class _FrameSettings(MountSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class GraspSettings:
-    """A grasp: a constraint between a frame of the object and a frame of the robot."""
+    """A grasp, which connects a frame of the object to a frame of the robot by a constraint."""
 
     holder_frame: Annotated[str, OptionInfo("frame of the robot")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
@@ -85,7 +85,7 @@ class _JointSpringSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class EffectSettings:
-    """An effect beyond the nominal model. Its parameters are named kind@location.quantity."""
+    """An effect (such as friction) added to the nominal model. Its parameters are named kind@location.quantity."""
 
     kind: Annotated[str, OptionInfo("kind of effect: kelvin_voigt, joint_coulomb, ..., or law")]
     location: Annotated[str, OptionInfo("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
@@ -130,7 +130,7 @@ class _JointActuationSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionLawSettings:
-    """Friction law of the robot's joints. The amount of friction is estimated."""
+    """The friction law of the robot's joints. The amount of friction is estimated."""
 
     law: Annotated[
         FrictionLawName,
@@ -145,7 +145,7 @@ class FrictionLawSettings:
         Gt(0),
         OptionInfo(
             "speed below which the sign of Coulomb and Stribeck friction is smoothed, so that a loaded joint "
-            "creeps; default: 0.02, less for joints that stand still under a load",
+            "creeps; default: 0.001 for joints driven by torques, otherwise 0.02",
             "rad/s",
         ),
     ] = None
@@ -197,7 +197,7 @@ class _ModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingsSettings:
-    """Recordings for estimation, held-out prediction and reference."""
+    """The recordings for estimation, for held-out prediction and for reference."""
 
     estimate: Annotated[_Recordings, OptionInfo("recordings for the estimation")] = ()
     held_out: Annotated[_Recordings, OptionInfo("recordings that are predicted only")] = ()
@@ -212,7 +212,7 @@ class RecordingsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
-    """Settings for the conversion of another tool's file by `import`. A command-line flag overrides its key here."""
+    """Settings of `import`, which converts files of other tools. A command-line flag overrides its key here."""
 
     joint_topics: Annotated[_Names | None, OptionInfo("bag: topics of joint states to merge; default: all")] = None
     command_topic: Annotated[
@@ -245,7 +245,9 @@ class ImportSettings:
     torque_constants: Annotated[
         _Numbers, OptionInfo("torque per current by joint or pattern, if efforts are motor currents", "N m/A")
     ] = None
-    gear_ratios: Annotated[_Numbers, OptionInfo("motor turns per joint turn, by joint or pattern; default: 1")] = None
+    gear_ratios: Annotated[_Numbers, OptionInfo("motor turns per joint turn, if efforts are currents; default: 1")] = (
+        None
+    )
     file_clock_offsets: Annotated[_Numbers, OptionInfo("several files: added to each one's times, by stem", "s")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
     recorded_or_nominal_times: Annotated[RecordedOrNominalClock | None, OptionInfo("table: kind of its times")] = None
@@ -255,7 +257,7 @@ class ImportSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterSettings:
-    """Initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
+    """The initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
 
     initial: Annotated[float | None, OptionInfo("value; initial value if free", "that of the parameter")] = None
     bounds: Annotated[tuple[float, float] | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
@@ -282,13 +284,13 @@ class ProblemSettings(ProblemOptions):
 
     @property
     def time_step_or_10_ms(self) -> float:
-        """Configured time step [s], or 10 ms for `auto`, which needs a recording to choose the step."""
+        """The configured time step [s], or 10 ms for `auto`, which needs a recording to choose the step."""
         return 0.01 if self.time_step == "auto" else self.time_step
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnosisSettings(Thresholds):
-    """Candidates and thresholds of the diagnosis of the sim-to-real gap."""
+    """The candidate effects and thresholds for the diagnosis of the sim-to-real gap."""
 
     candidates: Annotated[
         Literal["all"] | _Names, OptionInfo("effects to try: all, or a list of kind or kind@location")
@@ -307,7 +309,7 @@ class DiagnosisSettings(Thresholds):
 
     @property
     def fit_excess_residual_criteria(self) -> ExcessResidualCriteria:
-        """Limits of the null test on the residual after a fit, in units of the sensors' stated standard deviations."""
+        """The limits of the null test on the residual after a fit, in units of the stated standard deviations."""
         return replace(self.null_test_excess_criteria, noise_fraction_of_stated_std=self.noise_fraction_of_stated_std)
 
 
@@ -445,7 +447,7 @@ class RunSettings:
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def setting_location(self, *path: str | int) -> str:
-        """Location of a setting (file, line and key), for the `where` of an error."""
+        """Return the place of a setting (file, line and key), for the `where` of an error message."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
             if path[:count] in self.key_locations:
@@ -453,12 +455,12 @@ class RunSettings:
         return f"{self.config_file}: {key}" if self.config_file else key
 
     def config_error(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
-        """Return a `ConfigError` with file, line and key of a setting, for the caller to raise."""
+        """Make a `ConfigError` that states the file, line and key of a setting. The caller raises it."""
         return ConfigError(what, where=self.setting_location(*path), allowed=allowed, hint=hint)
 
 
 def config_yaml_with_defaults(run: RunSettings) -> str:
-    """Return a run's settings as YAML text with all defaults. `load_config` reads the same run from it."""
+    """Return the settings of a run, with all defaults, as YAML text. `load_config` reads the same run from it."""
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 120

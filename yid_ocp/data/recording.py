@@ -121,7 +121,7 @@ class JointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointGroup(ReprMixin):
-    """Positions of np named points over M frames of one sensor with its own clock. Arrays are copied and read-only.
+    """Positions of np named points at M times, from one sensor with its own clock. Arrays are copied and read-only.
 
     Attributes
     ----------

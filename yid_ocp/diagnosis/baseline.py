@@ -1,4 +1,4 @@
-"""Compare a diagnosis with earlier runs, use their estimates as priors, and predict without the effects found.
+"""Comparison of a diagnosis with earlier runs, and predictions of recordings made without the effects found.
 
 In a linear model with the prior N(m, C0), an estimate x with covariance C shifts by x - m. If nothing changed, the
 shift has the covariance C0 - C. A misfit that multiplies the data's noise variance by k adds (k - 1) C (1 - C/C0).
@@ -52,7 +52,7 @@ class _ParameterShift:
 
 @dataclass(frozen=True)
 class ParameterShiftsSinceBaseline:
-    """Shift of every parameter from the baseline runs, and the agreement among these runs."""
+    """The change of every parameter since the earlier runs, and the agreement of these runs with each other."""
 
     is_baseline_explained: bool  # whether the model explained the earlier runs' recordings
     between_runs_p_value: float  # of the differences between earlier runs; one for one run
@@ -60,17 +60,17 @@ class ParameterShiftsSinceBaseline:
 
     @property
     def changed_parameters(self) -> tuple[_ParameterShift, ...]:
-        """Parameters that have changed significantly, smallest p-value first."""
+        """The parameters that have changed significantly, with the smallest p-value first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
         return tuple(sorted(changed, key=lambda entry: entry.p_value))
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the shifts to the entry `baseline` of `yid-diagnosis/2`."""
+        """Convert the parameter changes to a dictionary, the entry `baseline` of `yid-diagnosis/2`."""
         return {"parameters": {entry.name: attributes_to_dict(entry, _SHIFT) for entry in self.parameter_shifts}}
 
 
 def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
-    """Return the problem with a baseline's parameters free and its estimates as their joint Gaussian prior.
+    """Free the parameters that earlier runs estimated, and use these estimates as a joint Gaussian prior.
 
     Raises `ConfigError` if the model lacks a parameter or effect of the baseline, or if a parameter differs between
     recordings.
@@ -100,7 +100,7 @@ def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> Es
 
 @dataclass(frozen=True)
 class EarlierRunsBaseline:
-    """Combined estimates of earlier runs, and reference recordings made without the sought effect."""
+    """The combined estimates of earlier runs, and reference recordings made without the effect that is sought."""
 
     combined_estimates: RunEstimates | None  # all earlier runs together
     between_runs_p_value: float
@@ -108,14 +108,14 @@ class EarlierRunsBaseline:
 
     @staticmethod
     def from_run_estimates(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> EarlierRunsBaseline:
-        """Make a baseline from the estimates of several runs and from reference recordings `without` the effect."""
+        """Create a baseline from the estimates of several runs and from reference recordings `without` the effect."""
         if not runs:
             return EarlierRunsBaseline(None, 1.0, without)
         known, chi2, degrees = pool_estimates_and_chi2(runs)
         return EarlierRunsBaseline(known, chi2_p_value(chi2, degrees), without)
 
     def parameter_shifts_of_fit(self, fit: RefittedModel, limits: Thresholds) -> ParameterShiftsSinceBaseline | None:
-        """Compute the shifts of a fit's parameters from its baseline prior. None if there are no runs."""
+        """Compute how far the parameters of a fit have moved from the earlier runs. None if there are no runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
             return None
@@ -139,14 +139,14 @@ class EarlierRunsBaseline:
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
     def fit_parameters_differ_from_baseline(self, fit: RefittedModel, limits: Thresholds) -> bool:
-        """Whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
+        """Check whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
         found = self.parameter_shifts_of_fit(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
     def errors_on_recordings_with_and_without_effects(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> CounterfactualErrorsOfFoundEffects | None:
-        """Test found effects on recordings made with and without them, such as before and after a repair.
+        """Test the found effects on recordings made with and without them, for example before and after a repair.
 
         Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
         there are no earlier runs, the parameters without the effects are estimated on the reference recordings. Returns
@@ -218,7 +218,7 @@ class _PredictionErrors:
 
 @dataclass(frozen=True)
 class CounterfactualErrorsOfFoundEffects:
-    """Prediction errors on reference recordings without the effects, and on diagnosed recordings with the effects."""
+    """The prediction errors on reference recordings without effects, and on diagnosed recordings with effects."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model
     effects_removed: _PredictionErrors
@@ -226,7 +226,7 @@ class CounterfactualErrorsOfFoundEffects:
     effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the prediction errors to the entry `counterfactual` of `yid-diagnosis/2`."""
+        """Convert the prediction errors to a dictionary, the entry `counterfactual` of `yid-diagnosis/2`."""
         return {"removed": self.effects_removed.to_dict(), "added": self.effects_added.to_dict()}
 
 

@@ -1,4 +1,4 @@
-"""Generate random blind cases of one experiment. Their labels are sealed before any recording is diagnosed."""
+"""Random blind-test cases of one experiment. Their labels are sealed before any recording is diagnosed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _MIN_CASES_PER_EXPERIMENT = 3  # with fewer cases, an experiment is not worth it
 
 @dataclass(frozen=True)
 class PlannedBlindCase:
-    """Plan of one blind case: number, experiment, category and effect size."""
+    """The plan of one blind-test case, with its number, experiment, category and effect size."""
 
     number: int
     experiment: str
@@ -70,7 +70,7 @@ def plan_blind_cases(
     chains: frozenset[str] = frozenset(),
     purpose: str = BLIND_ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
-    """Plan `count` blind test cases in random order, each with an experiment, effect category and size.
+    """Plan `count` blind-test cases in random order, each with an experiment, effect category and effect size.
 
     `weights` holds the share of cases of each experiment. An experiment with less than `_MIN_CASES_PER_EXPERIMENT`
     cases gets none; if all have less, the largest gets all. Objects of the experiments in `chains` can be simulated
@@ -140,7 +140,7 @@ _GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.05
 
 @dataclass(frozen=True)
 class CaseGroundTruth:
-    """True effects and parameters of a blind case, sealed until scoring."""
+    """The true effects and parameters of a blind-test case, which stay sealed until scoring."""
 
     case: str
     category: str  # null, single, pair, outside, left_out or finer_chain
@@ -150,19 +150,19 @@ class CaseGroundTruth:
     experiment: str = ""  # experiment of the case
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the label to a JSON-compatible dictionary."""
+        """Convert the true effects and parameters to a JSON-compatible dictionary."""
         return asdict(self)
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
-        """Restore the label from the dictionary returned by `to_dict`."""
+        """Restore the true effects and parameters from a dictionary that `to_dict` returned."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
         return CaseGroundTruth(**{**data, "injected": injected})
 
 
 @dataclass(frozen=True)
 class UnlabelledCase:
-    """A blind case for the diagnosis: recordings, and effect kinds excluded from the candidates."""
+    """A blind-test case as the diagnosis sees it: recordings, and effect kinds excluded from the candidates."""
 
     name: str
     estimation_recordings: tuple[Recording, ...]
@@ -171,13 +171,13 @@ class UnlabelledCase:
 
 
 def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
-    """Convert labels to JSON text with its SHA-256 hash. The hash is published before the diagnosis."""
+    """Return the true labels of cases as JSON text, with the SHA-256 hash that is published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
-    """Read sealed labels from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
+    """Read the sealed labels of cases from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         what, hint = "the labels differ from the commitment", "use the labels file that was written with the commitment"
         raise DataError(what, where="sealed labels", allowed=f"text with SHA-256 {commitment[:12]}...", hint=hint)
@@ -186,7 +186,7 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
 
 @dataclass(frozen=True)
 class SyntheticRecordingConditions:
-    """Settings of an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
+    """The settings for an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
 
     estimation_count: int = 1  # number of estimation recordings; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
@@ -203,7 +203,7 @@ _Detectable = tuple[EffectBase, Mapping[str, float], Array]
 
 
 class BlindCaseGenerator:
-    """Generates random blind cases of one experiment. Raises `ConfigError` if its system has no driven joints.
+    """A generator of random blind-test cases for one experiment. Raises `ConfigError` if no joint is driven.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ class BlindCaseGenerator:
         name: str,
         planned: PlannedBlindCase | None = None,
     ) -> Recording:
-        """Simulate one recording with injected effects, without description and ground truth."""
+        """Simulate one recording with injected effects. It contains no description and no ground truth."""
         nominal, posture = self.simulated_system, self.initial_configuration
         finer = self._finer if planned is not None and planned.category == "finer_chain" else None
         system = nominal if finer is None else finer(2)
@@ -313,14 +313,14 @@ class BlindCaseGenerator:
         )
 
     def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
-        """Compute JSON-compatible sensitivities of all candidates, which define their detectable sizes."""
+        """Return the sensitivities of all candidates, which define their detectable sizes, in JSON-compatible form."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
     def set_candidate_sensitivities_from_json(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Set the candidates' sensitivities to those of another generator's `candidate_sensitivities_to_json`."""
+        """Load candidate sensitivities that another generator exported with `candidate_sensitivities_to_json`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -336,7 +336,7 @@ class BlindCaseGenerator:
         return EstimationProblem(nominal.step, list(recordings), nominal.free, options, values)
 
     def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:
-        """Draw recordings and label of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
+        """Draw recordings and ground truth of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
         name = f"case_{planned.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_DRAWS_PER_CASE):
@@ -445,7 +445,7 @@ def record_random_motion(
     rng: np.random.Generator,
     conditions: SyntheticRecordingConditions,
 ) -> Recording:
-    """Record a simulation of `simulated` along a random multisine motion planned with the nominal system."""
+    """Simulate and record a random multisine motion of `simulated`, planned with the nominal system."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
     if conditions.is_brisk:
@@ -466,7 +466,7 @@ def record_random_motion(
 
 
 def first_recorded_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
-    """First recorded position of every driven joint. Raises `ConfigError` if one is not recorded."""
+    """Return the first recorded position of every driven joint. Raises `ConfigError` if one is not recorded."""
     joints = recording.joints
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
@@ -477,7 +477,7 @@ def first_recorded_driven_joint_positions(system: System, recording: Recording) 
 
 
 def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
-    """Scale joint stiffness and damping to the same tubes with more links."""
+    """Scale joint stiffness and damping so that they describe the same tubes with more links."""
     start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
@@ -501,7 +501,7 @@ def diagnose_blind_case(
     candidates: CandidateNamesOrAll = "all",
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
 ) -> DiagnosisResult:
-    """Diagnose a blind case from its recordings and exclusions, without its label."""
+    """Diagnose a blind-test case from its recordings and excluded effect kinds, without knowing its label."""
     problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]
     return diagnose(problem, candidates, held_out, thresholds=thresholds, exclude=case.excluded_kinds)
 
@@ -509,7 +509,7 @@ def diagnose_blind_case(
 def true_effects_gap_closure(
     ensemble: BlindCaseGenerator, case: UnlabelledCase, label: CaseGroundTruth, candidates: CandidateNamesOrAll = "all"
 ) -> float:
-    """Fraction of the held-out gap that a refit of the true effects closes. NaN if the refit fails."""
+    """Return the fraction of the held-out gap that the true effects close after a refit. NaN if the refit fails."""
     problem = ensemble._nominal_problem(case.estimation_recordings)
     effects = make_candidate_effects(problem.system, case.estimation_recordings, candidates)
     composed = AllCandidatesProblem.from_problem(problem, effects, [case.held_out_recording])

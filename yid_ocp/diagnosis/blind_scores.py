@@ -1,4 +1,4 @@
-"""Score blind diagnoses against their labels, and calibrate thresholds from an ensemble.
+"""Scores of blind diagnoses against their labels, and calibration of thresholds from an ensemble of cases.
 
 Given n values of a statistic on cases of one kind, a further case lies at or below their k-th smallest with a
 probability of at least k/(n + 1) (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715).
@@ -48,7 +48,7 @@ _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", _
 
 @dataclass(frozen=True)
 class BlindCaseScore:
-    """Score of one blind diagnosis against its label: correct answers, gap closure, errors and time."""
+    """The score of a blind diagnosis against its label: correct answers, gap closure, errors and time."""
 
     case: str
     category: str
@@ -84,7 +84,7 @@ class BlindCaseScore:
 def score_blind_case(
     label: CaseGroundTruth, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
 ) -> BlindCaseScore:
-    """Score a `yid-diagnosis/2` result against its label. `best` is the closure by `true_effects_gap_closure`."""
+    """Score a blind diagnosis (`yid-diagnosis/2`) against its label. `best` is from `true_effects_gap_closure`."""
 
     def labels(entries: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
         return tuple(f"{e['kind']}@{e['location']}" for e in entries)
@@ -167,7 +167,7 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 
 
 def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Rates over an ensemble, such as false alarms, detections and correct answers. A rate without cases is None.
+    """Compute rates over all cases, such as false alarms, detections and correct answers. A rate without cases is None.
 
     Cases that are not judged are excluded from all rates and counted as `not_judged`.
     """
@@ -298,7 +298,7 @@ _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
 def thresholds_always_accepting_best_candidate(limits: Thresholds) -> Thresholds:
-    """Return thresholds with which every residual is a gap and the best candidate is always accepted."""
+    """Return thresholds with which every residual counts as a gap and the best candidate is always accepted."""
     sure = 1.0 + 1e-9
     return replace(
         limits,
@@ -386,7 +386,7 @@ def calibrate_thresholds(
     limits: Thresholds = DEFAULT_THRESHOLDS,
     coverage: float = _TARGET_COVERAGE,
 ) -> dict[str, Any]:
-    """Compute diagnosis thresholds as conformal quantiles of blind-test statistics (`yid-calibration/1`).
+    """Compute diagnosis thresholds as conformal quantiles of the statistics of a blind test (`yid-calibration/1`).
 
     `labels`, `marks` and `answers` belong to the same cases. An answer holds the `result` with its `statistics` and, if
     no gap was detected, `open`: the statistics with permissive thresholds. `limits` are the thresholds of the answers.
@@ -455,7 +455,7 @@ _MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of
 
 
 def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
-    """The numbers on which a diagnosis' rules are based; `rejudge_diagnosis_evidence` uses them to judge it again."""
+    """Return all numbers that decide a diagnosis, so that `rejudge_diagnosis_evidence` can judge it again."""
     record, plain = result.record, to_lossless_plain_data
     pairs = {name: [[[e.label for e in both], fall] for both, _, fall in own] for name, own in record.pairs.items()}
     candidates = {entry.effect.label: entry.effect for entry in result.screening.detectability}
@@ -545,7 +545,7 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
 
 
 def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Recompute a diagnosis' verdict from `diagnosis_evidence_to_dict` data with changed thresholds.
+    """Judge a recorded diagnosis again with changed thresholds, from the data of `diagnosis_evidence_to_dict`.
 
     The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
     `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,

@@ -1,4 +1,4 @@
-"""Run all steps of a diagnosis of the sim-to-real gap, from the nominal fit to the verdict."""
+"""All steps of a diagnosis of the sim-to-real gap, from the nominal fit to the verdict."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def diagnose(
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
-    """Diagnose the gap between model and recordings: whether it exists, where, its causes, and what closes it.
+    """Diagnose the gap between model and recordings: find out whether it exists, where it is, and what causes it.
 
     Raises `ConfigError` or `ModelError` if a candidate does not fit the system, `DataError` if a held-out recording is
     also estimated on or there is no noise level, and `SolverError` if the nominal model cannot be rolled out or its
@@ -414,7 +414,7 @@ def fit_nominal_model(
     store: RefitStore = NO_REFIT_STORE,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
-    """Fit the nominal model within the problem with all candidates. Raises `SolverError` if the fit fails."""
+    """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
     solution = solution or solve(problem, GaussNewton(max_iterations=30), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)

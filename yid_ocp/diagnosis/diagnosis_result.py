@@ -1,4 +1,4 @@
-"""The result of a diagnosis: as a dataclass, in the format `yid-diagnosis/2`, and in sentences."""
+"""The result of a diagnosis as a dataclass, in the format `yid-diagnosis/2`, and in sentences."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _GAP_ORIGIN_PHRASES = {
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
-    """Result of a diagnosis: verdict, gap, locations, effects and the statistics behind them.
+    """The result of a diagnosis: verdict, gap, locations and effects, with the statistics behind them.
 
     Values have the units of their parameters. `smoother_result` has means and standard deviations (J, nd) per recording
     of nd unknown forces [N m or N], offsets and biases [m] in J time intervals.
@@ -89,7 +89,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
-        """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
+        """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return tuple(entry.effect for entry in self.accepted_selected_effects)
 
     @property
@@ -101,7 +101,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 
     @property
     def nominal_parameters_before_and_after(self) -> dict[str, dict[str, Any]]:
-        """By parameter of the nominal model: value before and after effects are added, standard deviation and unit."""
+        """The parameters of the nominal model before and after effects are added, with standard deviation and unit."""
         first, last, known = self.nominal_model, self.final_model, self.nominal_model.problem.system.parameters
         names, keys = first.problem.shared_parameters, ("before", "after", "std", "unit")
         values = ((first.values[name], last.values[name], last.std[name], known[name].unit) for name in names)
@@ -146,7 +146,7 @@ def _part_to_dict(part: ParameterShiftsSinceBaseline | CounterfactualErrorsOfFou
 
 
 def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
-    """Convert the rule-based, scored part of a diagnosis to a JSON-compatible dictionary."""
+    """Convert the verdict of a diagnosis and the evidence for it to a JSON-compatible dictionary."""
     added = judged.accepted_selected_effects
     before = _errors(seen.nominal_model) | attributes_to_dict(seen.nominal_held_out_test, "chi2_per_dof p_value")
     rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
@@ -163,7 +163,7 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
 
 
 def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
-    """Statistics that are compared with `Thresholds`, as a JSON-compatible dictionary; None if they are not known."""
+    """Return the statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. None: not known."""
     tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
     differences = (entry.absolute_difference_and_std for entry in result.transfer_checks)
     smoothed = None if result.nominal_model.has_process_noise else result.smoother_result
@@ -220,7 +220,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
 
 
 def recommended_experiment_text(result: DiagnosisResult) -> str:
-    """Recommend the next recording in a sentence, from verdict, gap location and confusable effects."""
+    """Recommend the next recording in one sentence, based on verdict, gap location and confusable effects."""
     for rivals in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
@@ -245,7 +245,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
-    """Summarise a diagnosis in a text on gap, locations, effects, events and the next experiment."""
+    """Summarise a diagnosis as text about the gap, locations, effects, events and the next experiment."""
     text = [_gap(result)]
     if result.verdict not in ("insufficient_data", "no_gap"):
         text += [_places(result), *_causes(result), *_remains(result)]
@@ -270,13 +270,13 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
 
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
-    """Sentence on how far the nominal model follows a truncated held-out recording."""
+    """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
     used, whole = cut.kept_duration, cut.full_duration
     return f"The nominal model follows {cut.recording} for {used:.3g} of {whole:.3g} s only; the rest is ignored."
 
 
 def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
-    """One sentence per recording whose end is ignored because a joint exceeds `max_joint_speed`."""
+    """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
     said, why = "s are ignored in", "moves too fast for the model."
     return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
 

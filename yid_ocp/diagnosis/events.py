@@ -1,4 +1,4 @@
-"""Find events such as pushes, snags and wrong samples, each with location and time window.
+"""Search for events such as pushes, snags and wrong samples, each with location and time window.
 
 At prescribed joints with compared efforts, the unknown force is measured minus required torque, sample by sample.
 Elsewhere it is the smoother's linear model of the force at one coordinate, with all other unknowns at their estimates.
@@ -100,7 +100,7 @@ class _Overspeed:
 
 @dataclass(frozen=True)
 class EventSet:
-    """Events of a diagnosis by recording and time, with overspeeds and the force estimates at the events."""
+    """All events of a diagnosis, sorted by recording and time, with joint overspeeds and force estimates."""
 
     disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
@@ -110,18 +110,18 @@ class EventSet:
         return bool(self.disturbances or self.overspeeds)
 
     def has_same_force_and_fault_events(self, other: EventSet) -> bool:
-        """Whether both sets have the same number of events, in the same channels at overlapping times."""
+        """Check whether both sets have the same number of events, in the same channels and at overlapping times."""
         pairs = list(zip(self.disturbances, other.disturbances, strict=False))
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
     def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
-        """Return one set of the force events, and one of the sensor faults and overspeeds."""
+        """Return two sets: the force events, and all other events (sensor faults and overspeeds)."""
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 
     def events_of_recording(self, recording: str) -> tuple[ForceOrFaultEvent, ...]:
-        """Events of one recording."""
+        """Return the events of one recording."""
         return tuple(event for event in self.disturbances if event.recording == recording)
 
     def _end_of(self, recording: str) -> float:
@@ -139,11 +139,11 @@ def find_force_and_fault_events(
     smoothed: SmoothedUnknownsResult | None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> EventSet:
-    """Find short forces and sensor faults in all recordings that are significant at a false-discovery rate.
+    """Find short forces and sensor faults in all recordings, and keep those that are statistically significant.
 
-    The rate refers to all time windows together. `problem` is whitened by sensor noise and has all samples. `x` (nx,)
-    is its fit, and `evaluation` its evaluation, with a Jacobian if `smoothed` is given. Forces that move the model are
-    searched only where the smoother found unknown forces.
+    The false-discovery rate refers to all time windows together. `problem` is whitened by sensor noise and has all
+    samples. `x` (nx,) is its fit, and `evaluation` its evaluation, with a Jacobian if `smoothed` is given. Forces that
+    move the model are searched only where the smoother found unknown forces.
     """
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
     told = [(e, result, problem.unpack_episode_unknowns(x, i)[0]) for i, (e, result) in enumerate(fitted)]
@@ -438,7 +438,7 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 
 
 def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
-    """Return the problem without the effect of found events, so that a fit is not disturbed by them.
+    """Remove the influence of found events from the data of a problem, so that they do not disturb a fit.
 
     Forces at joints driven by recorded torques are added to these torques; forces on an object and at servos are not
     compensated. Wrong samples are excluded, and effort samples of prescribed joints during an event, and everything

@@ -1,4 +1,4 @@
-"""Estimation problem of one system with all candidate effects and one compiled step."""
+"""An estimation problem that contains all candidate effects in one compiled step."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
+from yid_ocp.effects.friction import effect_as_sharp_as_nominal_friction
 from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
@@ -42,7 +43,7 @@ a failure it has already deviated. The next fraction is tried if the refitted mo
 def make_candidate_effects(
     system: System, recordings: Sequence[Recording], choice: CandidateNamesOrAll
 ) -> list[EffectBase]:
-    """Make the candidate effects for a system, without effects that its nominal model already has.
+    """Create the candidate effects for a system, except effects that its nominal model already contains.
 
     `choice` is "all", or a list of `kind@location` or `kind` (at all locations that a diagnosis tries). Raises
     `ConfigError` if the list is empty, or if a kind does not exist, has no location here or is part of the nominal
@@ -52,7 +53,7 @@ def make_candidate_effects(
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
     if choice == "all":
-        return [make_effect(kind, place, system) for kind, place in possible]
+        return [_make_candidate(kind, place, system) for kind, place in possible]
     if isinstance(choice, str) or not choice:
         what = f"candidates = '{choice}'" if choice else "there is no candidate to try"
         raise ConfigError(what, where=where, allowed="all, or a list of kinds", hint="leave the key out to try all")
@@ -70,11 +71,15 @@ def make_candidate_effects(
             allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), "leave it out"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)
         pairs += [pair for pair in found if pair not in pairs]
-    return [make_effect(kind, place, system) for kind, place in pairs]
+    return [_make_candidate(kind, place, system) for kind, place in pairs]
+
+
+def _make_candidate(kind: str, place: str, system: System) -> EffectBase:
+    return effect_as_sharp_as_nominal_friction(make_effect(kind, place, system), system)
 
 
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Return the candidate effects except those that `names` lists as `kind` or `kind@location`.
+    """Return the candidate effects that are not listed in `names` (as `kind` or `kind@location`).
 
     Excluded candidates stay in the compiled step, at values without effect, so nothing is recompiled. Raises
     `ConfigError` if a name is not a candidate, or if no candidate is left.
@@ -94,18 +99,18 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
 
 
 def neutral_effect_parameter_values(effects: Sequence[EffectBase]) -> dict[str, float]:
-    """Parameter values at which the given effects change nothing."""
+    """Return the parameter values at which the given effects change nothing."""
     return {name: value for effect in effects for name, value in effect.neutral_values.items()}
 
 
 def join_effect_labels(effects: Sequence[EffectBase]) -> str:
-    """Effect labels `kind@location` joined with "and"; "the nominal model" without effects."""
+    """Join the labels `kind@location` of effects with "and", or return "the nominal model" if there are none."""
     return " and ".join(effect.label for effect in effects) or "the nominal model"
 
 
 @dataclass(frozen=True)
 class HeldOutTruncation:
-    """A held-out recording truncated where the nominal model stops following it: name and durations."""
+    """A held-out recording that is cut off where the nominal model stops following it, with its durations."""
 
     recording: str
     kept_duration: float  # compared duration [s]; 0 if nothing is compared
@@ -114,7 +119,7 @@ class HeldOutTruncation:
 
 @dataclass(frozen=True)
 class AllCandidatesProblem:
-    """Estimation problem of a system with all candidate effects, each of which can be freed without recompiling.
+    """An estimation problem with all candidate effects, each of which can be freed without recompiling.
 
     Sensors, statics and corrections are compiled once with all derivatives, and recordings are placed on the nodes
     once. The tracking filter is computed at the nominal initial values and is therefore the same for every hypothesis.
@@ -132,7 +137,7 @@ class AllCandidatesProblem:
     def from_problem(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> AllCandidatesProblem:
-        """Problem with added candidate effects. `DataError` if a recording is both estimated on and held out."""
+        """Add candidate effects to a problem. Raises `DataError` if a recording is both estimated on and held out."""
         effects = tuple(effects)
         joint = compile_step_like(problem.step, problem.step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
@@ -160,11 +165,11 @@ class AllCandidatesProblem:
 
     @property
     def nominal_free_parameter_names(self) -> tuple[str, ...]:
-        """Names of the free parameters of the nominal problem."""
+        """The names of the free parameters of the nominal problem."""
         return self.problem.free
 
     def with_whitening_linearized_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
-        """Problem whitened by sensor and torque noise, with filters linearised at `values`."""
+        """Return the problem whitened by sensor and torque noise, with filters linearised at `values`."""
         if not self.problem.has_process_noise:
             return self
         # filters are linearised about the estimated torques, so these must be known first
@@ -174,7 +179,7 @@ class AllCandidatesProblem:
         return replace(self, problem=problem_with_held_out_kalman_whitening(made, x))
 
     def with_time_step(self, time_step: float, with_held_out: bool = True) -> AllCandidatesProblem:
-        """Problem with another time step [s] and the whole recordings, whitened by sensor noise alone."""
+        """Return the problem with another time step [s] and whole recordings, whitened by sensor noise alone."""
         made = self.problem.with_time_step(time_step)
         if self.is_split_in_blocks or not with_held_out:
             return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made, held_out_spread=None)
@@ -184,7 +189,7 @@ class AllCandidatesProblem:
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], kept_fraction: float
     ) -> tuple[AllCandidatesProblem, tuple[HeldOutTruncation, ...]]:
-        """Truncate held-out recordings where the nominal model's rollout fails. Also returns these recordings.
+        """Cut off held-out recordings where the nominal model's simulation fails. Also returns these recordings.
 
         They keep `kept_fraction` of the duration that the model follows. If too little of every recording remains,
         estimation recordings are split in blocks instead. Residuals are whitened by sensor noise alone.
@@ -220,14 +225,14 @@ class AllCandidatesProblem:
         return self if own is None else replace(self, problem=own, functions_of_place=None)
 
     def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
-        """Estimation problem in which the nominal model's free parameters and all those of `effects` are free."""
+        """Return the problem in which the nominal free parameters and all parameters of `effects` are free."""
         own = (name for effect in effects for name in effect.parameters.names)
         return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameter_names, *own))
 
     def with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Estimation problem with free `effects`, its filters relinearised about the torque offsets at the values `at`.
+        """Return the problem with free `effects`, and with filters linearised again at the torque offsets for `at`.
 
         Filters of held-out recordings are unchanged: see `relinearize_held_out_filters`.
         """
@@ -237,7 +242,7 @@ class AllCandidatesProblem:
     def relinearize_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Relinearise held-out filters at the fitted values. `own`: from `with_effects_and_relinearized_filters`."""
+        """Linearise the held-out filters at the fitted values. `own`: from `with_effects_and_relinearized_filters`."""
         if not own.has_process_noise:
             return own
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))
@@ -313,5 +318,5 @@ def _masked(episode: Episode, parity: int) -> Episode:
 
 
 def mask_out_samples(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
-    """Measurements without the samples in the mask `hidden` (M, k)."""
+    """Return the measurements without the samples that the mask `hidden` (M, k) marks."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

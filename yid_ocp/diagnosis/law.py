@@ -1,4 +1,4 @@
-"""Estimate a law for a gap that no named effect explains: a torque as a smooth function of known quantities."""
+"""Estimation of a torque law (a smooth function of known quantities) for a gap that no named effect explains."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MIN_LEFTOVER_CLOSURE = 0.2  # fraction of the residual gap that a law must clos
 
 @dataclass(frozen=True)
 class GapLaw:
-    """A law for a gap that no effect of the library explains, with its held-out closure."""
+    """A torque law for a gap that no effect of the library explains, with the fraction of the gap that it closes."""
 
     location: str
     tables: tuple[TorqueLawTable, ...]  # one table per quantity
@@ -56,12 +56,12 @@ class GapLaw:
 
     @property
     def depends_on(self) -> str:
-        """Quantities on which the torque depends, joined with `+`."""
+        """The quantities on which the torque depends, joined with `+`."""
         return "+".join(table.quantity for table in self.tables)
 
     @property
     def sentence(self) -> str:
-        """Sentence on the law: location, quantity, size and closed fraction of the gap."""
+        """A sentence about the law that states its location, quantity and size, and the closed fraction of the gap."""
         if self.depends_on == "time":
             head = f"{self.location} carries a torque that depends on nothing the model knows better than on time"
         else:
@@ -80,7 +80,7 @@ class GapLaw:
         return f"{head} ({', '.join(sizes)}); {closed}. No accepted effect describes it."
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the law to a dictionary: location, depends_on, table, closure, visited_range, runner_up."""
+        """Convert the law to a dictionary with location, depends_on, table, closure, visited_range and runner_up."""
         rows = [
             {"quantity": t.quantity, "unit": TORQUE_LAW_QUANTITY_UNITS[t.quantity], "at": x, "torque": f, "std": s}
             for t in self.tables
@@ -113,7 +113,7 @@ class _Family:
 def find_gap_law(
     search: RefitContext, problem: EstimationProblem, last: RefittedModel, places: Sequence[str], events: EventSet
 ) -> GapLaw | None:
-    """Estimate the remaining gap as a torque law, or return None if no location allows a law or no law closes enough.
+    """Estimate a torque law for the remaining gap, or return None if no law is possible or closes enough of the gap.
 
     `problem` is the problem of the nominal model, without candidates. `last` is the model with the accepted effects, or
     the nominal model. `places` are the locations of the gap, the most likely first.

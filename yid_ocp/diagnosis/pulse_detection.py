@@ -1,4 +1,4 @@
-"""Detect short pulses of one sign in the history of an unknown force on a slow or load-dependent background.
+"""Detection of short force pulses on a background that changes slowly or with the load.
 
 The likelihood of the force's values f is log p(data | f) = g'f - f'L f / 2. f is a sum of pulses and a Gaussian
 background with the covariance
@@ -48,7 +48,7 @@ class _TorqueTermSizes:
 
 
 class CompiledInverseDynamics:
-    """Inverse dynamics of a step's system, M(q) a + c(q, v) + g(q) = tau, compiled once for all recordings."""
+    """The inverse dynamics of a system, M(q) a + c(q, v) + g(q) = tau, compiled once for all recordings."""
 
     def __init__(self, step: Step) -> None:
         self._step = step
@@ -58,7 +58,7 @@ class CompiledInverseDynamics:
         return _function(self._step.system, self._step.time_step)
 
     def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
-        """Magnitudes of the inverse dynamics terms at increasing nodes (M,); accelerations are differences."""
+        """Compute the size of each inverse dynamics term at increasing nodes (M,). Accelerations are differences."""
         system, time_step = self._step.system, self._step.time_step
         n = system.n_coordinates
         q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
@@ -126,7 +126,7 @@ _MAX_PULSE_RANGE_RATIO = 1.5  # largest ratio of a pulse to the range of the his
 
 @dataclass(frozen=True)
 class ForceHistory:
-    """Estimate of an unknown force f over time at one location, by its log likelihood g'f - f'L f / 2."""
+    """An estimate of an unknown force f over time at one location, given by its log likelihood g'f - f'L f / 2."""
 
     recording: str
     location: str
@@ -142,23 +142,23 @@ class ForceHistory:
 
     @property
     def time_spacing(self) -> float:
-        """Median time between neighbouring points [s]."""
+        """The median time between neighbouring points [s]."""
         return float(np.median(np.diff(self.t)))
 
     def subset_at_time_indices(self, keep: IntArray) -> ForceHistory:
-        """Estimate restricted to the time points with the indices `keep`."""
+        """Return the estimate at only the time points with the indices `keep`."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
         return replace(self, information=information, **parts)
 
     @property
     def assumed_model_error(self) -> Array:
-        """Assumed model error (M,) of the force at every time point, in `unit`."""
+        """The assumed model error (M,) of the force at every time point, in `unit`."""
         return np.hypot(self.model_error_std, self.friction_limit)
 
     @property
     def max_likelihood_force(self) -> Array:
-        """Maximum-likelihood force (M,) at every time point, in `unit`."""
+        """The maximum-likelihood force (M,) at every time point, in `unit`."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
         return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
 
@@ -176,16 +176,16 @@ class DetectedForcePulse:
 
     @property
     def impulse_per_unit_peak(self) -> float:
-        """Time integral [s] of the pulse shape with a peak of one."""
+        """The time integral [s] of the pulse if its peak is one."""
         return (self.end_time - self.start_time) * (1 - _FLAT_RAMP_FRACTION / 2 if self.is_flat_topped else 0.5)
 
     @property
     def impulse(self) -> float:
-        """Signed time integral of the pulse, in the force's unit times s."""
+        """The signed time integral of the pulse, in the force's unit times s."""
         return self.peak_value * self.impulse_per_unit_peak
 
     def filtered_force_at(self, t: Array, cutoff: float = math.inf) -> Array:
-        """Force of the pulse at times `t` after a low-pass filter at `cutoff` [Hz]."""
+        """Compute the force of the pulse at the times `t` after a low-pass filter at `cutoff` [Hz]."""
         window = _Windows(*map(np.atleast_1d, (self.start_time, self.end_time, self.is_flat_topped)))
         return self.peak_value * _Filter.of(cutoff)(window, t)[:, 0]
 
@@ -306,7 +306,7 @@ class _Rest:
 def detect_force_pulses(
     history: ForceHistory, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[list[DetectedForcePulse], float]:
-    """Detect force pulses in one force estimate, largest evidence first. Also returns the number of windows searched.
+    """Find force pulses in a force estimate, strongest evidence first. Also returns the number of windows searched.
 
     The p-value of a pulse refers to a single window, so it must be corrected for the number of windows. This number
     counts disjoint windows, of lengths a factor of two apart.

@@ -1,4 +1,4 @@
-"""Refit the nominal parameters together with effects, and judge the fits on held-out recordings.
+"""Refits of the nominal parameters together with effects, and their errors on held-out recordings.
 
 A loss is the mean square of whitened residuals in blocks of held-out time. All models use the same blocks, so that
 differences between models are paired. G = max(0, chi2/n - 1) is the gap.
@@ -49,7 +49,7 @@ _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effe
 
 @dataclass(frozen=True)
 class HeldOutLoss:
-    """Whitened squared prediction errors of a model in nb time blocks of the held-out recordings, (nb,)."""
+    """The whitened squared prediction errors of a model, summed in nb time blocks of held-out data, shape (nb,)."""
 
     block_chi2: Array  # sums of whitened squares; infinite if a rollout failed
     block_sample_counts: Array
@@ -59,23 +59,23 @@ class HeldOutLoss:
 
     @property
     def total_chi2(self) -> float:
-        """Sum of chi2 over the held-out time blocks, plus chi2 of the deviation from earlier runs."""
+        """The sum of chi2 over all held-out time blocks, plus chi2 of the deviation from earlier runs."""
         return float(self.block_chi2.sum()) + self.baseline_chi2
 
     @property
     def chi2_per_sample(self) -> float:
-        """`total_chi2` divided by the number n of held-out samples; 1 on average for noise alone."""
+        """The value of `total_chi2` divided by the number of held-out samples. Noise alone gives 1 on average."""
         return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
 
     @property
     def excess_chi2_per_sample(self) -> float:
-        """Held-out gap G = max(0, chi2/n - 1)."""
+        """The gap on held-out recordings, G = max(0, chi2/n - 1)."""
         return max(0.0, self.chi2_per_sample - 1.0)
 
 
 @dataclass(frozen=True)
 class StoredFit:
-    """Stored values and standard deviations of a refit. One evaluation restores a `RefittedModel` from them."""
+    """The stored values and standard deviations of a refit. One evaluation restores a `RefittedModel` from them."""
 
     values: dict[str, float]  # values of all unknowns
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite if not informed by the data
@@ -85,7 +85,7 @@ class StoredFit:
 
 @dataclass(frozen=True)
 class RefitStatistics(StoredFit):
-    """Result of a refit without its problem: effects, estimates, cost and held-out prediction errors."""
+    """The result of a refit without its estimation problem: effects, estimates, cost and held-out errors."""
 
     effects: tuple[EffectBase, ...]
     cost: float
@@ -95,15 +95,15 @@ class RefitStatistics(StoredFit):
 
     @property
     def total_effect_parameter_count(self) -> int:
-        """Number of parameters of all effects in the model together."""
+        """The number of parameters of all effects in the model together."""
         return sum(len(effect.parameters) for effect in self.effects)
 
     def effect_parameters_as_reported(self, effect: EffectBase) -> dict[str, ReportedParameterValue]:
-        """Fitted parameters of an effect in reported units, with standard deviations."""
+        """Return the fitted parameters of an effect in reported units, with standard deviations."""
         return effect.parameters_as_reported(self.values, self.std)
 
     def amplitudes_beyond_prior_range(self, effect: EffectBase) -> list[str]:
-        """Names of an effect's amplitudes beyond their prior range by more than a quarter of its width."""
+        """List the amplitudes of an effect that leave their prior range by more than a quarter of its width."""
         ranges = {name: effect.prior_ranges[name] for name in effect.amplitude_parameter_names}
         far = {name: abs(self.values[name] - (low + high) / 2) / (high - low) for name, (low, high) in ranges.items()}
         return [name for name, away in far.items() if away > 0.5 + _PRIOR_RANGE_TOLERANCE]
@@ -111,21 +111,21 @@ class RefitStatistics(StoredFit):
 
 @dataclass(frozen=True)
 class RefittedModel(RefitStatistics):
-    """The nominal model with some effects after a refit, as a problem with its evaluation."""
+    """The nominal model after a refit with some effects, stored as a problem with its evaluation."""
 
     problem: EstimationProblem  # composed system; free nominal parameters and parameters of the effects
     evaluation: Evaluation
 
     def statistics(self) -> RefitStatistics:
-        """Copy the refit's statistics, without its estimation problem and evaluation, to save memory."""
+        """Return the statistics of the refit without its problem and evaluation, which saves memory."""
         return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
 
 
 class RefitStore(Protocol):
-    """Interface of a store of finished refits, from which an interrupted diagnosis resumes; called by two threads."""
+    """An interface for storing finished refits, so that an interrupted diagnosis can resume. Two threads call it."""
 
     def stored_refit(self, name: str) -> StoredFit | None:
-        """The refit stored under a name, or None."""
+        """Return the refit that is stored under a name, or None."""
         return None
 
     def put(self, name: str, refitted: StoredFit) -> None:
@@ -143,7 +143,7 @@ NO_REFIT_STORE: RefitStore = _NoStore()
 
 @dataclass(frozen=True)
 class NominalSolutionAndRefitStore:
-    """Solution of the nominal problem and refits of an interrupted run, known before a diagnosis."""
+    """The results that an interrupted diagnosis left: the nominal solution and the finished refits."""
 
     solution: Solution | None = None
     store: RefitStore = NO_REFIT_STORE  # receives every new refit
@@ -151,7 +151,7 @@ class NominalSolutionAndRefitStore:
 
 @dataclass(frozen=True)
 class EffectSearchRecord:
-    """All results that a search for effects requested, by name. Other rules can reuse them without refits."""
+    """A record of all results that a search for effects used, by name. Other rules can reuse them without refits."""
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # by name; next to effects in the model
@@ -161,7 +161,7 @@ class EffectSearchRecord:
 
 @dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress, store and deadline of one diagnosis. It makes the refits that rules request."""
+    """The problem, thresholds, progress, store and deadline of a diagnosis. It makes the refits that rules request."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
@@ -173,18 +173,18 @@ class RefitContext:
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
 
     def record_skip_if_past_deadline(self, *what: str) -> bool:
-        """Whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
+        """Check whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
         is_late = time.perf_counter() >= self.deadline
         self.skipped.extend(what * is_late)
         return is_late
 
     def refit(self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str) -> RefitStatistics | None:
-        """Refit the model with some effects; None if no rollout succeeds. `name` distinguishes different starts."""
+        """Refit the model with the given effects. None if no simulation succeeds. `name` distinguishes the starts."""
         asked = (self.problem, effects, start, self.store, name, self.thresholds)
         return self._answer(self.record.refits, name, lambda: refit_with_effects(*asked))
 
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
-        """Fit the same effects on the held-out recordings. None if that is not possible."""
+        """Fit the effects of `fit` again, on the held-out recordings. None if that is not possible."""
         name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
         return self._answer(self.record.refits, name, lambda: self._turned(fit, name))
 
@@ -203,7 +203,7 @@ class RefitContext:
         return refit_with_effects(whitened, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
-        """Screen all candidates in addition to some effects. `name` says which fit provides `values`.
+        """Test all candidates as additions to the effects in `base`. `name` says which fit provides `values`.
 
         There are no candidates if the model with all of them cannot be simulated at these values.
         """
@@ -216,7 +216,7 @@ class RefitContext:
         return self._answer(self.record.screenings, name, screened)
 
     def ranked_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
-        """Rank the most promising pairs of candidates, without one label. See `_MAX_RECORDED_PAIRS`."""
+        """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
         found = screened.joint_score_model.ranked_candidate_pairs(labels)
         return self._answer(self.record.pairs, without, lambda: tuple(itertools.islice(found, _MAX_RECORDED_PAIRS)))
@@ -241,7 +241,7 @@ def refit_with_effects(
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel | None:
-    """Fit nominal and effect parameters, and predict held-out recordings. Returns None if no rollout succeeds.
+    """Fit nominal and effect parameters together, then predict held-out recordings. None if no rollout succeeds.
 
     `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` and
     the time step are the name in the store of refits.
@@ -279,7 +279,7 @@ def _evaluated(
 
 
 def reevaluate_refit_with_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
-    """Evaluate a refit again, at its estimates, in the step of all candidates. Its other results are kept."""
+    """Evaluate a refit again at its estimates, with the step of all candidates. Its other results are kept."""
     if fit.problem.step is problem.problem.step:
         return fit
     own, finish = _evaluated(problem, fit.effects, fit.values)
@@ -381,7 +381,7 @@ def refit_with_each_effect(
     values: Mapping[str, float],
     where: str = "",
 ) -> list[RefitStatistics]:
-    """Refit the model with each of several effects, or pairs of effects, added to `base`. Failed ones are omitted.
+    """Refit the model once for each effect, or pair of effects, added to `base`. Failed refits are omitted.
 
     A refit that cannot predict the held-out recordings has failed. Each entry of `tried` holds the added effects and
     their initial parameters; `values` are the initial values of all other unknowns. `where` labels these initial values
@@ -420,7 +420,7 @@ def refit_with_each_effect(
 
 @np.errstate(invalid="ignore")  # of recordings that cannot be predicted
 def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = None) -> HeldOutLoss:
-    """Loss of a model on the held-out recordings, with `spread` (n, k) of `AllCandidatesProblem.held_out_spread`."""
+    """Compute the prediction loss on held-out recordings. `spread` (n, k) is from `AllCandidatesProblem`."""
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
     found, residuals, numbered = problem.predict_held_out(x), [], []
@@ -451,7 +451,7 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
 def held_out_rmse_and_unit_by_channel(
     found: Sequence[tuple[Episode, EpisodePrediction | str]],
 ) -> dict[str, tuple[float, str]]:
-    """Root mean square error and unit of each channel over the predicted held-out recordings."""
+    """Return the root mean square error and unit of each channel over all predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_unit_and_count_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])
     return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}

@@ -1,4 +1,4 @@
-"""Screening: detectability and score test of every candidate from one sensitivity sweep.
+"""Screening of all candidates: detectability and score tests from one computation of sensitivities.
 
 r is the whitened residual of the nominal fit, J_theta its sensitivity to the parameters of the nominal fit, J_j that to
 the amplitudes of candidate j, and P = I - J_theta J_theta^+:
@@ -58,7 +58,7 @@ class _EffectSignature:
 
 @dataclass(frozen=True)
 class ProjectedCandidatesLinearization:
-    """Residual and candidate signatures linearised at one point, with the model's free parameters projected out."""
+    """The linearised residual and candidate signatures, without the part that the model's free parameters explain."""
 
     projected_residual: Array  # P r, shape (nr,)
     signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
@@ -66,7 +66,7 @@ class ProjectedCandidatesLinearization:
 
 @dataclass(frozen=True)
 class CandidateDetectability:
-    """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
+    """The smallest amplitudes of a candidate that are detectable, given its sensitivity and the noise."""
 
     effect: EffectBase
     detectable_amplitudes: dict[str, float]  # amplitudes in the parameter's unit
@@ -75,7 +75,7 @@ class CandidateDetectability:
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """Score test of one candidate effect: predicted parameter values, predicted decrease of chi2, p-value."""
+    """The score test of one candidate effect: predicted parameter values, predicted decrease of chi2, and p-value."""
 
     effect: EffectBase
     predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values
@@ -227,7 +227,7 @@ def _score_candidates(
 
 
 def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[CandidateScore]) -> float:
-    """Bonferroni-corrected smallest p-value of the candidates; 1 without candidates."""
+    """Return the smallest p-value of the candidates after Bonferroni correction, or 1 if there are no candidates."""
     return min([1.0, *(score.p_value * len(ranked) for score in ranked)])
 
 
@@ -267,13 +267,13 @@ def _values(effect: EffectBase, step: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class ConfusabilityMatrix:
-    """Fractions of each candidate's signature that other candidates explain, beyond nominal parameters."""
+    """The fraction of each candidate's signature that each other candidate explains, beyond nominal parameters."""
 
     labels: tuple[str, ...]
     overlap_fractions: Array  # shape (nj, nj): of row j's signature by column i's
 
     def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
-        """Labels of the other candidates that explain at least the fraction `limit` of a candidate's signature."""
+        """List the other candidates that explain at least the fraction `limit` of the signature of `label`."""
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
@@ -284,7 +284,7 @@ ScoredCandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], flo
 
 @dataclass(frozen=True)
 class LinearModelOfAllCandidates:
-    """Joint linear model of the residual in the amplitudes of all candidates, each at one shape value."""
+    """A linear model of how the amplitudes of all candidates change the residual, each at one shape value."""
 
     effects: tuple[EffectBase, ...]
     shape_values: tuple[dict[str, float], ...]
@@ -297,7 +297,7 @@ class LinearModelOfAllCandidates:
         return np.split(np.arange(len(self.score_vector)), ends)
 
     def ranked_candidate_pairs(self, among: Sequence[str]) -> Iterator[ScoredCandidatePair]:
-        """Yield all pairs of the candidates `among`, largest penalised decrease of r'r first (r: whitened residual).
+        """Yield all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
         """
@@ -350,7 +350,7 @@ def _confusability_matrix(everything: LinearModelOfAllCandidates) -> Confusabili
 
 @dataclass(frozen=True)
 class ScreeningResult:
-    """Detectability, score tests and confusability of all candidates at one point, with their joint model."""
+    """The detectability, score tests and confusability of all candidates at one point, with their joint model."""
 
     detectability: tuple[CandidateDetectability, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
@@ -367,7 +367,7 @@ EMPTY_SCREENING_RESULT = ScreeningResult(
 def screen_candidates(
     problem: AllCandidatesProblem, base: Sequence[EffectBase], values: Mapping[str, float]
 ) -> ScreeningResult:
-    """Screen all candidates not in `base` at `values` for detectability, scores and confusability."""
+    """Compute detectability, scores and confusability of all candidates that are not in `base`, at `values`."""
     point = linearize_candidates(problem, base, values)
     visible = _candidate_detectable_amplitudes(point)
     ranked = _score_candidates(point, channels_with_residual_indices(problem.problem), visible)

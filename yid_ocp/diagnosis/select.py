@@ -1,4 +1,4 @@
-"""Choose the effects that predict held-out recordings best, and find those that the recordings cannot tell from them.
+"""Selection of the effects that predict held-out recordings best, and of effects that look the same in the recordings.
 
 The closure is 1 - G_after/G_before of the held-out losses. Its interval comes from resampling blocks (Kuensch 1989,
 doi:10.1214/aos/1176347265).
@@ -29,7 +29,7 @@ _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 @dataclass(frozen=True)
 class GapClosure:
-    """Fraction of the held-out gap that a model closes, with its 95 % interval. NaN if there is no gap."""
+    """The fraction of the held-out gap that a model closes, with its 95 % interval. NaN if there is no gap."""
 
     fraction: float
     ci_low: float
@@ -37,7 +37,7 @@ class GapClosure:
 
     @property
     def text(self) -> str:
-        """Text of the fraction; empty if there is no gap."""
+        """A text that states the closed fraction; empty if there is no gap."""
         return f"{100 * self.fraction:.3g} % of the held-out gap closed" if math.isfinite(self.fraction) else ""
 
 
@@ -46,7 +46,7 @@ UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """Effect added by forward selection, with refitted model, closed fraction of the gap and equivalents."""
+    """An effect chosen by forward selection, with its refit, closed fraction of the gap and equivalent effects."""
 
     effect: EffectBase
     refitted_model: RefitStatistics  # refit with all effects up to this one
@@ -56,12 +56,12 @@ class SelectedEffect:
 
 
 def total_gap_closure(added: Sequence[SelectedEffect]) -> GapClosure:
-    """Closure of the whole gap by all of some selected effects. Undefined without effects."""
+    """Return the fraction of the gap that all selected effects close together. Undefined without effects."""
     return [UNDEFINED_GAP_CLOSURE, *(entry.cumulative_closure for entry in added)][-1]
 
 
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
-    """Fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
+    """Compute the fraction of the held-out gap that closes from `before` to `after`, with a bootstrap interval."""
     if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
         return UNDEFINED_GAP_CLOSURE
     fraction = 1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample
@@ -87,7 +87,7 @@ def _leaves_little(nominal: RefitStatistics, fit: RefitStatistics, limits: Thres
 
 
 def held_out_improvement_and_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
-    """Decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
+    """Compute the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
     total = float(before.block_sample_counts.sum())
     difference = before.block_chi2 - after.block_chi2
     if not np.all(np.isfinite(difference)):
@@ -98,7 +98,7 @@ def held_out_improvement_and_error(before: HeldOutLoss, after: HeldOutLoss) -> t
 
 
 def bic_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
-    """Difference of two fits' Bayesian information criterion (BIC): `fit` minus `other`, negative if `fit` is better.
+    """Compute the BIC (Bayesian information criterion) of `fit` minus that of `other`; negative if `fit` is better.
 
     The BIC is r'r over estimation and held-out recordings (r: whitened residual) plus log(n) per effect parameter, with
     n residuals (Schwarz 1978, doi:10.1214/aos/1176344136). Half the difference is the log odds of `other` against
@@ -235,7 +235,7 @@ class _Choice:
 def select_effects(
     search: RefitContext, nominal: RefitStatistics, screened: ScreeningResult, moved: bool = False
 ) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
-    """Select effects by forward selection on the held-out gap, then try replacing and removing each effect.
+    """Add effects one by one to close the held-out gap, then try to replace and remove each of them.
 
     If `moved` (the nominal fit has left the estimates of an earlier run), candidates are also tried from those
     estimates. Returns the fits of single effects in the first round and the selected effects. The fit of the chosen
@@ -376,7 +376,7 @@ def _with_rivals(entry: SelectedEffect, rivals: Sequence[tuple[EffectBase, float
 def selected_effect_alone(
     entry: SelectedEffect, nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> SelectedEffect:
-    """The first selected effect without the others, with its equivalent effects among the `fits` of single effects."""
+    """Return `entry` as the only selected effect, with its equivalent effects among the `fits` of single effects."""
     near = [(fit.effects[-1], distance) for fit, distance in _near_best_models(nominal, fits, limits)]
     known = {effect.label: (effect, distance) for effect, distance in ((entry.effect, 0.0), *near)}
     return _with_rivals(entry, [*known.values()])

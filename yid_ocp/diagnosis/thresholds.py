@@ -15,7 +15,7 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds of every step of a diagnosis, from the null test to the events.
+    """The thresholds for every step of a diagnosis, from the null test to the events.
 
     Each field has a description, repeated in the section `diagnosis` of the settings reference.
     """
@@ -63,7 +63,7 @@ class Thresholds:
 
     @property
     def null_test_excess_criteria(self) -> ExcessResidualCriteria:
-        """Significance level and smallest excess of the null test, also used by `solve`."""
+        """The significance level and the smallest relevant excess of the null test, also used by `solve`."""
         return ExcessResidualCriteria(self.significance_level, self.min_excess_chi2_per_dof)
 
 

@@ -1,4 +1,4 @@
-"""Decide whether there is a gap, whether effects transfer to held-out recordings, and the verdict."""
+"""The rules that decide whether there is a gap, whether effects transfer to held-out recordings, and the verdict."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
 @dataclass(frozen=True)
 class EffectAmplitudeTransferCheck:
-    """Comparison of one effect parameter's estimates from the estimation and the held-out recordings."""
+    """A comparison of two estimates of one effect parameter, from the estimation and the held-out recordings."""
 
     effect_label: str
     parameter: str
@@ -46,26 +46,26 @@ class EffectAmplitudeTransferCheck:
 
     @property
     def both_estimates_text(self) -> str:
-        """Text of both estimates with their standard deviations and unit."""
+        """A text with both estimates, their standard deviations and unit."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
     def absolute_difference_and_std(self) -> tuple[float, float]:
-        """Absolute difference between the two estimates, and its standard deviation."""
+        """The absolute difference of the two estimates, and the standard deviation of this difference."""
         return abs(self.estimation_value - self.held_out_value), math.hypot(self.estimation_std, self.held_out_std)
 
     @property
     def std_of_significant_disagreement(self) -> float:
-        """Difference of the estimates over sqrt(2) if it is significant, else 0."""
+        """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
         apart, spread = self.absolute_difference_and_std
         return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
 @dataclass(frozen=True)
 class NominalModelGapEvidence:
-    """Evidence for a gap before the search for effects."""
+    """The evidence for a gap that is known before the search for effects."""
 
     nominal_model: RefitStatistics
     nominal_test: NullTestResult  # test on the estimation recordings
@@ -74,12 +74,12 @@ class NominalModelGapEvidence:
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
 
     def exceeds_noise(self, limits: Thresholds) -> bool:
-        """Whether the residual as a whole exceeds noise by a relevant amount."""
+        """Check whether the residual as a whole exceeds noise by a relevant amount."""
         whole = ExcessResidualCriteria(limits.gap_significance_level, limits.min_excess_chi2_per_dof)
         return residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
 
     def may_have_gap(self, limits: Thresholds) -> bool:
-        """Whether the residual exceeds noise as a whole or along a candidate's signature, or shifted parameters do.
+        """Check whether the residual exceeds noise (in total or along a candidate) or parameters left the baseline.
 
         A gap that parameters close by leaving the estimates of an earlier run counts only if an effect explains it.
         """
@@ -87,19 +87,19 @@ class NominalModelGapEvidence:
         return self.has_left_baseline or p_value < limits.gap_significance_level or self.exceeds_noise(limits)
 
     def are_data_sufficient(self, limits: Thresholds) -> bool:
-        """Whether the degrees of freedom suffice for the nominal model's unknowns, and a candidate is detectable."""
+        """Check whether the data suffice for the nominal model's unknowns, and whether any candidate is detectable."""
         is_seen = any(entry.is_detectable for entry in self.screening.detectability)
         enough = limits.min_samples_per_unknown * len(self.nominal_model.values)
         return is_seen and self.nominal_test.degrees_of_freedom >= enough
 
     def warrants_search(self, limits: Thresholds) -> bool:
-        """Whether there may be a gap, and the data suffice to search for its cause."""
+        """Check whether there may be a gap and the data suffice to search for its cause."""
         return self.may_have_gap(limits) and self.are_data_sufficient(limits)
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict of a diagnosis and the effects that it selects, with the statistics that support them."""
+    """The verdict of a diagnosis and the effects that it selects, with the statistics that support them."""
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
     unknown_reason: UnknownVerdictReason
@@ -111,12 +111,12 @@ class Judgement:
 
     @property
     def closure_by_selected_effects(self) -> GapClosure:
-        """Closure of the whole gap by all selected effects."""
+        """The fraction of the gap that all selected effects close together."""
         return total_gap_closure(self.selected_effects)
 
     @property
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
-        """Effects of an `effect` or `confusable` verdict, in the order added; empty for other verdicts."""
+        """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     @property
@@ -127,12 +127,12 @@ class Judgement:
 
     @property
     def failed_transfer_checks(self) -> tuple[EffectAmplitudeTransferCheck, ...]:
-        """Checks of effect parameters whose estimation and held-out recordings give different estimates."""
+        """The checks in which estimation and held-out recordings give different values of an effect parameter."""
         return tuple(entry for entry in self.transfer_checks if not entry.is_consistent)
 
     @property
     def accepted_effects_closure_by_location(self) -> dict[str, float]:
-        """Fraction of the gap that the accepted effects at each location close beyond those added before."""
+        """The fraction of the gap that accepted effects at each location close beyond the effects added before."""
         closed: dict[str, float] = {}
         most = 0.0
         for entry in self.accepted_selected_effects:
@@ -143,7 +143,7 @@ class Judgement:
 
     @property
     def selected_effect_and_equivalent_probabilities(self) -> dict[str, float]:
-        """Probability that an effect is a cause, by label, for the selected effects and their equivalents."""
+        """The probability that an effect is a cause, by label, for the selected effects and their equivalents."""
         return {
             effect.label: self.probability * share
             for entry in self.selected_effects
@@ -156,7 +156,7 @@ class Judgement:
         return max(self.explained_fraction, self.closure_by_selected_effects.ci_low)
 
     def required_total_explained_fraction(self, limits: Thresholds) -> float:
-        """Smallest explained fraction of the gap at which the selected effects are accepted.
+        """Compute the fraction of the gap that the selected effects must explain to be accepted.
 
         For k independent effects it is 1 - (1 - `min_explained_fraction`)^k: each must explain that part of the
         remainder.

@@ -1,4 +1,4 @@
-"""The library of unmodelled effects and their possible locations. A new kind is one file.
+"""The library of effects that the nominal model lacks, with their possible locations. A new kind is one file.
 
 The class of a kind states its equation, quantities, units, bounds and ranges. `docs/howto/extending.md` adds a kind.
 """
@@ -26,7 +26,7 @@ for _family in iter_modules(__path__):
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """Make an effect of the given kind at a location. `System.with_effects` adds it to a system.
+    """Create an effect of the given kind at a location. `System.with_effects` adds it to a system.
 
     Its parameters are named `kind@location.parameter`. `values` holds non-neutral values by parameter; a compliance may
     be given as its `stiffness`. Raises `ConfigError` for an unknown kind or parameter, or a value outside its bounds.
@@ -42,7 +42,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
 
 def signal_kinds_required_by_any_effect() -> frozenset[str]:
-    """Kinds of recorded signals that registered effects can require, such as `joints.effort`. Plug-ins are included."""
+    """Return the kinds of recorded signals that effects can need, such as `joints.effort`. Plug-ins are included."""
     return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
 

@@ -109,7 +109,7 @@ class _SeriesElasticity(_DistortedReading):
 
 @EFFECTS.register("backlash")
 class Backlash(_DistortedReading):
-    """Gear backlash with the encoder on the motor side: the measured angle is q + width/2 tanh(effort/`_PLAY_TORQUE`).
+    """The backlash of a gear with its encoder on the motor side, so that the measured angle depends on the effort.
 
     A position servo controls the measured angle, so its torque depends on the play z between motor and joint. For a
     joint with a servo, z is an internal coordinate that solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every
@@ -123,7 +123,7 @@ class Backlash(_DistortedReading):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Name `play` (present backlash) for a joint with a servo. Other joints have no internal coordinate."""
+        """Return the name `play` (current backlash) for a joint with a servo, and no name for other joints."""
         return ("play",) if location in system.servos else ()
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:

@@ -1,4 +1,4 @@
-"""Base class of all effects, their parameter definitions, and the locations in a system where effects can act."""
+"""Base class of all effects, definitions of their parameters, and locations where effects can act in a system."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class ParameterDefinition:
-    """Definition of one effect parameter: unit, neutral value, bounds, prior range and reported form."""
+    """The definition of an effect parameter: unit, neutral value, bounds, prior range and reported form."""
 
     name: str
     unit: str
@@ -53,18 +53,18 @@ class ParameterDefinition:
 
     @property
     def reported_name_and_unit(self) -> tuple[str, str]:
-        """Name and unit of the parameter in reports. For a compliance they are those of the stiffness."""
+        """The name and unit of the parameter in reports. For a compliance they are those of the stiffness."""
         name, _, unit = self.reported_reciprocal.partition(" ")
         return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
 
     def internal_from_reported_value(self, value: float) -> float:
-        """Convert a nonzero reported value to the internal value, which may be a reciprocal power of it."""
+        """Convert a nonzero reported value to the value used internally, for example a stiffness to a compliance."""
         return value**-self.reciprocal_power if self.reported_reciprocal else value
 
 
 @dataclass(frozen=True)
 class ReportedParameterValue:
-    """Value, standard deviation and unit of an effect's parameter in reports."""
+    """The value, standard deviation and unit of an effect parameter, as shown in reports."""
 
     value: float
     std: float
@@ -73,7 +73,7 @@ class ReportedParameterValue:
 
 @dataclass(frozen=True)
 class EffectBase(Effect):
-    """Base class of all effects. A subclass overrides the methods for what it changes."""
+    """The base class of all effects. A subclass overrides the methods for the parts of the model that it changes."""
 
     definitions: tuple[ParameterDefinition, ...] = ()  # definitions of `parameters`, scaled for the location
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
@@ -101,16 +101,16 @@ class EffectBase(Effect):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Names of the effect's own states, in addition to the joints' motion. There are none by default."""
+        """Return the names of the effect's own states, in addition to the joints' motion. Default: no states."""
         return ()
 
     @property
     def max_abs_initial_internal_coordinates(self) -> Mapping[str, float]:
-        """Largest absolute initial value of each internal coordinate whose initial value is estimated."""
+        """The largest absolute initial value of each internal coordinate whose initial value is estimated."""
         return {}
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Parameter values of a second starting point, in addition to `start`. None if one start is sufficient."""
+        """Return parameter values for a second starting point, in addition to `start`. None if one start is enough."""
         return None
 
     def __getitem__(self, parameter: str) -> ca.SX:
@@ -118,38 +118,38 @@ class EffectBase(Effect):
 
     @property
     def label(self) -> str:
-        """Label of the effect, `kind@location`."""
+        """The label of the effect, `kind@location`."""
         return f"{self.kind}@{self.location}"
 
     @property
     def neutral_values(self) -> dict[str, float]:
-        """Parameter values at which the effect vanishes, by parameter name."""
+        """The parameter values at which the effect vanishes, by parameter name."""
         return {f"{self.label}.{q.name}": q.neutral_value for q in self.definitions}
 
     @property
     def amplitude_parameter_names(self) -> tuple[str, ...]:
-        """Names of the amplitude parameters. The effect vanishes if they are neutral."""
+        """The names of the parameters that set the strength of the effect. It vanishes if they are neutral."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if not q.is_shape_parameter)
 
     @property
     def shape_parameter_names(self) -> tuple[str, ...]:
-        """Names of shape parameters, such as a relaxation time, without influence while the amplitudes are neutral."""
+        """The names of shape parameters (such as a relaxation time), which have no influence at neutral amplitudes."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
     @property
     def sticking_speed(self) -> float:
-        """Speed of the joint at `location` below which this friction can hold it with any torque up to its size."""
+        """The joint speed below which this friction can hold the joint against any torque up to the friction limit."""
         return 0.0
 
     @property
     def prior_ranges(self) -> dict[str, tuple[float, float]]:
-        """Expected low and high value of every parameter, by name, in its unit."""
+        """The lowest and highest expected value of every parameter, by name, in the parameter's unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
     def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
-        """Convert the parameters to their reported form. For example, a compliance is reported as a stiffness.
+        """Convert the parameters to the form used in reports. For example, a compliance is reported as a stiffness.
 
         Missing `values` are nominal, missing `stds` are NaN. A reported power of C, C^(-1/p), has the standard
         deviation C^(-1/p) std(C)/(p C).
@@ -175,7 +175,7 @@ EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
 def make_effect_unchecked(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
-    """Build an effect of a registered kind at a location that `make_effect` has checked."""
+    """Create an effect of a registered kind at a location that `make_effect` has already checked."""
     cls, label = EFFECTS[kind], f"{kind}@{location}"
     definitions = cls.parameter_definitions(location, system)
     names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
@@ -202,41 +202,41 @@ def make_effect_unchecked(kind: str, location: str, system: System, values: Mapp
 
 
 def flexible_segment_names(system: System) -> tuple[str, ...]:
-    """Names of the flexible segments of the object, such as branches of a cable."""
+    """Return the names of the object's flexible segments, such as the branches of a cable."""
     return tuple(segment.name for segment in system.segment_layouts)
 
 
 def object_joint_names(system: System) -> tuple[str, ...]:
-    """Names of the joints in all segments of the flexible object."""
+    """Return the names of the joints in all segments of the flexible object."""
     return tuple(joint for segment in system.segment_layouts for link in segment.link_joints for joint in link)
 
 
 def clamp_names(system: System) -> tuple[str, ...]:
-    """Names of the floating clamps. A clamp NAME has the six joints `NAME_x` to `NAME_rz`."""
+    """Return the names of all floating clamps. A clamp NAME has the six joints `NAME_x` to `NAME_rz`."""
     names = set(system.mechanism.joint_names)
     found = [name.removesuffix("_rz") for name in system.mechanism.joint_names if name.endswith("_rz")]
     return tuple(clamp for clamp in found if all(f"{clamp}_{axis}" in names for axis in _CLAMP_AXES))
 
 
 def arm_joint_names(system: System) -> tuple[str, ...]:
-    """Names of all joints except those of the object, the clamps and compliant mounts."""
+    """Return the names of all joints that belong neither to the object nor to a clamp or compliant mount."""
     clamps = {f"{clamp}_{axis}" for clamp in clamp_names(system) for axis in _CLAMP_AXES}
     other = {*object_joint_names(system), *system.joint_compliances, *clamps}
     return tuple(name for name in system.mechanism.joint_names if name not in other)
 
 
 def servo_joint_names(system: System) -> tuple[str, ...]:
-    """Names of the arm joints that have a servo."""
+    """Return the names of the arm joints that have a servo."""
     return tuple(name for name in arm_joint_names(system) if name in system.servos)
 
 
 def grasp_names(system: System) -> tuple[str, ...]:
-    """Names of all grasps, including those of clamps."""
+    """Return the names of all grasps, including the grasps of clamps."""
     return tuple(grasp.name for grasp in system.grasps)
 
 
 def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
-    """Joint names by arm. An arm is named after its grasp, else its joints' prefix (left, right), else `gripper`."""
+    """Return the joint names of each arm. Arms are named by grasp, else joint prefix (left, right), else `gripper`."""
     joints, tree = arm_joint_names(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
@@ -268,13 +268,13 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
 
 
 def effort_limit_ratio_to_baxter(system: System, joint: str) -> float:
-    """Effort limit of a joint relative to that of Baxter's joints, at least 1. It is 1 for unlimited joints."""
+    """Return a joint's effort limit divided by that of Baxter's joints, at least 1. It is 1 for unlimited joints."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
 
 
 def frame_names_at_arm_link_ends(system: System) -> tuple[str, ...]:
-    """Names of frames at the ends of the arms' links, without fixed or coincident points."""
+    """Return the names of frames at the ends of the arm links, without fixed or coincident points."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
     if not own:
@@ -296,7 +296,7 @@ def frame_names_at_arm_link_ends(system: System) -> tuple[str, ...]:
 
 
 def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
-    """Choose one frame for every arm link with mass: that of a grasp, else of a gripper, else the link's first frame.
+    """Choose one frame for every arm link with mass: at a grasp, else at a gripper, else the first frame of the link.
 
     A finger (a prismatic joint without child joints) counts as part of the link that carries it.
     """
@@ -326,7 +326,7 @@ def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def segment_name_of_frame(system: System, frame: str) -> str | None:
-    """Name of the segment that contains the frame, or None."""
+    """Return the name of the segment that contains the frame, or None."""
     index = system.mechanism.frame(frame).joint_index
     if index < 0:
         return None
@@ -335,14 +335,14 @@ def segment_name_of_frame(system: System, frame: str) -> str | None:
 
 
 def elastic_joints_of_segment(system: System, segment: str) -> tuple[ElasticJoint, ...]:
-    """The elastic joints of one segment."""
+    """Return the elastic joints of one segment."""
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
 def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
-    """Define an arm joint's parameter, neutral at zero. `upper` and `expected` are scaled by the effort limit."""
+    """Define a joint parameter that is neutral at zero. `upper` and `expected` are scaled by the effort limit."""
     prior, scale = (0.0, expected), effort_limit_ratio_to_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
@@ -350,13 +350,13 @@ def effort_limit_scaled_parameter_definition(
 def compliance_parameter_definition(
     unit: str, upper: float, prior: tuple[float, float], part: str, reported: str
 ) -> ParameterDefinition:
-    """Define the compliance parameter of `part`, 0 (rigid) to `upper`. `reported` is the unit of its reciprocal."""
+    """Define the compliance parameter of `part`, from 0 (rigid) to `upper`. `reported` is its reciprocal's unit."""
     text, said = f"compliance of the {part}", f"stiffness {reported}"
     return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 
 
 def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
-    """Generalized force (n, 1) with one nonzero entry, `value` at the joint."""
+    """Return the generalized force vector (n, 1) that is `value` at one joint and zero at all others."""
     force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force
@@ -365,7 +365,7 @@ def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.S
 def system_with_changed_bodies(
     system: System, joints: Collection[str], change: Callable[[tuple[Inertia, ...]], Iterable[Inertia]]
 ) -> System:
-    """Return the system with `change` applied to the rigid bodies of the named joints."""
+    """Return the system after `change` is applied to the rigid bodies of the named joints."""
     tree = system.mechanism
     changed = tuple(replace(j, bodies=tuple(change(j.bodies))) if j.name in joints else j for j in tree.joints)
     return replace(system, mechanism=replace(tree, joints=changed))

@@ -1,4 +1,4 @@
-"""Effects on mass, inertia, length and weight of bodies, and air drag."""
+"""Effects on the mass, inertia, length and weight of bodies, and air drag."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class _LinkMass(_ScaledBodies):
 
 
 def system_with_link_mass_factors(system: System, name: str) -> System:
-    """Return a copy with a parameter `JOINT.name` per arm link that scales the link's mass and inertia."""
+    """Return a copy with a parameter `JOINT.name` for each arm link, which scales the link's mass and inertia."""
     tree, text = system.mechanism, "mass and inertia of the link on {} over those of the URDF"
     factors = {j: Parameter(f"{j}.{name}", 1.0, "1", 0.2, 3.0, text.format(j)) for j in _joints_with_mass(system)}
     joints = tuple(
@@ -135,7 +135,7 @@ class _PointMass(EffectBase):
 
 @EFFECTS.register("payload")
 class Payload(EffectBase):
-    """Point mass fixed to a frame, with first moments m = (mx, my, mz) about the frame. A negative mass removes mass.
+    """A point mass fixed to a frame, with first moments m = (mx, my, mz) about the frame. A negative mass removes mass.
 
     Let the bodies that move with the joint have mass M, centre C, and second-moment matrix Sigma, the integral of r r'
     dm about C. The payload adds `mass`, the first moment e = s + mass (frame - C) about C, and the second moment about
@@ -162,7 +162,7 @@ class Payload(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of mass and first moments. The mass [kg] is at least -`_MAX_REMOVED_MASS_FRACTION` x link's."""
+        """Define mass and first moments of the payload. The mass is at least -`_MAX_REMOVED_MASS_FRACTION` x link's."""
         upper, expected = _bearable(system, location)
         lower = -_MAX_REMOVED_MASS_FRACTION * _carried_body(system, system.mechanism.frame(location).joint_index).mass
         far, near = (_MAX_PAYLOAD_DISTANCE * mass for mass in (upper, expected))
@@ -183,7 +183,7 @@ class Payload(EffectBase):
     def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
-        """Reported mass and limited first moments of the payload. Moments at their limit have no standard deviation."""
+        """Return the mass and limited first moments for reports. Moments at their limit have no standard deviation."""
         found = super().parameters_as_reported(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION

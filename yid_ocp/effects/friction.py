@@ -1,4 +1,4 @@
-"""Friction and springs in the joints of arms."""
+"""Effects of friction and springs in the joints of arms."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from yid_ocp.model.system import Effect, EffectStepTerms, MidpointStateSymbols, 
 
 SIGN_SMOOTHING_SPEED = 0.02
 """v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
+TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED = 1e-3
+"""v_s of joints driven by torques, which would creep by mm before they break loose with a larger one [rad/s]."""
 _LOAD_SIGN_SMOOTHING_SPEED = 0.005  # for load-dependent friction, which must hold its load at rest [rad/s]
 _SMOOTHING_TORQUE = 1e-3  # smoothing range of |torque| [N m]
 _ABS_SMOOTHING_ANGLE = 1e-7  # smoothing range of |d| in Dahl's law, angle per step [rad]
@@ -60,10 +62,19 @@ class _JointFriction(EffectBase):
 
 
 def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
-    """The effect with another smoothing speed [rad/s] if it is a joint friction and a speed is given."""
+    """Set the smoothing speed [rad/s] of a joint friction. Other effects, or all without `speed`, are unchanged."""
     if speed is None or not isinstance(effect, _JointFriction):
         return effect
     return replace(effect, sign_smoothing_speed=speed)
+
+
+def effect_as_sharp_as_nominal_friction(effect: EffectBase, system: System) -> EffectBase:
+    """Return the effect; as a joint friction, it gets the lowest smoothing speed of the frictions at its joint."""
+    if not isinstance(effect, _JointFriction):
+        return effect
+    known = (own for own in system.effects if isinstance(own, _JointFriction) and own.location == effect.location)
+    speeds = [own.sign_smoothing_speed for own in known]
+    return replace(effect, sign_smoothing_speed=min([effect.sign_smoothing_speed, *speeds]))
 
 
 @EFFECTS.register("joint_viscous")

@@ -1,4 +1,4 @@
-"""Laws: torques at a joint or segment as smooth functions of known quantities, for effects that no kind describes."""
+"""Torque laws: smooth functions of known quantities, for torques that no kind of effect describes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _SPACING_RTOL = 1e-3  # relative tolerance on equal spacing of knots in a file
 
 @dataclass(frozen=True)
 class TorqueLawTable:
-    """Torque as a function of one quantity: values and standard deviations at equally spaced knots (k,).
+    """A table of torque against one quantity, with values and standard deviations at equally spaced knots (k,).
 
     A natural cubic spline interpolates the values. Beyond the knots the torque is constant.
     """
@@ -48,14 +48,14 @@ class TorqueLawTable:
     torque_std: Array  # [N m]; NaN where it is not known
 
     def interpolated_torque(self, x: Array) -> Array:
-        """Torque (m,) [N m] at the values `x` of the quantity."""
+        """Interpolate the torque (m,) [N m] at the values `x` of the quantity."""
         spline = scipy.interpolate.CubicSpline(self.knots, self.torque, bc_type="natural")
         return np.asarray(spline(np.clip(x, self.knots[0], self.knots[-1])), float)
 
 
 @dataclass(frozen=True)
 class TorqueLaw(base.EffectBase):
-    """Torque as a smooth function F = f(x) on an arm joint, or on every joint that bends a segment.
+    """A torque that is a smooth function F = f(x), on an arm joint or on every joint that bends a segment.
 
     x is the joint's own angle, speed, load or command, or the time since the start of the recording (an internal
     coordinate s with ds/dt = 1). f is a natural cubic spline whose parameters are its values at equally spaced knots,
@@ -71,18 +71,18 @@ class TorqueLaw(base.EffectBase):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Quantities on which the torque depends."""
+        """The quantities on which the torque depends."""
         return tuple(self.knots or ())
 
     def restricted_to_quantities(self, quantities: Sequence[str]) -> TorqueLaw:
-        """Return a copy of the law for some of its quantities, without the parameters of the other quantities."""
+        """Return a copy of the law for only the given quantities, without the parameters of other quantities."""
         kept = {name: own for name, own in (self.knots or {}).items() if name in quantities}
         definitions = [d for d in self.definitions if d.name.rstrip("0123456789") in kept]
         entries = Parameters(self.parameters[f"{self.label}.{d.name}"] for d in definitions)
         return replace(self, parameters=entries, definitions=tuple(definitions), knots=kept)
 
     def knot_parameter_names(self, quantity: str) -> tuple[str, ...]:
-        """Names of the parameters at the knots of one quantity."""
+        """Return the names of the parameters at the knots of one quantity."""
         return tuple(f"{self.label}.{quantity}{k}" for k in range(len((self.knots or {})[quantity])))
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
@@ -152,7 +152,7 @@ def _quantity(quantity: str, state: MidpointStateSymbols, label: str, index: int
 
 
 def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[str, ...]:
-    """Quantities on which a law at a location may depend, empty if no law is possible.
+    """Return the quantities on which a law at a location may depend. Empty if no law is possible.
 
     `load` needs a driven joint, `command` a servo.
     """
@@ -167,7 +167,7 @@ def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[st
 def torque_law_argument_along_rollout(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
-    """Values (N, joints) of `quantity`, such as speed or load, at the midpoints of the N steps of a rollout.
+    """Compute `quantity` (N, joints), such as speed or load, at the midpoints of the N steps of a rollout.
 
     Columns are the joints of `location`. A command is NaN while the motor is off. `nodes` holds `state` (N + 1, nx),
     `torque` (N, nu), the constraint `multipliers` (N, m) and the `time_step` [s] as an array.
@@ -203,7 +203,7 @@ def torque_law_argument_along_rollout(
 def torque_law_from_tables(
     location: str, system: System, tables: Sequence[TorqueLawTable], torque_scale: float = math.inf
 ) -> TorqueLaw:
-    """Make a law at a joint or segment from its tables. `torque_scale` is the expected size of its torque [N m].
+    """Create a law at a joint or segment from its tables. `torque_scale` is the expected size of its torque [N m].
 
     Raises `ConfigError` if the location allows no law, or no law of these quantities.
     """
@@ -265,7 +265,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
 
 
 def torque_law_tables_csv(tables: Sequence[TorqueLawTable]) -> str:
-    """Return a law's tables as CSV text, which `read_torque_law_tables` reads."""
+    """Convert the tables of a law to CSV text, which `read_torque_law_tables` reads."""
     lines = [",".join(_TABLE_COLUMNS)]
     for table in tables:
         unit = TORQUE_LAW_QUANTITY_UNITS[table.quantity]

@@ -1,4 +1,4 @@
-"""Compliant mounts and junctions of the object, and displaced, compliant or slipping grasps."""
+"""Effects of compliant mounts and junctions of the object, and of displaced, compliant or slipping grasps."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Export of models, equations and signals."""
+"""Export of models, equations and signals to files of other tools."""

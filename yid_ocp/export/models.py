@@ -1,4 +1,4 @@
-"""Export of a system's tree as URDF or SDF, and of which parameters and effects a format can express."""
+"""Export of a system as URDF or SDF, with a list of the parameters and effects that a format can express."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
 
 
 def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
-    """Convert a system to an SDF 1.10 world. Joints have springs, damping and friction. Grasps are omitted."""
+    """Convert a system to an SDF 1.10 world with springs, damping and friction in the joints. Grasps are omitted."""
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
@@ -116,14 +116,14 @@ def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class FeatureExportSupport:
-    """How an export format expresses a parameter or effect: the element that holds it, or the obstacle."""
+    """The support of an export format for a parameter or effect: the element that holds it, or the obstacle."""
 
     status: _SupportStatus
     how: str
 
     @property
     def loses_motion_or_force(self) -> bool:
-        """Whether the format omits a feature that changes motion or forces. Effects on sensors alone do not count."""
+        """True if the format omits a feature that changes motion or forces. Effects on sensors alone do not count."""
         return self.status == "not representable" and self != _READING
 
 
@@ -150,7 +150,7 @@ _UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
 
 
 def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
-    """Support of the export format `form` (`mjcf`, `urdf` or `sdf`) for each effect of a system."""
+    """Return how well the export format `form` (`mjcf`, `urdf` or `sdf`) supports each effect of a system."""
     value, found = mjcf.ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
@@ -167,7 +167,7 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
 def support_in_export_format_by_parameter(
     system: System, effects: Mapping[str, FeatureExportSupport], form: str
 ) -> dict[str, FeatureExportSupport]:
-    """Whether the format `form` can hold each parameter. Parameters of an effect have its support in `effects`."""
+    """Return how well the format `form` supports each parameter. Parameters of effects share the entry in `effects`."""
     found = {}
     for entry in system.parameters:
         owner = entry.name.rpartition(".")[0]

@@ -30,7 +30,7 @@ _WORLD_FRAME = "world"
 
 @dataclass(frozen=True)
 class RosTopicTimeSeries:
-    """Time series of one ROS topic at times t (M,) [s]. A time without any finite value gets no message.
+    """The time series of one ROS topic at the times t (M,) [s]. A time without any finite value gets no message.
 
     `values` holds `position`, `velocity` and `effort` of joints, each (M, len(names)), or, for any other kind, `xyz`
     (M, 3), which are the forces of a wrench.
@@ -83,7 +83,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
 
 
 def ros_signals_from_recording(recording: Recording) -> list[RosTopicTimeSeries]:
-    """Convert a recording to `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
+    """Convert a recording to ROS topics `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/...`."""
     found: list[RosTopicTimeSeries] = []
     for group in recording.joint_and_point_groups:
         if isinstance(group, JointGroup):
@@ -127,7 +127,7 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
 
 
 def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write each group as a table `<group>.csv`, with all digits and the column names that `read_csv` reads.
+    """Write each group of a recording as a table `<group>.csv` with all digits, which `read_csv` can read.
 
     The tables omit standard deviations, the kind of effort, sensor, frame, pose and clock. The cells of an unseen point
     are empty. Returns the files, joints first. Raises `OutputError` if the folder or a file cannot be written.
@@ -153,7 +153,7 @@ def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[s
 def joint_trajectory_message(
     names: Sequence[str], t: Array, position: Array, velocity: Array, acceleration: Array, effort: Array
 ) -> dict[str, Any]:
-    """Build a ROS trajectory_msgs/JointTrajectory message of nj joints as a dict.
+    """Build a ROS trajectory_msgs/JointTrajectory message for nj joints, as a dictionary.
 
     Times t (N,) [s] count from the start; the other arrays are (N, nj). See
     https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html

@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 @dataclass(frozen=True)
 class StateTransition:
-    """Linear state transition of a filter: s' = M (s, sum of the parameter groups p_i), p' = f p."""
+    """The linear transition of a filter's state in one step: s' = M (s, sum of parameter groups p_i), p' = f p."""
 
     state_rows: Array  # M, shape (ns, ns + m)
     decay: Array  # f, shape (nx - ns,), nx - ns = g m
@@ -39,7 +39,7 @@ class StateTransition:
         return len(self.decay) // m if m else 0, m
 
     def propagate_state(self, columns: Array) -> Array:
-        """Propagate states, the columns of an (nx, c) array, over the step."""
+        """Propagate states over the step. Each column of the (nx, c) array is one state."""
         ns, own = len(self.state_rows), columns[len(self.state_rows) :]
         if self._shape[0] != 1:
             columns = np.vstack([columns[:ns], own.reshape(*self._shape, own.shape[1]).sum(axis=0)])
@@ -55,7 +55,7 @@ class StateTransition:
 
 @dataclass(frozen=True)
 class KalmanStepMatrices:
-    """One step of a linear Kalman filter with fixed gains. A measurement update precedes a state transition.
+    """The matrices of one Kalman filter step with fixed gains. A measurement update precedes a state transition.
 
     The state x = (s, p) consists of dynamic states s and parameters p. It is measured by y = H x + e, where the noise e
     has unit covariance, and becomes x' = (M x, f p) + process noise, with the transition M and the decay f. P is the
@@ -69,12 +69,12 @@ class KalmanStepMatrices:
     transition: StateTransition
 
     def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
-        """Normalized innovations of `measured` (r, c), and the state means (nx, c) after the step."""
+        """Compute the normalized innovations of `measured` (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
-        """Step backwards through one filter step: smoothed measurement noise (r, c) and the costate before it (nx, c).
+        """Compute smoothed measurement noise (r, c) and the costate (nx, c) before the step, backwards in time.
 
         `white` are the normalized innovations and `costate` is the costate after the step. The smoothed state is the
         filter's prediction + P costate, with the covariance P.
@@ -84,7 +84,7 @@ class KalmanStepMatrices:
         return noise, pulled + self.observation.T @ noise
 
     def costate_covariance_before_step(self, information: Array) -> Array:
-        """Covariance of the costate before the step (nx, nx), from the one after the step, `information`."""
+        """Compute the costate covariance (nx, nx) before the step from its value `information` after the step."""
         shaped, projected = self.whitening @ self.observation, self.projected_covariance
         pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
         pulled -= (pulled @ projected.T) @ shaped
@@ -95,7 +95,7 @@ class KalmanStepMatrices:
 def kalman_matrices_and_next_covariance(
     covariance: Array, observation: Array, transition: StateTransition
 ) -> tuple[KalmanStepMatrices, Array, float]:
-    """Compute a filter step's gains, the next state covariance without process noise, and log det S.
+    """Compute the gains of a filter step, the next state covariance without process noise, and log det S.
 
     `covariance` is P (nx, nx) before the measurement, `observation` is H (r, nx), and S = I + H P H' is the covariance
     of the innovation. If rounding makes S indefinite, only its diagonal is used, and log det S is returned as infinity.
@@ -121,7 +121,7 @@ def _library() -> ctypes.CDLL | None:
 
 @dataclass(frozen=True)
 class FixedGainKalmanFilter:
-    """Successive steps of a linear Kalman filter with fixed gains, in compiled code if possible.
+    """A sequence of steps of a linear Kalman filter with fixed gains, in compiled code if possible.
 
     The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`.
     """
@@ -155,7 +155,7 @@ class FixedGainKalmanFilter:
     def normalized_innovations_and_next_mean(
         self, mean: Array, measured: Array, shift: Array, push: Array | None = None, keep_means: bool = False
     ) -> tuple[Array, Array, Array | None]:
-        """Filter all steps: normalized innovations (r, c) and final means (nx, c).
+        """Filter all steps, and return the normalized innovations (r, c) and the final state means (nx, c).
 
         With `keep_means`, the means before each step (k, nx, c) are returned too. `mean` is the mean before all steps,
         `measured` (r, c) the measurements. `push` (k, m, c) is added to the parameters during a step's transition.
@@ -175,7 +175,7 @@ class FixedGainKalmanFilter:
         return white, mean, np.array(before) if keep_means else None
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
-        """Smooth all steps: measurement noise (r, c), first costates (nx, c), and costates after each step (k, nx, c).
+        """Smooth all steps; return the noise (r, c), first costates (nx, c), and costates after each step (k, nx, c).
 
         `white` are the normalized innovations, `costate` is the costate after the last step.
         """
@@ -217,7 +217,7 @@ def kalman_steps_and_covariance(
     decay: Array,
     variance: Array,
 ) -> tuple[FixedGainKalmanFilter, Array]:
-    """Compute k successive Kalman filter steps. Returns them and the state covariance (nx, nx) after the last step.
+    """Compute k successive steps of a Kalman filter. Returns them and the state covariance (nx, nx) after the last.
 
     The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states.
     `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `FixedGainKalmanFilter`.

@@ -1,4 +1,4 @@
-"""Linear model of a residual along a trajectory, with bounded steps and predicted cost reductions."""
+"""A linear model of the residual along a trajectory, with bounded steps and predicted cost reductions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from yid_ocp.problem.model_functions import ModelFunctions, NodeStateValues
 
 @dataclass(frozen=True)
 class NominalTrajectory:
-    """Trajectory of an episode with its measurements, about which the residual is linearized.
+    """The trajectory of a recording about which the residual is linearized, with the measurements.
 
     Measurements are shifted by their delays to the times at which they were true. `initial_state_by_angles` and
     `initial_state_by_torque` (nx, nu) are derivatives of the initial state with respect to the driven joints' first
@@ -43,7 +43,7 @@ class NominalTrajectory:
 def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
-    """Make an episode's nominal trajectory from its prediction at the parameters `theta`."""
+    """Create the nominal trajectory of a recording from its prediction at the parameters `theta`."""
     own = predictor.theta_with_episode_values(episode, theta)
     rest = result.equilibrium
     sizes = predictor.integrator_step.sizes
@@ -57,7 +57,7 @@ def nominal_trajectory_from_prediction(
 
 @dataclass(frozen=True)
 class ResidualDerivativesByStateAndEffort:
-    """Derivatives of r residuals with respect to states and efforts at the nodes around each sample.
+    """The derivatives of r residuals with respect to the states and efforts at the nodes around each sample.
 
     Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
     """
@@ -70,7 +70,7 @@ class ResidualDerivativesByStateAndEffort:
     def from_nominal_trajectory(
         trajectory: NominalTrajectory, *, with_neighbours: bool = False
     ) -> ResidualDerivativesByStateAndEffort:
-        """Compute residual derivatives from the sensors' derivatives along a nominal trajectory.
+        """Compute the residual derivatives from the derivatives of the sensors along a nominal trajectory.
 
         `with_neighbours` is required for a sensor of velocities, accelerations or constraint forces, which depends on
         four nodes (the first one is before the sample's node). Raises `DataError` without it.
@@ -122,19 +122,19 @@ class ResidualDerivativesByStateAndEffort:
 
     @property
     def visible_state_mask(self) -> BoolArray:
-        """Mask of the states on which at least one residual depends, shape (nx,)."""
+        """A mask of the states on which at least one residual depends, shape (nx,)."""
         return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
     def select_states(self, kept: IntArray) -> ResidualDerivativesByStateAndEffort:
-        """Return a copy with the derivatives with respect to the states at the indices `kept`."""
+        """Return a copy with only the derivatives with respect to the states at the indices `kept`."""
         return replace(self, by_state=self.by_state[:, :, kept])
 
     def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesByStateAndEffort:
-        """Return a copy with the derivatives of the residuals at the indices `rows`."""
+        """Return a copy with only the derivatives of the residuals at the indices `rows`."""
         return ResidualDerivativesByStateAndEffort(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Residual derivatives (r, d) along d directions, from the derivatives of states and efforts at K nodes.
+        """Compute residual derivatives (r, d) along d directions from derivatives of states and efforts at K nodes.
 
         `by_node` (K, nx, d) holds the derivatives of the states, `effort` (K, nc, d) the derivatives of the efforts.
         The K nodes begin with node `first`. A residual beyond them uses the last node.
@@ -149,7 +149,7 @@ class ResidualDerivativesByStateAndEffort:
         return found
 
     def residual_indices_by_first_node(self, last: int) -> list[IntArray]:
-        """Indices of the residuals by their first node, one array for each node from 0 to `last`."""
+        """Group the residual indices by their first node, with one array for each node from 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
@@ -162,7 +162,7 @@ _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 def residual_and_jacobian_without_weak_priors(
     problem: EstimationProblem, evaluation: Evaluation
 ) -> tuple[Array, Array]:
-    """Noise-scaled residual (r,) and Jacobian (r, nx) of the data and stated priors, without weak priors."""
+    """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
     units = np.ones(len(evaluation.residual))
@@ -172,7 +172,7 @@ def residual_and_jacobian_without_weak_priors(
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
-    """Minimise |J d + r|^2 + mu c |d|^2 over lower <= d <= upper; c is the largest squared column norm of J."""
+    """Find the d in [lower, upper] that minimises |J d + r|^2 + mu c |d|^2. c is J's largest squared column norm."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
     small = np.zeros((count + 1, count + 1))
@@ -192,19 +192,19 @@ def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float
 
 
 def predicted_cost_reduction_by_step(jacobian: Array, residual: Array, step: Array) -> float:
-    """Reduction of the cost 1/2 |r|^2 that the linear model predicts for a step."""
+    """Compute the reduction of the cost 1/2 |r|^2 that the linear model predicts for a step."""
     return -float((jacobian.T @ residual) @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
 
 
 def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
-    """Whether no step from `x` predicts a relevant cost reduction. Returns False without a Jacobian."""
+    """Check whether no step from `x` promises a relevant cost reduction. Returns False without a Jacobian."""
     noise = problem.stated_rms_noise_of_data_residuals**2
     worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * noise)
     return achievable_cost_reduction(problem, x, evaluation) <= worth
 
 
 def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
-    """Predicted cost reduction of the best step within the unknowns' sizes. It is infinite without a Jacobian."""
+    """Predict the largest cost reduction if no unknown moves by more than its size. Infinite without a Jacobian."""
     if evaluation.jacobian is None:
         return math.inf
     if not len(x):
@@ -216,7 +216,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def size_limited_damped_step(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Solve for the damped least-squares step (nx,) in which an unknown moves by at most its value or typical size."""
+    """Compute the damped least-squares step (nx,) in which no unknown moves by more than its value or typical size."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
@@ -224,12 +224,12 @@ def size_limited_damped_step(
 
 
 def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
-    """Infinity norm of the scaled gradient, without components that push against an active bound."""
+    """Return the largest absolute entry of the scaled gradient, except entries that push against an active bound."""
     free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))
 
 
 def step_norm_in_stds(evaluation: Evaluation | None, moved: Array) -> float:
-    """Norm |J d| of a move d of the unknowns (nx,), which bounds all |d_i| / std_i; infinite without a Jacobian."""
+    """Compute the norm |J d| of a step d (nx,), which bounds all |d_i| / std_i. It is infinite without a Jacobian."""
     slopes = evaluation.jacobian if evaluation is not None and evaluation.ok else None
     return math.inf if slopes is None else float(np.linalg.norm(slopes @ moved))

@@ -1,4 +1,4 @@
-"""Null test of whether noise alone explains a residual.
+"""Null test, which decides whether noise alone explains a residual.
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
 (white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2). A chi-squared variable
@@ -32,7 +32,7 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 @dataclass(frozen=True)
 class ChannelResidualIndices:
-    """Sample times of one scalar sensor output, and the samples' indices in the residual vector."""
+    """The sample times of one scalar sensor output, and the indices of its samples in the residual vector."""
 
     recording: str
     channel: str
@@ -45,7 +45,7 @@ class ChannelResidualIndices:
 
 @dataclass(frozen=True)
 class AssumedChannelNoiseLevel:
-    """Noise standard deviation that a problem assumes for one channel, the median over its samples."""
+    """The noise standard deviation that a problem assumes for one channel (the median over its samples)."""
 
     channel: str
     unit: str
@@ -54,7 +54,7 @@ class AssumedChannelNoiseLevel:
 
     @property
     def noise_rmse(self) -> float:
-        """Root mean square error from noise alone. For points it is that of a distance."""
+        """The root mean square error that noise alone causes. For points it is that of a distance."""
         return math.sqrt(self.outputs_per_channel) * self.noise_std
 
 
@@ -71,7 +71,7 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """Result of a null test: chi2 per degree of freedom, p-value, chi2 of channels and tests of time windows."""
+    """The result of a null test: chi2 per degree of freedom, p-value, chi2 by channel and tests of time windows."""
 
     chi2_per_dof: float
     degrees_of_freedom: float  # effective ones, of autocorrelated noise
@@ -81,7 +81,7 @@ class NullTestResult:
 
 
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
-    """Noise level that the problem assumes for each channel. It is a stated value, not an estimate."""
+    """Return the noise level that the problem assumes for each channel. It is a stated value, not an estimate."""
     found: dict[str, list[Array]] = {}
     told: dict[str, tuple[str, int]] = {}
     for episode in problem.episodes:
@@ -101,7 +101,7 @@ def _variance_inflation(autocorrelation: Array) -> float:
 
 
 def chi2_p_value(chi2: float, degrees: float) -> float:
-    """Probability that noise alone gives at least `chi2`. It is 1 for zero degrees of freedom."""
+    """Compute the probability that noise alone gives at least `chi2`. It is 1 for zero degrees of freedom."""
     return float(scipy.special.chdtrc(degrees, max(chi2, 0.0))) if degrees else 1.0
 
 
@@ -112,7 +112,7 @@ def residual_chi2_null_test(
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
-    """Test whether a whitened residual (nr,) is noise alone after a fit of `parameters` parameters.
+    """Test whether a whitened residual (nr,) is only noise after a fit with `parameters` parameters.
 
     Rows that belong to no series (priors) are ignored, and so are parameters that their priors determine. `level` is
     the false-discovery rate over time windows of length `window` [s].
@@ -131,7 +131,7 @@ def residual_chi2_null_test(
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Whiten a residual r (nr,), given in noise units, against further independent errors: (I + F F')^(-1/2) r.
+    """Include further independent errors in a whitened residual r (nr,), and return (I + F F')^(-1/2) r.
 
     Column j of F (nr, k), the argument `spread`, is the change of the residual for one standard deviation of error j.
     Columns that are not finite are ignored.
@@ -143,7 +143,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
 def encoder_noise_residual_covariance_factor(
     problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
 ) -> Array:
-    """Factor F (nr, K) of the covariance F F' that encoder noise of prescribed arms adds to residuals.
+    """Compute a factor F (nr, K) of the covariance F F' that encoder noise of prescribed arms adds to residuals.
 
     F F' is the covariance that this noise adds. A lightly damped object rings with it, which is neither white nor an
     error of the model. `predicted` returns the residual of a problem with redrawn episodes, None where it fails; by
@@ -170,7 +170,7 @@ def encoder_noise_residual_covariance_factor(
 
 
 def episodes_with_added_path_noise(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
-    """Episodes moved by their recorded angles with one more draw of their encoders' noise. Measurements stay."""
+    """Return recordings whose measured motion has one more random draw of encoder noise. Measurements stay."""
     return [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
 
 
@@ -193,13 +193,13 @@ def _with_path_noise_redrawn(episode: Episode, problem: EstimationProblem, rng: 
 def residuals_exceed_noise(
     tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
 ) -> bool:
-    """Whether one model's residuals exceed noise by a significant and relevant amount, in at least one of `tests`."""
+    """Check whether the residuals of a model exceed noise by a significant and relevant amount, in any of `tests`."""
     significant = bonferroni_corrected_min_test_p_value(tests) < limits.significance_level
     return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2_per_dof
 
 
 def bonferroni_corrected_min_test_p_value(tests: Sequence[NullTestResult]) -> float:
-    """Bonferroni-corrected smallest p-value of several tests."""
+    """Return the smallest p-value of several tests after Bonferroni correction."""
     return min(1.0, len(tests) * min(test.p_value for test in tests))
 
 
@@ -240,12 +240,12 @@ def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: floa
 
 
 def times_since_recording_start(episode: Episode, samples: SensorMeasurements) -> Array:
-    """Sample times since the start of the recording, shape (M,) [s]."""
+    """Return the sample times since the start of the recording, shape (M,) [s]."""
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
 def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelResidualIndices, ...]:
-    """Sample times and residual indices of every scalar sensor output of every recording."""
+    """Return the sample times and residual indices of every scalar sensor output of every recording."""
     series: list[ChannelResidualIndices] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):

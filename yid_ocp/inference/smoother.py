@@ -1,4 +1,4 @@
-"""Weak-constraint smoother that finds unknown forces, grasp offsets and sensor biases behind a residual.
+"""A weak-constraint smoother that finds the unknown forces, grasp offsets and sensor biases behind a residual.
 
 The unknowns of `smoother_model` change from interval to interval by
 
@@ -54,7 +54,7 @@ _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promisin
 
 @dataclass(frozen=True)
 class SmoothedDisturbances:
-    """Smoothed unknown forces, offsets and biases of one recording, with mean and standard deviation per interval."""
+    """The smoothed forces, offsets and biases of one recording, with mean and standard deviation in each interval."""
 
     recording: str
     interval_edges: Array  # shape (J + 1,) [s]
@@ -67,7 +67,7 @@ class SmoothedDisturbances:
 
 @dataclass(frozen=True)
 class SmoothedUnknownsResult:
-    """Result of the weak-constraint smoother: smoothed unknowns and the evidence for each group."""
+    """The result of the weak-constraint smoother: smoothed unknowns, and the evidence for each group of them."""
 
     smoothed_unknowns: tuple[SmoothedDisturbances, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # variance at the largest evidence [squared reference]
@@ -85,13 +85,13 @@ class SmoothedUnknownsResult:
 
     @property
     def explainable_gap_fraction(self) -> float:
-        """Fraction of the gap that the smoothed unknowns can explain. The gap is G = max(0, chi2/n - 1)."""
+        """The fraction of the gap that the smoothed unknowns can explain. The gap is G = max(0, chi2/n - 1)."""
         gap = self.chi2_before / self.dof_before - 1
         return float(np.clip(1 - max(self.chi2_after / self.dof_after - 1, 0.0) / gap, 0.0, 1.0)) if gap > 0 else 0.0
 
     @property
     def plant_or_sensor_origin(self) -> str:
-        """Origin of the gap in plant or sensor: "none", "plant", "sensor", "both" or "either" (confounded)."""
+        """The origin of the gap: "none", "plant", "sensor", "both", or "either" if the data cannot distinguish them."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
         heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
@@ -338,7 +338,7 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
 def select_and_smooth_unknowns(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float = DEFAULT_MIN_LOG_BAYES_FACTOR
 ) -> SmoothedUnknownsResult:
-    """Select groups of unknown forces, offsets and biases by log evidence at a fit `x`, and estimate them.
+    """Select groups of unknown forces, offsets and biases that raise the log evidence at a fit `x`, and estimate them.
 
     `least` is the smallest rise of the log evidence for which a group is selected (5: odds of 150 to 1).
     """
@@ -371,7 +371,7 @@ def select_and_smooth_unknowns(
 def force_log_likelihood_coefficients(
     model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
-    """Log likelihood g'f - f'L f / 2 of the values f (J,) of one unknown in J intervals: returns g (J,) and L (J, J).
+    """Return g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2 of one unknown with values f in J intervals.
 
     `unknown` is the index of the unknown; f is in units of the unknown's reference standard deviation. Free parameters,
     states and all other unknowns are integrated out; `variance` gives the variances of their groups [squared
@@ -444,7 +444,7 @@ _MAX_NAMED_LOCATIONS = 3  # largest number of named locations
 
 @dataclass(frozen=True)
 class GapLocation:
-    """A location in the model or sensors: share of the gap, observability, and time windows of the gap."""
+    """A location of the gap in the model or a sensor, with its share of the gap, observability and time windows."""
 
     location: str
     gap_share: float  # share of the locatable gap; all shares sum to one
@@ -454,7 +454,7 @@ class GapLocation:
 
 
 def select_largest_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
-    """Select the first three locations of `where` with over 10 % of the gap, or only the first if none has."""
+    """Select the first three locations with more than 10 % of the gap, or only the first location if there are none."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
 
@@ -485,7 +485,7 @@ def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tupl
 
 
 def smoothed_unknown_significance_mask(trace: SmoothedDisturbances, columns: Sequence[int]) -> BoolArray:
-    """Mask (J, columns) of the unknowns of `trace` that are more than `SIGNIFICANT_Z` stds from zero."""
+    """Return a mask (J, columns) of the unknowns in `trace` over `SIGNIFICANT_Z` standard deviations from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > SIGNIFICANT_Z * std)
 
@@ -518,7 +518,7 @@ def gap_locations_from_effects_and_smoother(
     rest: Sequence[GapLocation],
     windows: tuple[tuple[float, float], ...],
 ) -> tuple[GapLocation, ...]:
-    """Assign the gap parts that effects close to the effects' locations, and the rest by smoother shares.
+    """Assign the part of the gap that effects close to their locations, and the rest by the smoother's shares.
 
     `before` holds the locations found for the nominal model, `rest` those for the model with the effects. `closed` is
     the part of the gap that the effects at each location close. `windows` are the time windows of locations at which
@@ -544,7 +544,7 @@ def gap_locations_from_effects_and_smoother(
 def z_scores_of_smoothed_unknowns(
     smoothed: SmoothedUnknownsResult, recording: int = 0
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Return the z scores (J, nd) of nd smoothed unknowns in J intervals: posterior mean over standard deviation.
+    """Compute the z scores (J, nd) of nd smoothed unknowns in J intervals, posterior mean over standard deviation.
 
     The result is the interval edges (J + 1,) [s], the names of the unknowns, and the scores. A score is NaN if the data
     reduced the variance of the unknown by half or less.
@@ -558,13 +558,13 @@ def z_scores_of_smoothed_unknowns(
 
 
 def smoothed_unknown_units(system: System, trace: SmoothedDisturbances) -> tuple[str, ...]:
-    """SI unit of every smoothed unknown in `trace`: of a force, torque, push, grasp offset or sensor bias."""
+    """Return the SI unit of each smoothed unknown in `trace`: a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}
     return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
 
 
 def generalised_force_unit(system: System, coordinate: str) -> str:
-    """SI unit of the generalised force at a coordinate: N for a prismatic joint, else N m."""
+    """Return the SI unit of the generalised force at a coordinate: N for a prismatic joint, else N m."""
     kinds = {joint.name: joint.kind for joint in system.mechanism.joints}
     return "N" if kinds.get(coordinate) == "prismatic" else "N m"

@@ -1,4 +1,4 @@
-"""Linear model of a recording's residual under unknown forces, grasp offsets and sensor biases.
+"""A linear model of how unknown forces, grasp offsets and sensor biases change the residual of a recording.
 
 The residual is linearised about the rollout of a fitted model. Every DEL row gets an unknown generalized force, every
 grasp an unknown offset, and every output of a point sensor an unknown bias. Every segment gets an unknown push, a force
@@ -54,7 +54,7 @@ _FORCE_POINT = "75%"  # point of the push by arc length: a compromise of tip and
 
 @dataclass(frozen=True)
 class SmoothedUnknownGroup:
-    """Group of unknown forces, offsets or biases with the same location and standard deviation."""
+    """A group of unknown forces, offsets or biases that have the same location and standard deviation."""
 
     location: str
     kind: _UnknownKind
@@ -148,7 +148,7 @@ def _unknown_forces(course: _LinearizedEpisode) -> tuple[list[str], list[Smoothe
 
 
 def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str:
-    """Location of a sensor's bias: `camera`, `wrist:FRAME`, the grasp that holds the frame, or the sensor's group."""
+    """Return the location of a sensor's bias: `camera`, `wrist:FRAME`, the frame's grasp, or the sensor's group."""
     if sensor.camera_pose is not None:
         return "camera"
     if isinstance(sensor, MountedSensor):
@@ -220,7 +220,7 @@ class _IntervalModel:
 
 @dataclass(frozen=True)
 class LinearResidualModel:
-    """Linear state-space model of one recording's residual, with one set of matrices per time interval."""
+    """A linear state-space model of one recording's residual, with one set of matrices for each time interval."""
 
     recording: str
     intervals: tuple[_IntervalModel, ...]
@@ -234,7 +234,7 @@ class LinearResidualModel:
     torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
 
     def prior_variances_of_unknowns(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
-        """Prior variances (nd,) of the unknowns in `reference_std`^2: group variance plus torque noise."""
+        """Compute prior variances (nd,) of the unknowns in `reference_std`^2, as group variance plus torque noise."""
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 

@@ -44,7 +44,7 @@ _MIN_PRIOR_SHARE = 0.5  # of the largest deviation from a prior [stds], from whi
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """Result of the null test of a fit on its own recordings: whether the model explains them."""
+    """The result of a null test that tells whether a model explains the recordings to which it was fitted."""
 
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
@@ -54,7 +54,7 @@ class GoodnessOfFit:
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """Estimate of one parameter: value, standard deviation, bounds and verdict.
+    """The estimate of one parameter, with value, standard deviation, bounds and verdict.
 
     The 95 % `interval` is given if the standard deviation does not describe the uncertainty: at a bound, where it is
     one-sided, and for a cost that is not quadratic, where it is a profile-likelihood interval. None is an open end.
@@ -72,7 +72,7 @@ class ParameterEstimate:
 
     @property
     def confidence_interval_ends(self) -> tuple[float, float]:
-        """Ends of the 95 % interval, infinite if open. Without a stated interval they are value ± 1.96 std."""
+        """The ends of the 95 % interval, infinite if open. Without a stated interval they are value ± 1.96 std."""
         if self.interval is None:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
@@ -81,7 +81,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class EstimateShiftByLinksAndTimeStep:
-    """Shift of one estimate if the number of links is doubled, or if the time step is halved. None if not computed."""
+    """The change of an estimate if the number of links is doubled or the time step halved. None if not computed."""
 
     links: float | None = None
     time_step: float | None = None
@@ -92,7 +92,7 @@ def assess_goodness_of_fit(
     evaluation: Evaluation,
     limits: ExcessResidualCriteria = null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> GoodnessOfFit:
-    """Test a fit on its own recordings. Residuals are in noise units for any weighting of the problem."""
+    """Test whether a fit explains its own recordings. Residuals are in noise units for any weighting of the problem."""
     if not evaluation.ok:
         return GoodnessOfFit(math.nan, math.nan, False)
     residual = evaluation.residual
@@ -110,7 +110,7 @@ def assess_goodness_of_fit(
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
-    """Covariance of the unknowns (nx, nx) from data and stated priors, and chi2 per degree of freedom.
+    """Compute the covariance (nx, nx) of the unknowns from data and stated priors, and chi2 per degree of freedom.
 
     A direction without information gets the std 1e8 x the unknown's scale. The covariance is scaled by max(1, chi2);
     a prior counts at least with its stated std, also if stated ones were scaled down (`stated_std_factor` below 1).
@@ -125,7 +125,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 
 
 def noise_only_covariance_sqrt(problem: EstimationProblem, evaluation: Evaluation) -> Array:
-    """Factor F (nx, nx) of the covariance F F' from noise alone; F F' itself loses digits in uninformed directions."""
+    """Compute a factor F (nx, nx) of the covariance F F' from noise alone. F F' loses digits in weak directions."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
     _, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
@@ -136,7 +136,7 @@ def noise_only_covariance_sqrt(problem: EstimationProblem, evaluation: Evaluatio
 
 
 def effective_parameter_count(problem: EstimationProblem, evaluation: Evaluation) -> float:
-    """Number of unknowns that the data determine, without the part that stated priors determine (MacKay 1992).
+    """Count the unknowns that the data determine, without the part that stated priors determine (MacKay 1992).
 
     It is n - trace(P (J'J)^-1 P') for n unknowns and the Jacobians P of the stated priors and J of data and priors.
     """
@@ -226,7 +226,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
 
 
 def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
-    """Covariance of the unknowns at a fit, (nx, nx). It includes the misfit if the model does not explain the data."""
+    """Compute the covariance (nx, nx) of unknowns at a fit, with the misfit if the model does not explain the data."""
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, evaluation)
     return covariance if fit.explains else _misfit_sandwich_covariance(problem, evaluation, covariance)
 
@@ -263,7 +263,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
 
 
 def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
-    """Names of the unknowns that are parameters, not initial states. Local ones include the recording's name."""
+    """List the unknowns that are parameters, not initial states. Local parameters include the recording's name."""
     parameters = {*problem.shared_parameters, *problem.local_parameters}
     return tuple(name for name in problem.unknown_names if name.split("[")[0] in parameters)
 
@@ -288,7 +288,7 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
 
 
 def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
-    """Cost of data (in noise units) and stated priors, without weak priors."""
+    """Compute the cost of the data (in noise units) and of the stated priors, without weak priors."""
     rows = problem.residual_rows
     weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
     return (evaluation.cost - weak - stated) / problem.stated_rms_noise_of_data_residuals**2 + stated
@@ -328,7 +328,7 @@ def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str
 
 
 def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
-    """Copy an estimate with a 95 % profile-likelihood interval, with which std and verdict become consistent.
+    """Add a 95 % profile-likelihood interval to an estimate, and make its std and verdict consistent with it.
 
     An open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
     `parameter_verdict`). With two open ends the verdict is not_identifiable. With one open end it is at best weak, and
@@ -355,12 +355,12 @@ def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterva
 
 
 def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
-    """Whether a parameter needs no profile because its relative standard deviation is at most 10 %."""
+    """Check whether a parameter needs no profile because its relative standard deviation is at most 10 %."""
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
 
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
-    """Typical magnitude of each free parameter from priors, bounds, similar parameters or initial values.
+    """Return the typical magnitude of each free parameter, from priors, bounds, similar parameters or initial values.
 
     It is the first of these that is available: the prior's standard deviation, half the distance of finite bounds, the
     median of parameters of the same kind (such as `bend`) or unit, the scale of the unknown.
@@ -396,7 +396,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
 def parameter_estimates(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array, fit: GoodnessOfFit | None
 ) -> dict[str, ParameterEstimate]:
-    """Make the estimates of all parameters from the unknowns `x`, their covariance (nx, nx) and the evaluation at `x`.
+    """Create the estimates of all parameters from the unknowns `x`, their covariance (nx, nx) and the evaluation.
 
     Local parameters are listed by recording. If `x` is not a fit, `fit` is None, and misfit and bounds are ignored.
     """
@@ -436,7 +436,7 @@ def parameter_estimates(
 
 
 def mark_free_estimates_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
-    """Copy estimates with the verdict not_trusted. Fixed and not_identifiable parameters keep their verdicts."""
+    """Give free estimates the verdict not_trusted. Fixed and not_identifiable parameters keep their verdicts."""
     doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}
 
@@ -454,7 +454,7 @@ VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VE
 
 
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
-    """Explain in a sentence whether a model explains its recordings, with advice for a poor fit."""
+    """Return a sentence that states whether a model explains its recordings, with advice for a poor fit."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "whether the model explains the recordings is not known"
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}"
@@ -464,7 +464,7 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
 
 
 def value_and_uncertainty_text(value: float, std: float | None, interval: ConfidenceInterval | None) -> str:
-    """Format a value with its 95 % interval or, without one, with its standard deviation if known."""
+    """Format a value with its 95 % interval or, without an interval, with its standard deviation if known."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
     return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
@@ -476,7 +476,7 @@ def finite_or_none(value: float) -> float | None:
 
 
 def percent_number_text(part: float) -> str:
-    """Format a fraction as a percentage with two digits, without exponents below 10000 %."""
+    """Format a fraction as a percentage with two digits. There are no exponents below 10000 %."""
     return f"{100 * part:.0f}" if 100 * part >= 99.5 and part < 100 else f"{100 * part:.2g}"
 
 
@@ -490,7 +490,7 @@ def interval_text(lower: float | None, upper: float | None) -> str:
 
 
 def priors_that_determine_unknown(data: Array, priors: Array, column: int) -> BoolArray:
-    """Mask (nx,) of the unknowns whose priors determine the unknown `column`; all False if the data determine it.
+    """Return a mask (nx,) of the unknowns whose priors determine the unknown `column`. All False if the data do.
 
     `data` (n, nx) and `priors` (k, nx) are Jacobians of whitened residuals. An unknown is determined by priors if its
     standard deviation without them is more than `_PRIOR_STD_RATIO` times as large. The others can then change with
@@ -514,7 +514,7 @@ def priors_that_determine_unknown(data: Array, priors: Array, column: int) -> Bo
 
 @dataclass(frozen=True)
 class EstimateChecksBeyondFit:
-    """Checks of an estimate beyond its fit: finer discretisations, held-out recordings and step stability.
+    """Further checks of an estimate: finer discretisations, held-out recordings and stability of the time step.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Whiten a recording's residual by a Kalman filter that includes errors of recorded torques and encoders.
+"""Whitening of a recording's residual by a Kalman filter that includes errors of recorded torques and encoders.
 
 The recorded torques of driven joints have two errors: w, white noise from sample to sample, and b, constant over a
 recording. Encoders have the error v. To first order, the error d of a rollout's state (model minus truth) obeys
@@ -86,7 +86,7 @@ class _SmoothedInputErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class WhiteningFilter:
-    """Kalman filter that whitens the residual of a recording, linearized along one rollout."""
+    """A Kalman filter that whitens the residual of a recording, linearized along one rollout."""
 
     filter_steps: tuple[_FilterPart, ...]  # all steps, and the last node
     input_error_model: TorqueAndAngleErrorModel  # includes the values of b and w at the linearisation
@@ -95,7 +95,7 @@ class WhiteningFilter:
     torque_bias_std: Array  # standard deviation of b after all measurements, shape (nu,) [N m]
 
     def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten residual columns (r, c), and estimate torque biases (nu, c) [N m] from all rows.
+        """Whiten residual columns (r, c), and estimate the constant torque errors (nu, c) [N m] from all rows.
 
         The first column of `rows` is a residual in units of sensor noise, all other columns are its derivatives. `push`
         (N, nu, c) is the tracking filter's correction of the torque and the derivatives of this correction [N m].
@@ -234,7 +234,7 @@ def _filter_steps(
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
-    """Constant torque errors (nu,) [N m] of the driven joints, estimated from the prediction `result` of an episode."""
+    """Estimate the constant torque errors (nu,) [N m] of the driven joints from the prediction of a recording."""
     return _innovations_and_bias(episode, result, whitening)[1][:, 0]
 
 
@@ -326,7 +326,7 @@ def problem_with_whitening_at(
     rounds: int = 1,
     keep_weights: bool = False,
 ) -> EstimationProblem:
-    """Return a problem whose residuals are whitened by sensor and process noise, linearized at `x`.
+    """Return a problem whose residuals are whitened by sensor and process noise, linearized at the unknowns `x`.
 
     The problem itself is returned if it has no process noise, or if the rollout fails at `x`. If it is already
     whitened, the new filter is linearized about the motion and torques that the old filter smooths. `rounds` is the
@@ -376,7 +376,7 @@ def problem_with_held_out_kalman_whitening(
 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """Relinearize the estimation recordings' whitening filters at the torque offsets of `x`. Weights are unchanged."""
+    """Linearize the whitening filters of the estimation recordings at the torque offsets of `x`. Weights stay fixed."""
     parts = problem.unpack_episode_unknowns
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
@@ -386,7 +386,7 @@ def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, fr
 def problem_with_reestimated_held_out_torque_biases(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
-    """Re-estimate the torque offsets in held-out whitening filters at the unknowns `x`; gains stay fixed."""
+    """Estimate the torque offsets in held-out whitening filters again at the unknowns `x`. Gains stay fixed."""
     pairs = zip(problem.held_out_prediction_inputs(x), problem.held_out, strict=True)
     at = [(*own, problem.held_out_parameter_vector(frozen, held)) for own, held in pairs]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
@@ -394,12 +394,12 @@ def problem_with_reestimated_held_out_torque_biases(
 
 
 def problem_with_sensor_noise_only(problem: EstimationProblem) -> EstimationProblem:
-    """Whiten a problem by sensor noise, not by noise of the recorded inputs. Estimated torque offsets are kept."""
+    """Whiten a problem by sensor noise, without the noise of recorded inputs. Estimated torque offsets are kept."""
     return _with_errors(problem, lambda errors: errors.with_torque_bias_only)
 
 
 def problem_without_input_errors(problem: EstimationProblem) -> EstimationProblem:
-    """Treat the recorded torques and angles of a problem as exact."""
+    """Return the problem with its recorded torques and angles treated as exact."""
     return _with_errors(problem, lambda errors: None)
 
 
@@ -413,7 +413,7 @@ def _with_errors(
 
 
 def torque_biases_and_stds_per_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-    """Estimate the constant torque errors at `x` and their standard deviations for each recording, (nu,) [N m].
+    """Estimate the constant torque errors (nu,) [N m] of each recording at `x`, and their standard deviations.
 
     An entry is None if torques are exact, or without a whitening filter (`problem_with_whitening_at`).
     """
@@ -481,7 +481,7 @@ def _settled(
 def max_torque_bias_change_in_stds(
     some: Sequence[ProcessNoiseWhitener | None], others: Sequence[ProcessNoiseWhitener | None]
 ) -> float:
-    """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""
+    """Return the largest difference in torque offset between two sets of filters, in stated standard deviations."""
     return max((_apart(one, other) for one, other in zip(some, others, strict=True) if one and other), default=0.0)
 
 

@@ -1,4 +1,4 @@
-"""Generate CasADi functions, index tables and C code from symbolic step equations.
+"""Generation of CasADi functions, index tables and C code from symbolic step equations.
 
 Batched kernels, and functions of very many instructions, are written with the SIMD arithmetic of `simd.c`.
 """
@@ -22,7 +22,7 @@ _Indices = NDArray[np.int32]
 
 
 class StepFunctions:
-    """CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
+    """The CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
 
     Each is built when it is first used, because a cached kernel needs none of them. With constraint forces at the node,
     the outputs for the midpoint and the end of the step are empty.
@@ -43,7 +43,7 @@ class StepFunctions:
 
     @property
     def sparse_jacobian_parts_function(self) -> ca.Function:
-        """Function that returns the parts of the step's sparse Jacobians.
+        """The function that returns the parts of the step's sparse Jacobians.
 
         Its outputs are the vectors per joint, then the nonzeros of the remaining entries of the residual, of p1 and of
         the constraints, and the curvature. The curvature is the derivative of the midpoint's constraint force with
@@ -53,12 +53,12 @@ class StepFunctions:
 
     @property
     def row_scale_and_true_time_step_function(self) -> ca.Function:
-        """Function that returns the scale of the momentum balance's rows and the clock-corrected time step [s]."""
+        """The function that returns the row scale of the momentum balance and the clock-corrected time step [s]."""
         return self._function("scales")
 
     @property
     def internal_residual_at_rest_function(self) -> ca.Function:
-        """Function of the internal equations at rest (both nodes equal) and their derivatives by (q, z, lam, u)."""
+        """The function of the internal equations at rest (nodes equal) and their derivatives by (q, z, lam, u)."""
         return self._function("resting")
 
     @property
@@ -157,7 +157,7 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 
 
 def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
-    """Build a CasADi function of the sparse derivatives of a step with respect to the parameters `names`.
+    """Build a CasADi function for the sparse derivatives of a step with respect to the parameters `names`.
 
     Its outputs are the derivatives of the residual, of p1 and of the prescribed effort.
     """
@@ -172,7 +172,7 @@ def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[st
 
 @dataclass(frozen=True)
 class StepSparsityTables:
-    """Index tables of the sparse Jacobians of a step and of their elimination, valid at every state."""
+    """The index tables of a step's sparse Jacobians and of their elimination, which are valid at every state."""
 
     unknown_rows: _Indices  # full row (balance, internal, constraint) of each unknown (free q1, z1, lam), (ny,)
     elimination_order: _Indices  # internal coordinates, tips before roots, multipliers last, (ny,)
@@ -239,14 +239,14 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
 
 
 def kernel_cache_key_text(functions: StepFunctions, tables: StepSparsityTables) -> str:
-    """Collect the text that identifies a kernel in the cache: generators, index tables and serialized equations."""
+    """Return the text that identifies a kernel in the cache: generators, index tables and serialized equations."""
     folder = resources.files("yid_ocp.integrator")
     files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]
     return "\0".join([*files, *_kernel_tables(functions, tables), functions._expression_text()])
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
-    """Generate the C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables and `kernel.c`.
+    """Generate the C source of the stepping kernel from `simd.c`, CasADi's functions, sizes, tables and `kernel.c`.
 
     With `batched`, the kernel integrates `yid_simd_width` rollouts at once; None if a function has no SIMD form.
     """
@@ -314,7 +314,7 @@ def _step_source(functions: Sequence[ca.Function]) -> str:
 
 
 def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
-    """Generate C source for CasADi functions under their own names. `name` is the name of the generated file."""
+    """Generate the C source of CasADi functions, which keep their names. `name` is the name of the generated file."""
     generator = ca.CodeGenerator(name, {"with_header": False, "indent": 0})
     for function in functions:
         generator.add(function)
@@ -322,7 +322,7 @@ def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
 
 
 def nonzero_indices(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
-    """Row and column indices of a sparsity pattern's structural nonzeros, each an array (nnz,)."""
+    """Return the row and column indices (nnz,) of the structural nonzeros in a sparsity pattern."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)
 

@@ -106,7 +106,7 @@ class _ThetaColumns:
 
 
 class CompiledKernel:
-    """Thread-safe stepping kernel in generated C. It has the methods of `InterpretedKernel`."""
+    """A thread-safe stepping kernel in generated C. It has the methods of `InterpretedKernel`."""
 
     def __init__(self, model: StepEquationsAndFunctions, library: ctypes.CDLL) -> None:
         self._model = model
@@ -118,7 +118,7 @@ class CompiledKernel:
         )
 
     def make_kernel_sharing_code(self, model: StepEquationsAndFunctions) -> CompiledKernel:
-        """Make a kernel for another step model that shares this compiled library."""
+        """Create a kernel for another step model that uses the same compiled library."""
         other = CompiledKernel(model, self._library)
         other._theta_columns, other._batched = self._theta_columns, self._batched
         return other
@@ -230,7 +230,7 @@ class CompiledKernel:
     def iterate_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, in C; see `step.iterate_step_derivatives`."""
+        """Compute the derivatives of a rollout's steps in C. See `step.iterate_step_derivatives`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)

@@ -1,4 +1,4 @@
-"""Compile C code with the machine's C compiler and cache the libraries."""
+"""Compilation of C code with the machine's C compiler, and a cache of the compiled libraries."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _optimization_flag() -> str:
 
 
 def private_cache_folder() -> Path:
-    """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it."""
+    """Return the private folder of compiled code, and create it if it is absent. YID_OCP_CACHE overrides it."""
     wanted = os.environ.get("YID_OCP_CACHE")
     folder = Path(wanted or platformdirs.user_cache_dir("yid_ocp"))
     allowed = "a folder that you own, writable by you alone"
@@ -141,7 +141,7 @@ def _machine() -> str:
 def compile_and_load_library(
     source: str, make: Callable[[], str | None] | None = None, level: str | None = None
 ) -> ctypes.CDLL | None:
-    """Load the shared library of a C source, compiled or from the cache. Returns None if no compiler works.
+    """Compile a C source, or find it in the cache, and load the shared library. Returns None if no compiler works.
 
     The cache key is the hash of `source`, the flags, the compiler, the processor and CasADi's version. With `make`,
     `source` is only part of the key, and `make` returns the C text (or None) if the library is not in the cache.
@@ -252,9 +252,9 @@ def _is_ours(built: Path) -> bool:
 
 
 class MappedFunction:
-    """A CasADi function of dense columns, evaluated at many points in one call, compiled if possible.
+    """A CasADi function that is evaluated at many points in one call, in compiled code if possible.
 
-    `shared_inputs` are the indices of inputs that have one value for all points.
+    Inputs and outputs are dense columns. `shared_inputs` are the indices of inputs that have one value for all points.
     """
 
     def __init__(self, function: ca.Function, shared_inputs: Sequence[int] = (), use_compiler: bool = True) -> None:

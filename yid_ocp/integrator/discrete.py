@@ -72,7 +72,7 @@ class _ConstraintImpulses:
 
 @dataclass(frozen=True)
 class DiscreteEquations:
-    """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system, from node 0 to node 1.
+    """The symbolic discrete Euler-Lagrange (DEL) equations of one step of a system, from node 0 to node 1.
 
     q (n, 1) are coordinates, z (nz, 1) internal coordinates and p (n, 1) momenta [N m s]; the digit 0 or 1 in a name
     denotes the node. The system has m constraints, nu inputs and ntheta parameters.
@@ -111,18 +111,18 @@ class DiscreteEquations:
 
     @property
     def arguments(self) -> list[ca.SX]:
-        """Arguments of every compiled function of the step, in order."""
+        """The arguments of every compiled function of the step, in order."""
         return [self.q0, self.q1, self.p0, self.z0, self.z1, self.lam, self.u, self.theta, self.time_step]
 
     @property
     def residual(self) -> ca.SX:
-        """Residual of the step: momentum balance of free coordinates, internal equations and constraint equations."""
+        """The residual of the step: momentum balance of free coordinates, internal equations and constraints."""
         balance = self.momentum_balance[list(self.system.unprescribed_coordinate_indices), 0]
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
     def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulses of the closed-form force in `momentum_balance` and `p1`, each (n, 1) [N m s]; None without it."""
+        """The impulses of the closed-form force in `momentum_balance` and `p1`, each (n, 1) [N m s], or None."""
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares
@@ -130,14 +130,14 @@ class DiscreteEquations:
 
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
-        """Constraint violation at the end of the step without relaxation, phi(q_{k+1}) - C lam / h, shape (m, 1)."""
+        """The constraint violation at the end of the step without relaxation, phi(q_{k+1}) - C lam / h, (m, 1)."""
         if self.constraint_relaxation_gain is None:
             return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
     def newton_unknowns(self) -> ca.SX:
-        """Unknowns of Newton's method: free coordinates of q1, internal coordinates z1 and multipliers lam."""
+        """The unknowns of Newton's method: free coordinates of q1, internal coordinates z1 and multipliers lam."""
         return ca.vertcat(self.q1[list(self.system.unprescribed_coordinate_indices), 0], self.z1, self.lam)
 
 
@@ -382,7 +382,7 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
 
 @dataclass(frozen=True)
 class EquilibriumEquations:
-    """Symbolic equations of static equilibrium. Torques and springs hold driven joints; prescribed ones are given."""
+    """The symbolic equations of static equilibrium. Torques and springs hold driven joints; prescribed ones are set."""
 
     # (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
     # held torque, holding spring's stiffness, theta, time step
@@ -417,7 +417,7 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
 
 @dataclass(frozen=True, eq=False)
 class NlpStepConstraints:
-    """Symbolic equality constraints of one step in a nonlinear program (NLP), with their Jacobians.
+    """The symbolic equality constraints of one step in a nonlinear program (NLP), with their Jacobians.
 
     `residual_jacobians` and `effort_jacobians` are the sparse derivatives of `residual` (nr, 1) and `prescribed_effort`
     (nc, 1) with respect to `x0`, `x1`, `lam` and `u`.
@@ -437,13 +437,13 @@ class NlpStepConstraints:
     effort_jacobians: dict[str, ca.SX]
 
     def residual_and_effort_jacobians_by_parameters(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
-        """Sparse derivatives of `residual` and `prescribed_effort` with respect to parameters, (..., len(names))."""
+        """Compute derivatives of `residual` and `prescribed_effort` with respect to parameters, (..., len(names))."""
         chosen = ca.vertcat(ca.SX(0, 1), *(self.equations.system.parameters[name].symbol for name in names))
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)
 
 
 def one_step_nlp_constraints(equations: DiscreteEquations, time_step: float) -> NlpStepConstraints:
-    """Build one step's equality constraints for a nonlinear program, with their Jacobians, for a time step [s].
+    """Build the equality constraints of one time step [s] for a nonlinear program, with their Jacobians.
 
     The state is x = (q, p, z), and p1 is the momentum after the step. The constraint rows are scaled to order one:
 

@@ -36,7 +36,7 @@ _PointEvaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """Thread-safe stepping kernel in CasADi's interpreter and NumPy, for machines without a compiler.
+    """A thread-safe stepping kernel that runs in CasADi's interpreter and NumPy, for machines without a compiler.
 
     Its methods are as in `CompiledKernel`. A point is a column of all `DiscreteEquations.arguments`. The outputs are
     the rows of the balance, internal and constraint equations, then p1, then the effort of the prescribed coordinates.
@@ -58,7 +58,7 @@ class InterpretedKernel:
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
     def make_kernel_sharing_code(self, model: StepEquationsAndFunctions) -> InterpretedKernel:
-        """Make a kernel for `model`, which must have the same equations, that reuses this kernel's functions."""
+        """Create a kernel that reuses this kernel's functions for a `model` with the same equations."""
         other = InterpretedKernel(model)
         other._functions = self._functions
         return other
@@ -88,18 +88,18 @@ class InterpretedKernel:
         return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 
     def _newton(
-        self, value: _PointEvaluator, slope: _PointEvaluator, point: Array, leap: float
+        self, value: _PointEvaluator, slope: _PointEvaluator, point: Array, by_work: bool
     ) -> tuple[NewtonStatusCode, float, int]:
-        """Solve for the unknowns in the point, by Newton's method with leaps as in kernel.c."""
+        """Solve for the unknowns in the point, by Newton's method with the line searches of kernel.c."""
 
         def largest(change: Array) -> float:
             return float(np.abs(change[: self._coordinates]).max(initial=0.0))
 
-        tolerance, error = self._model.tolerance, 0.0
+        tolerance, error, balance = self._model.tolerance, math.inf, slice(self._coordinates - self._model.sizes["nz"])
         if not len(self._unknown):  # all coordinates are prescribed
-            return NewtonStatusCode.OK, error, 1
+            return NewtonStatusCode.OK, 0.0, 1
         for iteration in range(1, NEWTON_ITERATION_LIMIT + 1):
-            residual = value(point)[self._residual, 0]
+            residual, previous = value(point)[self._residual, 0], error
             if not np.isfinite(residual).all():
                 return NewtonStatusCode.NOT_FINITE, error, iteration
             factors = _factorised(slope(point))
@@ -109,28 +109,31 @@ class InterpretedKernel:
             error = largest(change)
             if not math.isfinite(error):
                 return NewtonStatusCode.NOT_FINITE, error, iteration
-            noise, factor = error <= tolerance, min(1.0, 0.5 / error) if error else 1.0
-            while not noise:
-                trial = point.copy()
-                trial[self._unknown] += factor * change
-                further = _solved(factors, value(trial)[self._residual, 0])
-                if (after := largest(further)) <= (1 - 0.25 * factor) * error:
-                    break
-                if factor < 1e-4:
-                    if leap < 1e3 * tolerance:
-                        return NewtonStatusCode.NOT_CONVERGED, error, iteration
-                    trial, leap = point.copy(), 0.2 * leap
-                    trial[self._unknown] += 5 * leap / error * change
-                    break
-                # near the tolerance, a correction that no step length reduces is rounding
-                noise, factor = error < 1e3 * tolerance, 0.5 * factor
-            if noise:
+            is_near = error < 1e3 * tolerance
+            if error <= tolerance or (is_near and error > 0.5 * previous):
                 point[self._at["lam"]] += change[self._coordinates :]
                 return NewtonStatusCode.OK, error, iteration
-            point[:] = trial
-            if factor == 1.0 and after <= tolerance:
-                point[self._at["lam"]] -= further[self._coordinates :]
-                return NewtonStatusCode.OK, after, iteration
+            work, start = residual[balance] @ change[balance], point[self._unknown]
+            longest = min(1.0, 0.5 / error) * (-1.0 if by_work and work < 0 else 1.0)
+            low, low_left, high, part = 0.0, 1.0, 1.0, 1.0
+            while True:
+                point[self._unknown] = start + longest * part * change
+                residual, left = value(point)[self._residual, 0], math.nan
+                if by_work:
+                    left = float(residual[balance] @ change[balance] / work)
+                    is_good = abs(left) <= 0.5 or (left > 0 and part == 1.0)
+                else:
+                    is_good = largest(_solved(factors, residual)) <= (1 - 0.25 * longest * part) * error
+                if is_good or is_near or (by_work and high - low < 1e-4):
+                    break
+                if high - low < 1e-4:
+                    return NewtonStatusCode.NOT_CONVERGED, error, iteration
+                if left > 0:
+                    low, low_left = part, left
+                else:
+                    high = part
+                root = low + (high - low) * low_left / (low_left - left) if left < 0 else 0.5 * (low + high)
+                part = min(max(root, 0.9 * low + 0.1 * high), 0.1 * low + 0.9 * high)
         return NewtonStatusCode.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
 
     @np.errstate(over="ignore", invalid="ignore")  # the status says what is not finite
@@ -152,11 +155,10 @@ class InterpretedKernel:
             guess = x if k == 0 else 2 * x - state[k - 1]
             if k > 1:
                 guess[:n] += x[:n] - 2 * state[k - 1, :n] + state[k - 2, :n]
-            for first, pull, leap in ((guess, lam, 0.0), (x, 0 * lam, 0.5)):
+            for first, pull, by_work in ((guess, lam, False), (x, 0 * lam, False), (x, 0 * lam, True)):
                 point = self._point(theta, x, first, pull, u)
                 point[self._fixed] = path[k + 1]
-                end, error, spent = self._newton(value, slope, point, leap)
-                code = end if not leap or end == NewtonStatusCode.OK else code
+                code, error, spent = self._newton(value, slope, point, by_work)
                 total += spent
                 if code == NewtonStatusCode.OK:
                     break
@@ -213,7 +215,7 @@ class InterpretedKernel:
     def iterate_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps; see `step.iterate_step_derivatives`."""
+        """Compute the derivatives of a rollout's steps. See `step.iterate_step_derivatives`."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
@@ -291,7 +293,7 @@ class InterpretedKernel:
 
 
 def dense_function_evaluator(function: Any) -> Callable[[Array], list[Array]]:
-    """Make a fast evaluator of a CasADi function of one vector with dense outputs, for use in one thread.
+    """Create a fast evaluator for a CasADi function of one vector with dense outputs, for use in one thread.
 
     It reuses fixed buffers and takes a third of the time of a call, which converts CasADi matrices to arrays.
     """

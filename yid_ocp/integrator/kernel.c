@@ -415,10 +415,18 @@ static mask newton_chord(Work *k, const Point *a, real tolerance, int limit, mas
 }
 
 #if SIMD_WIDTH == 1
-/* Full Newton, damped by the natural monotonicity test (Deuflhard 2011, section 3.3). Where it stalls, as where friction
- * falls more steeply with the speed than inertia grows, it goes on beyond, after a leap of at most `leap`. */
-static int newton_damped(Work *k, const Point *a, double tolerance, int limit, double leap, double *error) {
-    double q_keep[ONE(N)], z_keep[ONE(NZ)], lam_keep[ONE(M)], step[ONE(NY)], trial[ONE(NY)], previous = INFINITY;
+/* Work of the balance's residual along a correction of the coordinates. */
+static double work_along(const Work *k, const double *step) {
+    double sum = 0;
+    for (int i = 0; i < NF; i++) sum += k->r[i] * step[i];
+    return sum;
+}
+
+/* Full Newton. A correction is shortened until the next one is smaller (natural monotonicity test, Deuflhard 2011,
+ * section 3.3). `by_work`: until the residual's work along it is small. Where friction changes its sign within a small
+ * part of a step no correction may get smaller, but this work changes its sign once. */
+static int newton_damped(Work *k, const Point *a, double tolerance, int limit, int by_work, double *error) {
+    double step[ONE(NY)], trial[ONE(NY)], previous = INFINITY;
     for (int it = 0; it < limit; it++) {
         k->iterations++;
         if (!evaluate(k, a)) return NOT_FINITE;
@@ -426,40 +434,38 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, d
         if (!factorise(k, EVERY, EVERY)) return SINGULAR;
         for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
         solve(k, k->r, step);
-        const double norm = *error = coordinate_norm(step);
+        const double norm = *error = coordinate_norm(step), work = -work_along(k, step);
         if (!isfinite(norm)) return NOT_FINITE;
         if (norm <= tolerance || (norm < 1e3 * tolerance && norm > 0.5 * previous)) {
             settle_multipliers(k, a, step, EVERY);
             return OK;
         }
         previous = norm;
-        memcpy(q_keep, a->q1, sizeof(double) * N);
-        memcpy(z_keep, a->z1, sizeof(double) * NZ);
-        memcpy(lam_keep, a->lam, sizeof(double) * M);
-        double factor = norm > 0.5 ? 0.5 / norm : 1.0;
+        /* backwards where friction falls more steeply with the speed than inertia grows */
+        const double longest = (norm > 0.5 ? 0.5 / norm : 1.0) * (by_work && work < 0 ? -1.0 : 1.0);
+        double low = 0.0, low_left = 1.0, high = 1.0, part = 1.0, at = 0.0;
         for (;;) {
-            advance(a, step, factor, EVERY);
-            if (evaluate(k, a)) {
+            advance(a, step, longest * (part - at), EVERY);
+            at = part;
+            double left = NAN;
+            if (evaluate(k, a) && by_work) {
+                left = work_along(k, step) / work;
+                if (fabs(left) <= 0.5 || (left > 0 && part == 1.0)) break;
+            } else if (!by_work) {
                 for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
                 solve(k, k->r, trial);
                 const double size = coordinate_norm(trial);
-                if (isfinite(size) && size <= (1.0 - 0.25 * factor) * norm) break;
+                if (isfinite(size) && size <= (1.0 - 0.25 * longest * part) * norm) break;
             }
-            memcpy(a->q1, q_keep, sizeof(double) * N);
-            memcpy(a->z1, z_keep, sizeof(double) * NZ);
-            memcpy(a->lam, lam_keep, sizeof(double) * M);
-            if (factor < 1e-4) {
-                /* so near the end only rounding keeps a correction from getting smaller */
-                if (norm <= 1e3 * tolerance && evaluate(k, a)) {
-                    settle_multipliers(k, a, step, EVERY);
-                    return OK;
-                }
-                if (leap < 1e3 * tolerance) return NOT_CONVERGED;
-                advance(a, step, leap / norm, EVERY);
-                leap *= 0.2;
+            if (norm < 1e3 * tolerance) break; /* only rounding keeps it from getting smaller */
+            if (high - low < 1e-4) {
+                if (!by_work) return NOT_CONVERGED;
                 break;
             }
-            factor *= 0.5;
+            if (left > 0) low = part, low_left = left;
+            else high = part;
+            const double root = left < 0 ? low + (high - low) * low_left / (low_left - left) : 0.5 * (low + high);
+            part = fmin(fmax(root, 0.9 * low + 0.1 * high), 0.1 * low + 0.9 * high);
         }
     }
     return NOT_CONVERGED;
@@ -490,15 +496,15 @@ static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at
     }
     mask good = newton_chord(k, a, tolerance, 20, at_work, error);
 #if SIMD_WIDTH == 1
-    for (int attempt = 0; !good && attempt < 2; attempt++) {
+    for (int attempt = 0; !good && attempt < 3; attempt++) {
         for (int i = 0; i < N; i++) a->q1[i] = q_guess[i];
         if (attempt)
             for (int i = 0; i < NF; i++) a->q1[free_index[i]] = a->q0[free_index[i]];
         for (int i = 0; i < NZ; i++) a->z1[i] = attempt ? a->z0[i] : z_guess[i];
         for (int i = 0; i < M; i++) a->lam[i] = attempt ? 0.0 : lam_guess[i];
-        const int end = newton_damped(k, a, tolerance, limit, attempt ? 0.5 : 0.0, error);
+        const int end = newton_damped(k, a, tolerance, limit, attempt == 2, error);
         good = end == OK;
-        if (good || !attempt) *status = end; /* where leaps end says nothing */
+        if (good || !attempt) *status = end;
     }
 #endif
     k->factored &= good;

@@ -56,7 +56,7 @@ _MAX_HOLD_DEFLECTION = 0.02  # larger deflections of a holding spring mean a pos
 
 
 class EquilibriumSolver:
-    """Newton solver for the static equilibrium of a system whose driven and prescribed joints have given positions.
+    """A Newton solver for the static equilibrium of a system with given positions of driven and prescribed joints.
 
     `known_coordinates` are the indices of these coordinates (driven, then prescribed), `free_coordinates` the indices
     of the unknown coordinates.
@@ -323,7 +323,7 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
 
 
 def measured_joint_angle_hold_stiffness(system: System, known: bool) -> float:
-    """Stiffness of springs at measured angles [N m/rad]. `known` states whether torques or servo commands are given."""
+    """Return the stiffness [N m/rad] of springs at measured angles. `known`: torques or servo commands are given."""
     if not known:
         return RIGID_HOLD_STIFFNESS
     return _HOLD_STIFFNESS_WITH_COMMAND if system.servos else _HOLD_STIFFNESS_WITH_TORQUE
@@ -392,7 +392,7 @@ def _solved(matrix: Array, right: Array) -> Array:
 
 
 def steady_effect_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
-    """Relaxed internal coordinates (nz,) of a system held at configuration `q` for a long time."""
+    """Compute the relaxed internal coordinates (nz,) of a system held at the configuration `q` for a long time."""
     e = step.equations
     nz = e.z0.numel()
     if nz == 0:

@@ -38,7 +38,7 @@ _ALL_STEPS = slice(None)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(ReprMixin):
-    """Step map of a system over one time step, made by `compile_step`. It `is_compiled` if it runs generated C code."""
+    """The map from a system's state to its state one time step later. `is_compiled` is True if it runs generated C."""
 
     model: StepEquationsAndFunctions
     kernel: CompiledKernel | InterpretedKernel
@@ -51,22 +51,22 @@ class Step(ReprMixin):
 
     @property
     def system(self) -> System:
-        """System that the step simulates."""
+        """The system that the step simulates."""
         return self.model.system
 
     @property
     def time_step(self) -> float:
-        """Time step h [s]."""
+        """The time step h [s]."""
         return self.model.time_step
 
     def clock_scaled_time_step(self, theta: Array) -> float:
-        """Time step corrected for the recording's clock [s]: h times `System.recorded_time_scale` at `theta`."""
+        """Return the time step [s] corrected for the recording's clock: h times `System.recorded_time_scale`."""
         none = [np.zeros(self.sizes[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
         return float(self.functions.row_scale_and_true_time_step_function(*none, theta, self.time_step)[1])
 
     @property
     def force_split(self) -> ForceSplit:
-        """Split of a step's forces between its two nodes: `symmetric` (half to each) or `left` (all to the first)."""
+        """The split of a step's forces between its nodes: `symmetric` (half to each) or `left` (all to the first)."""
         return self.model.equations.force_split
 
     @property
@@ -76,12 +76,12 @@ class Step(ReprMixin):
 
     @property
     def functions(self) -> codegen.StepFunctions:
-        """CasADi functions of the step equations and their derivatives."""
+        """The CasADi functions of the step equations and their derivatives."""
         return self.model.functions
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Dimensions n (coordinates), nz (internal), m (constraints), nu (inputs), nc (prescribed), nx, ntheta."""
+        """The dimensions n (coordinates), nz (internal), m (constraints), nu (inputs), nc (prescribed), nx, ntheta."""
         return self.model.sizes
 
     def __call__(
@@ -119,7 +119,7 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Jacobians of the next state with respect to the state, the input and the parameters `names` (default: all).
+        """Compute Jacobians of the next state with respect to state, input and the parameters `names` (default: all).
 
         Returns A (nx, nx), B_u (nx, nu) and B_theta (nx, len(names)), computed by the implicit function theorem. The
         other arguments are as in `__call__`.
@@ -242,7 +242,7 @@ def simulate(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> Rollout:
-    """Simulate a system over `steps` steps. Derivatives are computed along `directions`, if given.
+    """Simulate a system for `steps` time steps. Derivatives are computed along `directions`, if given.
 
     If Newton's method fails, `status` of the result reports it, and the later entries are NaN. Raises `ModelError` if
     an array has the wrong shape.
@@ -263,7 +263,7 @@ def simulate(
 
 
 def simulate_rollouts(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several rollouts from `checked_rollout_inputs`. Results equal `simulate` except for rounding."""
+    """Simulate several trajectories from `checked_rollout_inputs`. Results equal `simulate` except for rounding."""
     return step.kernel.rollout_batch(members)
 
 
@@ -277,7 +277,7 @@ def checked_rollout_inputs(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> RolloutInputs:
-    """Check the shapes of one rollout's inputs. Arguments and errors are as in `simulate`."""
+    """Check the shapes of the inputs of one rollout, and return them. Arguments and errors are as in `simulate`."""
     sizes, check = step.sizes, float_array_with_checked_shape
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
@@ -301,7 +301,7 @@ def checked_rollout_inputs(
 
 
 def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
-    """Torque on the driven joints in every step, (N, nu) [N m]: the input, or the torque of the position servos."""
+    """Return the torque on the driven joints in every step, (N, nu) [N m]: the input, or the torque of the servos."""
     system, h = step.system, step.clock_scaled_time_step(np.asarray(theta, float))
     if not system.servos:
         return rollout.torque
@@ -317,7 +317,7 @@ def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rol
 
 
 def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv at (q, v), each (n,) or (K, n) [N m s], times compliance at compliant coordinates."""
+    """Compute the momentum dL/dv at (q, v), each (n,) or (K, n) [N m s], times compliance at compliant coordinates."""
     e, s = step.equations, step.sizes
     half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
     middle = np.atleast_2d(np.asarray(q, float))
@@ -337,7 +337,7 @@ def reachable_and_observable_state_mask(
     seen: BoolArray | None = None,
     disturbed: BoolArray | None = None,
 ) -> BoolArray:
-    """Mask (nx,) of the states that depend on any state or input and that affect measurements, directly or indirectly.
+    """Return a mask (nx,) of the states that depend on a state or input and affect measurements, also indirectly.
 
     Prescribed coordinates and internal states of a neutral effect are excluded. Other coordinates and momenta count as
     measured. Only the first and the last step are examined. `loads` are extra excitations as in

@@ -28,7 +28,7 @@ _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-1
 
 @dataclass(frozen=True, eq=False)
 class StepEquationsAndFunctions:
-    """Equations, functions and index tables of one time step, from which a kernel is built.
+    """The equations, functions and index tables of one time step, from which a kernel is built.
 
     `sizes` holds the numbers of coordinates (n), internal coordinates (nz), constraints (m), inputs (nu), prescribed
     coordinates (nc), states (nx = 2 n + nz) and parameters (ntheta). `time_step` is in s. Newton's method stops at a
@@ -51,7 +51,7 @@ def build_step_model(
     constraint_force_at: ConstraintForcePlacement,
     tolerance: float | None = None,
 ) -> StepEquationsAndFunctions:
-    """Build the `StepEquationsAndFunctions` of a system. Arguments are as in `compile_step`."""
+    """Build the equations, functions and index tables of a step. Arguments are as in `compile_step`."""
     e = discrete_equations(system, force_split, constraint_force_at)
     functions = codegen.build_casadi_step_functions(e)
     n, nz = system.n_coordinates, e.z0.numel()
@@ -63,12 +63,12 @@ def build_step_model(
 
 
 def newton_coordinate_tolerance(time_step: float) -> float:
-    """Convergence tolerance of Newton's method on coordinate corrections [rad or m], for a time step [s]."""
+    """Return the coordinate correction [rad or m] at which Newton's method has converged, for a time step [s]."""
     return max(_ROUNDING_FLOOR, min(_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE * time_step))
 
 
 class NewtonStatusCode(IntEnum):
-    """Status codes of Newton's method in one step. The C kernel uses the same numbers."""
+    """The status codes of Newton's method in one step. The C kernel uses the same numbers."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -97,7 +97,7 @@ _INSTABILITY_HINT = (
 
 @dataclass(frozen=True)
 class RolloutConvergenceInfo:
-    """Convergence of a rollout: status code, last correction of Newton's method [rad or m] and totals over all steps.
+    """The convergence of a rollout: status code, last Newton correction [rad or m] and totals over all steps.
 
     `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
     the values after the last step.
@@ -113,12 +113,12 @@ class RolloutConvergenceInfo:
 
     @property
     def is_converged(self) -> bool:
-        """Whether Newton's method converged in every step."""
+        """True if Newton's method converged in every step."""
         return self.code == NewtonStatusCode.OK
 
     @property
     def message(self) -> str:
-        """Explain the status in a sentence: step, last correction and remedy."""
+        """A sentence that explains the status, with step, last correction and remedy."""
         if self.is_converged:
             return _STATUS_MESSAGES[self.code]
         step, what = self.completed_steps, _STATUS_MESSAGES[self.code]
@@ -148,13 +148,13 @@ class SensitivityDirections:
 
     @property
     def count(self) -> int:
-        """Number d of directions."""
+        """The number d of directions."""
         return self.initial_state_tangents.shape[1]
 
 
 @dataclass(frozen=True)
 class TrackingFeedback:
-    """Feedback that keeps driven arms near their measured motion, u_k = ubar_k - K_k (x_k[index] - xbar_k).
+    """A feedback that keeps driven arms near their measured motion, u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     `state_indices` (nb,) selects entries of the state (q, p, z). `gain` (N, nu, nb) holds K_k [N m/rad for a
     coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries.
@@ -167,7 +167,7 @@ class TrackingFeedback:
 
 @dataclass(frozen=True)
 class RolloutInputs:
-    """Inputs of one rollout: parameters, initial state, torques, prescribed path, feedback, sensitivity directions.
+    """The inputs of one rollout: parameters, initial state, torques, prescribed path, feedback and directions.
 
     Shapes: `theta` (ntheta,), initial state (q, p, z) (nx,), nominal motor torque of every step (N, nu) [N m], and
     prescribed coordinates at every node (N + 1, nc) [rad or m].
@@ -208,7 +208,7 @@ CostDerivativesByRolloutOutputs = tuple[Array, Array | None, Array | None]
 
 @dataclass(frozen=True)
 class RolloutCostGradient:
-    """Gradient of a scalar cost along a rollout by the adjoint method. NaN if a step's equations are singular.
+    """The gradient of a scalar cost along a rollout, by the adjoint method. NaN if a step's equations are singular.
 
     It has the derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu)
     and the prescribed coordinates at every node (N + 1, nc). The derivatives at node 0 are also part of
@@ -223,7 +223,7 @@ class RolloutCostGradient:
 
 @dataclass(frozen=True)
 class StepResidualsAndJacobians:
-    """Residuals and Jacobians of the step equations along any trajectory, even one that does not satisfy them.
+    """The residuals and Jacobians of the step equations along any trajectory, even if it does not satisfy them.
 
     Each step has nt = n + nz + m equations: momentum balance (n), internal (nz) and constraint (m). `p1` is the
     momentum p_{k+1} (n) that follows from the other values. The Jacobians are with respect to the new values (q_{k+1},
@@ -244,7 +244,7 @@ class StepResidualsAndJacobians:
 
 
 def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
-    """Allocate an empty rollout of `steps` steps; `count` sensitivity directions (None: none)."""
+    """Allocate an empty rollout of `steps` steps, with `count` sensitivity directions (None: no directions)."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
     names = [f"{name}_sensitivity" for name in ("state", "multipliers", "effort")]
@@ -258,7 +258,7 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
 def allocate_linearization(
     sizes: dict[str, int], count: int, width: int, derivatives: bool
 ) -> StepResidualsAndJacobians:
-    """Allocate zero linearizations of `count` steps and `width` parameters, without Jacobians if not `derivatives`."""
+    """Allocate zero-filled linearizations of `count` steps and `width` parameters, with Jacobians if `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
     shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
@@ -275,7 +275,7 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], make: Callable[...
 
 
 def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
-    """Return the `InsufficientMemoryError` for `what`, which needs `size` bytes."""
+    """Create the error for a lack of memory, because `what` needs `size` bytes."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}: it takes {amount}"
     hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
@@ -286,7 +286,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 def attach_status_to_rollout(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """The rollout, NaN where it failed, with its status. `counts`: iterations, factorisations."""
+    """Add a status to a rollout, and set values after a failed step to NaN. `counts`: iterations, factorisations."""
     if code != NewtonStatusCode.OK:
         first_missing = {"state": step + 2, "state_sensitivity": step + 1}  # the last state that was tried is kept
         for name in [name for name, array in vars(rollout).items() if isinstance(array, np.ndarray)]:

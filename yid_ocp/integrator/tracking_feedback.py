@@ -1,4 +1,4 @@
-"""Tracking filter of driven arms: a feedback about the measured motion with LQR gains.
+"""Tracking filter of driven arms: a feedback with LQR gains that keeps them near the measured motion.
 
 The discrete momentum contains half the impulse of the previous step. An effect, or a torque other than the recorded
 one, therefore changes the momentum that belongs to a given motion.
@@ -26,7 +26,7 @@ _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors of equal weight in
 
 
 def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
-    """Make a feedback that keeps driven joints near their measured angles, u_k = ubar_k - K (q_k - qbar_k).
+    """Create a feedback that keeps driven joints near their measured angles, u_k = ubar_k - K (q_k - qbar_k).
 
     K is diagonal. `measured` holds the joint angles qbar at every node, (N + 1, nu) [rad]. `gains` [N m/rad] holds one
     gain, one for each joint of an arm, or nu gains. Raises `ModelError` for another number of gains or a negative gain.
@@ -93,7 +93,7 @@ def lqr_tracking_feedback(
 
 
 def compile_driven_arms_only_step(step: Step) -> Step:
-    """Compile a step of the driven joints alone. Raises `ModelError` if other joints come before them."""
+    """Compile a step that contains only the driven joints. Raises `ModelError` if other joints come before them."""
     system, mechanism = step.system, step.system.mechanism
     keep = [mechanism.joint_index(name) for name in system.driven]
     if sorted(keep) != list(range(len(keep))):
@@ -136,7 +136,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 @dataclass(frozen=True)
 class JointMotionAndTorqueWithSensitivities:
-    """Angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
+    """The angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
 
     The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
     """
@@ -155,7 +155,7 @@ class JointMotionAndTorqueWithSensitivities:
 
 
 class EffectMomentumCalculator:
-    """Computes the momentum that effects add to the recorded motion, so that the feedback does not oppose it.
+    """A calculator of the momentum that effects add to the recorded motion, so that the feedback does not oppose it.
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
     effect such as an armature, a fitted mass or damping of the arm, or a torque other than the recorded torque, changes
@@ -211,7 +211,7 @@ class EffectMomentumCalculator:
                 self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
 
     def momentum_derivative_by_previous_torque(self, theta: Array) -> Array:
-        """Derivative of the momentum with respect to the previous step's torques, (nu, nu) [s]."""
+        """Compute the derivative of the momentum with respect to the torques of the previous step, (nu, nu) [s]."""
         return np.array(self._impulse(*[np.zeros(self._impulse.numel_in(i)) for i in range(5)], theta, self._time_step))
 
     def effect_momentum_shifts_and_sensitivities(
@@ -221,7 +221,7 @@ class EffectMomentumCalculator:
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Momentum (N, nu) that effects add to the recorded motion at nodes 0..N-1, and its sensitivities (N, nu, d).
+        """Compute the momentum (N, nu) that effects add to the motion, at nodes 0..N-1, and its derivatives (N, nu, d).
 
         `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
         The first of the d directions are the parameters `names`.
@@ -267,18 +267,18 @@ class EffectMomentumCalculator:
         return z, total if np.any(total) else None
 
     def parameter_values_without_effects(self, theta: Array) -> Array:
-        """Copy of theta with neutral effects and the arm as described, by which the reference is computed."""
+        """Return a copy of theta with neutral effects and the arm as described, which defines the reference."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
         return plain
 
     def is_active(self, theta: Array, names: Sequence[str]) -> bool:
-        """Whether effects can shift the momentum: a parameter is in `names`, or `theta` is not neutral."""
+        """Check whether effects can change the momentum, given the parameter names `names` and the values `theta`."""
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 
 def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative of the applied torque (recorded plus feedback) with respect to an error of the recorded torque.
+    """Compute how much an error of the recorded torque changes the applied torque (recorded plus feedback).
 
     The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
     is assumed to be the same in this step and the previous step. `gain` (..., nu, nb) is the feedback gain of the step.

@@ -1,4 +1,4 @@
-"""Mechanical model of a robot and a flexible object. Additions to it are implemented in `effects`."""
+"""The mechanical model of a robot and a flexible object. The folder `effects` extends it."""
 
 from yid_ocp.model.flexible import FlexibleObject as FlexibleObject
 from yid_ocp.model.flexible import FlexibleSegment as FlexibleSegment

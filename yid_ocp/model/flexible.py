@@ -1,4 +1,4 @@
-"""Flexible branched objects (tubes, beams, cables) as chains of rigid links with elastic joints."""
+"""Models of flexible branched objects (tubes, beams, cables) as chains of rigid links with elastic joints."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class FlexibleSegment:
 
 @dataclass(frozen=True)
 class ElasticJoint:
-    """Spring and damper on one joint of a segment, with energy 1/2 stiffness (q - rest)^2 and force -damping v."""
+    """A spring and damper on one joint of a segment, with energy 1/2 stiffness (q - rest)^2 and force -damping v."""
 
     joint_name: str
     segment_name: str
@@ -88,7 +88,7 @@ class ElasticJoint:
 
 @dataclass(frozen=True)
 class SegmentLayout:
-    """Joints, link lengths, radius, mass and parent segment of one segment in the mechanism."""
+    """The layout of one segment in the mechanism: joints, link lengths, radius, mass and parent segment."""
 
     name: str
     link_joints: tuple[tuple[str, ...], ...]  # names, link by link
@@ -100,7 +100,7 @@ class SegmentLayout:
 
 @dataclass(frozen=True, repr=False)
 class FlexibleObject(ReprMixin):
-    """A flexible object as a model of rigid links with elastic joints.
+    """A model of a flexible object that consists of rigid links with elastic joints.
 
     Its frames are `object_root`, the segment tips `w_SEGMENT`, the link tips `SEGMENT_i_tip`, and points by arc length
     such as `SEGMENT:40%`, which do not depend on the number of links.
@@ -122,7 +122,7 @@ def flexible_object(
     name: str = "object",
     gravity_fraction: float = 1.0,
 ) -> FlexibleObject:
-    """Build a flexible object as chains of rigid links, with elastic joints before each link.
+    """Build a flexible object from chains of rigid links, with elastic joints before each link.
 
     Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`). Parameters are `SEGMENT.length` (or `.length_0`, ...), `.mass`,
     `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` if given). Raises
@@ -208,7 +208,7 @@ def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravi
 
 
 def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
-    """Compute the twist-free rotation (3, 3) of each edge of a polyline relative to the previous edge.
+    """Compute how each edge of a polyline is rotated from the previous edge, without twist, as matrices (3, 3).
 
     The rotations serve as a segment's `rest_rotation` and `link_rest_rotations`. `vertices` (k, 3) are the
     undeformed centre line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line;

@@ -1,4 +1,4 @@
-"""Symbolic kinematics and rigid-body mechanics of a kinematic tree in world-frame screw coordinates.
+"""Symbolic kinematics and rigid-body mechanics of a kinematic tree, with joint screws in the world frame.
 
 A spatial velocity consists of the angular velocity and the linear velocity of the body point at the world origin. A
 wrench consists of the moment about the world origin and the force. In one fixed frame the derivatives are cheap.
@@ -16,7 +16,7 @@ from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement, symbol
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Symbolic poses and screws of all joints of a mechanism at one configuration."""
+    """The symbolic poses and screws of all joints of a mechanism at one configuration."""
 
     mechanism: Mechanism
     joint_rotations: tuple[ca.SX, ...]  # from each joint's moving frame to the world, each (3, 3)
@@ -24,22 +24,22 @@ class Kinematics:
     joint_screws: tuple[ca.SX, ...]  # S_j, the spatial velocity per unit rate of joint j, each (6, 1)
 
     def frame_pose(self, frame: str | Frame) -> Placement:
-        """Pose of a frame, given by name or as a `Frame`, in the world."""
+        """Return the pose of a frame in the world. The frame is given by name or as a `Frame`."""
         entry = self._frame(frame)
         j, local = entry.joint_index, entry.placement
         return local if j < 0 else Placement(self.joint_rotations[j], self.joint_origins[j]) @ local
 
     def frame_position(self, frame: str | Frame) -> ca.SX:
-        """Position of a frame's origin in the world, shape (3, 1) [m]."""
+        """Return the position of a frame's origin in the world, shape (3, 1) [m]."""
         return self.frame_pose(frame).translation
 
     def position_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Jacobian of a frame's position in the world with respect to the configuration, shape (3, n)."""
+        """Return the Jacobian (3, n) of a frame's world position with respect to the configuration."""
         point = self.frame_position(frame)
         return self._columns(frame, lambda screw: screw[3:] + ca.cross(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Jacobian of a frame's angular velocity with respect to joint rates, in world axes, shape (3, n)."""
+        """Return the Jacobian (3, n) of a frame's angular velocity, in world axes, with respect to the joint rates."""
         return self._columns(frame, lambda screw: screw[:3])
 
     def _frame(self, frame: str | Frame) -> Frame:
@@ -54,7 +54,7 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class LagrangianFirstDerivatives:
-    """First derivatives of the rigid-body Lagrangian, and vectors from which the second derivatives follow.
+    """The first derivatives of the rigid-body Lagrangian, and vectors from which the second derivatives are computed.
 
     S_j is the screw of joint j and D_j = V_parent(j) x S_j, with the velocity V_parent(j) of the link before the joint.
     Ic_j, H_j and W_j are the inertia, momentum and weight of all bodies that joint j moves:
@@ -80,12 +80,12 @@ class LagrangianFirstDerivatives:
 
 
 def motion_cross_motion_product(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Spatial cross product a x b of two twists, angular part first, shape (6, 1)."""
+    """Compute the spatial cross product a x b of two twists, angular part first, shape (6, 1)."""
     return ca.vertcat(ca.cross(a[:3], b[:3]), ca.cross(a[:3], b[3:]) + ca.cross(a[3:], b[:3]))
 
 
 def motion_cross_force_product(a: ca.SX, f: ca.SX) -> ca.SX:
-    """Spatial cross product a x* f of a twist and a wrench, angular part first, shape (6, 1)."""
+    """Compute the spatial cross product a x* f of a twist and a wrench, angular part first, shape (6, 1)."""
     return ca.vertcat(ca.cross(a[:3], f[:3]) + ca.cross(a[3:], f[3:]), ca.cross(a[:3], f[3:]))
 
 
@@ -112,7 +112,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 
 
 def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> LagrangianFirstDerivatives:
-    """Compute the Lagrangian derivatives of a mechanism's bodies for velocities v (n, 1) and gravity (3, 1)."""
+    """Compute the first derivatives of the bodies' Lagrangian at velocities v (n, 1) with gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
@@ -187,14 +187,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 
 def mass_matrix(rigid: LagrangianFirstDerivatives, mechanism: Mechanism) -> ca.SX:
-    """Mass matrix (n, n) of the mechanism from its Lagrangian derivatives `rigid`."""
+    """Return the mass matrix (n, n) of the mechanism, computed from its Lagrangian derivatives `rigid`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(
     rigid: LagrangianFirstDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Second derivatives L_qq, L_qv, L_vv of the bodies' Lagrangian, each (n, n). Rows of L_qv belong to q."""
+    """Return the second derivatives L_qq, L_qv, L_vv (n, n) of the bodies' Lagrangian. Rows of L_qv belong to q."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
     by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
     by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))

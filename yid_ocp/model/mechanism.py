@@ -1,4 +1,4 @@
-"""Kinematic trees of rigid bodies, their components, and operations that combine trees."""
+"""Kinematic trees of rigid bodies, and operations that change or combine the trees."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from yid_ocp.model.parameters import Parameters
 
 @dataclass(frozen=True)
 class Placement:
-    """Symbolic rigid transform from a child frame to its parent: rotation (3, 3) and translation (3, 1) [m]."""
+    """A symbolic rigid transform from a child frame to its parent: rotation (3, 3) and translation (3, 1) [m]."""
 
     rotation: ca.SX
     translation: ca.SX
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> Placement:
-        """Make a placement from a numeric homogeneous matrix, shape (4, 4)."""
+        """Make a placement from a numeric homogeneous matrix (4, 4)."""
         array = snap_near_integer_entries(np.asarray(matrix, dtype=float))
         return Placement(ca.SX(ca.DM(array[:3, :3])), ca.SX(ca.DM(array[:3, 3])))
 
     @staticmethod
     def identity() -> Placement:
-        """Make the identity placement."""
+        """Make the identity placement, which neither rotates nor translates."""
         return Placement.from_matrix(np.eye(4))
 
     def __matmul__(self, other: Placement) -> Placement:
@@ -46,7 +46,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class Inertia:
-    """Mass [kg], centre of mass [m] and inertia tensor about it [kg m^2] of a rigid body, in its joint's frame.
+    """The mass [kg], centre of mass [m] and inertia tensor about that centre [kg m^2] of a body, in its joint's frame.
 
     `gravity_fraction` multiplies the weight of the body, not its inertia; None means 1.
     """
@@ -58,15 +58,15 @@ class Inertia:
 
     @staticmethod
     def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
-        """Make an inertia from mass [kg], centre (3,) [m] and tensor about the centre (3, 3) [kg m^2]."""
+        """Make an inertia from mass [kg], centre of mass (3,) [m] and tensor about that centre (3, 3) [kg m^2]."""
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
     def scaled_by(self, factor: ca.SX) -> Inertia:
-        """Multiply mass and inertia tensor by `factor`."""
+        """Return a copy whose mass and inertia tensor are multiplied by `factor`."""
         return replace(self, mass=self.mass * factor, inertia_about_com=self.inertia_about_com * factor)
 
     def transformed_by(self, placement: Placement) -> Inertia:
-        """Express the inertia in another frame, in which `placement` is the pose of the present frame."""
+        """Express the inertia in another frame. `placement` is the pose of the present frame in the other frame."""
         rotation = placement.rotation
         com = rotation @ self.center_of_mass + placement.translation
         return replace(self, center_of_mass=com, inertia_about_com=rotation @ self.inertia_about_com @ rotation.T)
@@ -74,7 +74,7 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Joint:
-    """One revolute or prismatic joint with its limits and the bodies attached to its moving side."""
+    """A revolute or prismatic joint with its limits and the bodies on its moving side."""
 
     name: str
     kind: Literal["revolute", "prismatic"]
@@ -89,7 +89,7 @@ class Joint:
 
     @property
     def coordinate_unit(self) -> str:
-        """Unit of the joint's coordinate: `rad` or `m`."""
+        """The unit of the joint's coordinate: `rad` or `m`."""
         return "rad" if self.kind == "revolute" else "m"
 
 
@@ -110,7 +110,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class ArcLengthChain:
-    """A chain of straight links with points located by arc-length fraction."""
+    """A chain of straight links on which a point is located by its fraction of the arc length."""
 
     tip_frames: tuple[str, ...]  # frame at the end of every link (at the link's translation), base to tip
     length_fractions: tuple[float, ...]  # fraction of the nominal arc length of each link; the sum is one
@@ -148,7 +148,7 @@ class Mechanism(ReprMixin):
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of the configuration vector."""
+        """The names of the joints, in the order of the configuration vector."""
         return tuple(joint.name for joint in self.joints)
 
     def joint_index(self, name: str) -> int:
@@ -158,7 +158,7 @@ class Mechanism(ReprMixin):
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:
-        """Whether a frame of this name exists. `T1:40%` exists if there is a segment `T1`."""
+        """Check whether a frame of this name exists. `T1:40%` exists if there is a segment `T1`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
 
     def frame(self, name: str) -> Frame:
@@ -179,7 +179,7 @@ class Mechanism(ReprMixin):
         return replace(end, placement=Placement(end.placement.rotation, part * end.placement.translation))
 
     def ancestor_joint_indices(self, index: int) -> tuple[int, ...]:
-        """Indices of the joints from the root to joint `index`, inclusive. They are empty for the world (-1)."""
+        """Return the indices of the joints from the root to joint `index`, inclusive. Empty for the world (-1)."""
         chain = []
         while index >= 0:
             chain.append(index)
@@ -189,7 +189,7 @@ class Mechanism(ReprMixin):
     def with_attached_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
-        """Return a copy with another mechanism, whose root has the pose `placement` (4, 4) in `frame` (None: world)."""
+        """Return a copy with another mechanism, attached at the pose `placement` (4, 4) in `frame` (None: world)."""
         root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
         if frame is not None:
@@ -219,7 +219,7 @@ class Mechanism(ReprMixin):
         return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
 
     def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
-        """Return a copy with a frame `name` at a fixed pose (4, 4) in `frame` (None: world)."""
+        """Return a copy with a new frame `name` at a fixed pose (4, 4) in `frame` (None: world)."""
         if name in self.frames:
             what, where = f"there is already a frame '{name}'", f"model '{self.name}'"
             raise ModelError(what, where=where, allowed="a new name", hint="choose another name for the frame")
@@ -228,13 +228,13 @@ class Mechanism(ReprMixin):
         return replace(self, frames={**self.frames, name: added})
 
     def with_gravity_fraction(self, fraction: ca.SX | None) -> Mechanism:
-        """Return a copy with this factor on the weight of every body; None means 1."""
+        """Return a copy in which the weight of every body is multiplied by `fraction`; None means 1."""
         bodies = [tuple(replace(b, gravity_fraction=fraction) for b in joint.bodies) for joint in self.joints]
         joints = tuple(replace(joint, bodies=own) for joint, own in zip(self.joints, bodies, strict=True))
         return replace(self, joints=joints)
 
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """Return a copy with numbers, from `values` or nominal, in place of all parameters."""
+        """Return a copy in which numbers replace all parameters. They come from `values` or are nominal."""
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)
         symbolic = list[ca.SX]()
 
@@ -254,7 +254,7 @@ class Mechanism(ReprMixin):
         return replace(mapped, parameters=Parameters())
 
     def with_joint_chain_added_at_index(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """Return a copy with a chain of joints added at list index `index`. Other joints keep their parents.
+        """Return a copy with a chain of joints inserted at list index `index`. Other joints keep their parents.
 
         The first joint's parent must precede `index`. The parent of each further joint is the previous joint of the
         chain.
@@ -272,7 +272,7 @@ class Mechanism(ReprMixin):
 
 
 def map_expressions(description: Any, change: Callable[[ca.SX], ca.SX]) -> Any:
-    """Apply `change` to every symbolic expression of a model description, except its parameters."""
+    """Apply the function `change` to every symbolic expression in a model description, except its parameters."""
     if isinstance(description, ca.SX):
         return change(description)
     if isinstance(description, tuple):
@@ -298,7 +298,7 @@ def _fraction(name: str, said: str) -> float:
 
 
 def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
-    """Combine rigidly connected bodies into one. Returns None without bodies or with zero total mass."""
+    """Combine rigidly connected bodies into one body. Returns None without bodies or with zero total mass."""
     entries = list(bodies)
     if not entries:
         return None
@@ -322,7 +322,7 @@ _SNAP_TOLERANCE = 1e-11
 
 
 def snap_near_integer_entries(matrix: Array) -> Array:
-    """Round matrix entries within `_SNAP_TOLERANCE` of -1, 0 or 1 to these numbers."""
+    """Round each matrix entry that lies within `_SNAP_TOLERANCE` of -1, 0 or 1 to that number."""
     result = np.array(matrix, dtype=float)
     for exact in (-1.0, 0.0, 1.0):
         result[np.abs(result - exact) < _SNAP_TOLERANCE] = exact
@@ -337,14 +337,14 @@ def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation matrix (3, 3) from roll, pitch, yaw [rad] as in URDF: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Compute a rotation matrix (3, 3) from roll, pitch, yaw [rad] as in URDF: Rz(yaw) Ry(pitch) Rx(roll)."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
     return np.array([x, [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], [-sp, cp * sr, cp * cr]])
 
 
 def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw [rad] of a rotation matrix (inverse of `rotation_from_rpy`)."""
+    """Compute roll, pitch and yaw [rad] from a rotation matrix (inverse of `rotation_from_rpy`)."""
     # roll is computed after removing yaw and pitch, which also works at and near pitch = 90 degrees
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
@@ -353,13 +353,13 @@ def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
 
 
 def rotation_from_axis_sin_cos(axis: ArrayLike, sine: float, cosine: float) -> Array:
-    """Rotation matrix from a unit axis and the sine and cosine of the angle (Rodrigues' formula)."""
+    """Compute a rotation matrix from a unit axis and the sine and cosine of the angle (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
 
 
 def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca.SX:
-    """Rotation matrix from a numeric unit axis and a symbolic angle [rad], shape (3, 3)."""
+    """Compute the rotation matrix (3, 3) of a numeric unit axis and a symbolic angle [rad]."""
     c, s = ca.cos(angle), ca.sin(angle)
     for k in range(3):
         if abs(abs(axis[k]) - 1.0) < 1e-15:
@@ -374,7 +374,7 @@ def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca
 
 
 def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
-    """Rotation matrix (3, 3) from symbolic roll, pitch and yaw (default 0) [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Compute the rotation matrix (3, 3) of symbolic roll, pitch, yaw (default 0) [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
     about_x = symbolic_rotation_from_axis_angle((1.0, 0.0, 0.0), roll)
     turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ about_x
     return ca.densify(turned if yaw is None else symbolic_rotation_from_axis_angle((0.0, 0.0, 1.0), yaw) @ turned)
@@ -385,5 +385,5 @@ def _skew(u: Array) -> Array:
 
 
 def transform_from_xyz_rpy(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Build a homogeneous matrix (4, 4) from a translation [m] and roll, pitch, yaw [rad]."""
+    """Build a homogeneous matrix (4, 4) from a translation [m] and the angles roll, pitch, yaw [rad]."""
     return homogeneous_transform(rotation_from_rpy(*np.asarray(rpy, float)), xyz)

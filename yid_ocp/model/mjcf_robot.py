@@ -1,4 +1,4 @@
-"""Read robots from MJCF files. MuJoCo compiles the file, and its bodies and joints are converted to those of URDF."""
+"""A reader of robot descriptions in MJCF files. MuJoCo compiles a file; bodies and joints are converted as in URDF."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _JOINT_EQUALITY, _WELD_EQUALITY, _SITE_OBJECT, _FREE_JOINT, _WORLD = 2, 1, 6, 0,
 
 
 def mjcf_robot_description(file: Path) -> SimpleNamespace:
-    """Read name, links and joints of an MJCF file in the form that `read_urdf` uses. Omitted elements are logged.
+    """Read the name, links and joints of an MJCF file, in the form that `read_urdf` uses. Omitted elements are logged.
 
     Each body becomes a link, and each site a frame. The inertia of a body is its `inertial` element or, without this
     element, computed by MuJoCo from the geoms. Coordinates are as in MuJoCo, including `ref`. A joint that a linear
@@ -50,7 +50,7 @@ def mjcf_robot_description(file: Path) -> SimpleNamespace:
 
 
 def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
-    """Nonzero constants of an MJCF file's joints, by joint and name. For other files the result is empty.
+    """Read the nonzero constants of an MJCF file's joints, by joint and name. Empty for other files.
 
     Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
     `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `mjcf_robot_description`.
@@ -235,7 +235,7 @@ def _shift(translation: Array) -> Array:
 
 
 def joint_motion_pose(axis: Array, amount: float, kind: str) -> Array:
-    """Pose (4, 4) of a prismatic or revolute joint of unit axis (3,) at the position `amount` [m or rad]."""
+    """Compute the pose (4, 4) of a prismatic or revolute joint with unit axis (3,) at position `amount` [m or rad]."""
     if kind == "prismatic":
         return _shift(amount * axis)
     return homogeneous_transform(rotation_from_axis_sin_cos(axis, math.sin(amount), math.cos(amount)), np.zeros(3))

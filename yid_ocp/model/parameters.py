@@ -17,7 +17,7 @@ from yid_ocp.errors import ConfigError, require_known_names
 
 @dataclass(frozen=True)
 class Parameter:
-    """One physical parameter: nominal value, SI unit, physical bounds and symbol."""
+    """A physical parameter with its nominal value, SI unit, physical bounds and symbol."""
 
     name: str  # `owner.quantity`, for example `T1.bend`; for an effect `kind@location.quantity`
     value: float
@@ -42,7 +42,7 @@ class Parameter:
 
 
 class Parameters(ReprMixin):
-    """A model's parameters in the order of the vector `theta`. Names are unique, and the sequence is immutable."""
+    """The parameters of a model, in the order of the vector `theta`. Names are unique; the sequence is immutable."""
 
     def __init__(self, entries: Iterable[Parameter] = ()) -> None:
         self._entries = tuple(entries)
@@ -59,12 +59,12 @@ class Parameters(ReprMixin):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameter names in the order of `theta`."""
+        """The names of the parameters, in the order of `theta`."""
         return tuple(entry.name for entry in self._entries)
 
     @property
     def symbols(self) -> ca.SX:
-        """Parameter symbols in the order of `theta`, shape (ntheta, 1)."""
+        """The symbols of the parameters, in the order of `theta`, shape (ntheta, 1)."""
         return ca.vertcat(*(entry.symbol for entry in self._entries)) if self._entries else ca.SX(0, 1)
 
     def __len__(self) -> int:
@@ -80,12 +80,12 @@ class Parameters(ReprMixin):
         return self._entries[self.index(name)]
 
     def index(self, name: str) -> int:
-        """Index of a parameter in `theta`. Raises `ConfigError`, which suggests the nearest name, if there is none."""
+        """Return the index of a parameter in `theta`. Raises `ConfigError`, with the nearest name, if there is none."""
         require_known_names([name], self._index, "parameter", "parameters of the model", ConfigError)
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """Values theta (ntheta,), nominal or from `values`. Raises `ConfigError` for an invalid name or value."""
+        """Return theta (ntheta,): nominal values, replaced by `values` where given. Raises `ConfigError` if invalid."""
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):
@@ -95,7 +95,7 @@ class Parameters(ReprMixin):
         return theta
 
     def with_nominal_values(self, values: Mapping[str, float]) -> Parameters:
-        """Return a copy with some other nominal values. Symbols stay the same."""
+        """Return a copy in which the named parameters have other nominal values. Symbols stay the same."""
         changed = list(self._entries)
         for name, value in values.items():
             changed[self.index(name)] = replace(self[name], value=float(value))
@@ -106,6 +106,6 @@ class Parameters(ReprMixin):
         return Parameters([*self._entries, *(entry for other in others for entry in other)])
 
     def lower_and_upper_bounds(self, names: Sequence[str]) -> tuple[Array, Array]:
-        """Lower and upper bounds of the named parameters, two arrays (len(names),)."""
+        """Return the lower and upper bounds of the named parameters, as two arrays (len(names),)."""
         chosen = [self[name] for name in names]
         return np.array([e.lower for e in chosen], dtype=float), np.array([e.upper for e in chosen], dtype=float)

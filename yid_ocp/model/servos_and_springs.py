@@ -101,7 +101,7 @@ MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
 
 @dataclass(frozen=True)
 class MotorKindAndPreset:
-    """Settings of a servo's motor. The kind is `ideal` or `dc`; a preset holds published data of a dc motor."""
+    """The settings of a servo's motor. The kind is `ideal` or `dc`; a preset holds published data of a dc motor."""
 
     kind: Annotated[
         _MotorKind,
@@ -122,7 +122,7 @@ class MotorKindAndPreset:
 
 @dataclass(frozen=True)
 class RobotJointSpring:
-    """Spring on a robot joint with stiffness [N m/rad or N/m] and rest position [rad or m]."""
+    """A spring on a robot joint, with its stiffness [N m/rad or N/m] and rest position [rad or m]."""
 
     stiffness: float
     rest_position: float = 0.0
@@ -130,7 +130,7 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class ServoModelOptions:
-    """Settings of the model of all position servos. Their gains are parameters, not settings."""
+    """The model settings that all position servos share. Their gains are parameters, not settings."""
 
     command_interpolation: Annotated[
         _CommandInterpolation,
@@ -160,7 +160,7 @@ class ServoModelOptions:
 
 @dataclass(frozen=True)
 class PositionServo:
-    """Position servo on one joint. It converts the commanded coordinate u into a torque.
+    """A position servo on one joint, which converts the commanded coordinate u into a torque.
 
         ideal:  torque = clip(gain (e + integral z) - damping dq/dt)
         dc:     torque = clip(gain (e + integral z) - derivative dq/dt) - damping dq/dt
@@ -184,7 +184,7 @@ class PositionServo:
     torque_constant: float | None = None  # published one of a dc motor [N m/A]
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Servo torque [N m] or force [N] for the commanded coordinate, the coordinate q and the rate v."""
+        """Compute the servo torque [N m] or force [N] from the commanded coordinate, coordinate q and rate v."""
         on = command < MOTOR_OFF_COMMAND / 2
         error, drag = self.position_error_beyond_dead_band(command, q), self.damping * v
         error = error if self.integral.is_zero() else error + self.integral
@@ -196,7 +196,7 @@ class PositionServo:
         return ca.if_else(on, torque, 0)
 
     def position_error_beyond_dead_band(self, command: ca.SX, q: ca.SX) -> ca.SX:
-        """Position error beyond the dead band [rad or m]. It is zero while the motor is off."""
+        """Return the position error beyond the dead band [rad or m]. It is zero while the motor is off."""
         error = ca.if_else(command < MOTOR_OFF_COMMAND / 2, command, q) - q
         if self.dead_band.is_zero():
             return error
@@ -210,7 +210,7 @@ def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
 
 
 def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
-    """Make the parameters `JOINT.stiffness` and `JOINT.rest` of a robot joint's spring."""
+    """Make the parameters `JOINT.stiffness` and `JOINT.rest` for the spring of a robot joint."""
     unit = tree.joints[tree.joint_index(joint)].coordinate_unit
     per = "N m/rad" if unit == "rad" else "N/m"
     return (

@@ -39,7 +39,7 @@ _GRASP_EQUATION_NAMES = {
 
 @dataclass(frozen=True)
 class Grasp:
-    """A grasp that makes the origins of an object's and a holder's frame coincide. Some kinds also align axes."""
+    """A grasp that keeps a point of the object at a point of its holder. Some kinds also align axes."""
 
     name: str
     """`left`, `right`, `gripper`, or a clamp's name."""
@@ -60,16 +60,16 @@ class Grasp:
 
     @property
     def n_constraint_equations(self) -> int:
-        """Number of scalar constraint equations of the grasp."""
+        """The number of scalar constraint equations of the grasp."""
         return len(_GRASP_EQUATION_NAMES[self.kind])
 
     @property
     def constraint_equation_names(self) -> tuple[str, ...]:
-        """Names of the constraint equations: positions such as `left.x`, then tilts or rotations."""
+        """The names of the constraint equations: positions such as `left.x`, then tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual phi(q), holder minus held, as a column: position [m], then orientation [rad]."""
+        """Return the constraint residual phi(q), holder minus held, a column: position [m], then orientation [rad]."""
         holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
         held = kinematics.frame_pose(self.held_frame)
         rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
@@ -81,7 +81,7 @@ class Grasp:
         return ca.vertcat(*rows)
 
     def holder_minus_held_axis_directions(self, kinematics: Kinematics) -> ca.SX:
-        """Holder minus held axes (0, 3 or 9 rows). Unlike `constraint_residual` it is nonzero for opposite axes."""
+        """Return the holder's axes minus the held axes (0, 3 or 9 rows). Opposite axes do not give zero."""
         if self.kind == "point":
             return ca.SX(0, 1)
         holder, held = (kinematics.frame_pose(name).rotation for name in (self.holder_frame, self.held_frame))
@@ -91,7 +91,7 @@ class Grasp:
 
 @dataclass(frozen=True)
 class MidpointStateSymbols:
-    """Symbols at the midpoint of one step, on which energies and forces may depend.
+    """The symbols at the midpoint of one time step, on which energies and forces may depend.
 
     The coordinates q and internal coordinates z are means of both nodes; v and z_rate are differences divided by h.
     """
@@ -110,7 +110,7 @@ class MidpointStateSymbols:
 
 @dataclass(frozen=True)
 class NodeStateSymbols:
-    """Symbols at one node of a trajectory, on which measurements may depend.
+    """The symbols at one node of a trajectory, on which measurements may depend.
 
     `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; the
     acceleration `a` is their difference over h, with an error of order h^2. At the first and last node, `v` is the
@@ -133,7 +133,7 @@ class NodeStateSymbols:
 
 @dataclass(frozen=True)
 class ForceWithFactoredDerivatives:
-    """A dissipative generalized force F(q, v) of wrenches on bodies, with its derivatives, (n, 1) [N m or N].
+    """A dissipative generalized force F(q, v) from wrenches on bodies, with its derivatives, (n, 1) [N m or N].
 
     S_j and D_j are as in `LagrangianFirstDerivatives`. A_j and T_j are the columns of A and T (6, n). For i an
     ancestor of joint j or j itself:
@@ -148,7 +148,7 @@ class ForceWithFactoredDerivatives:
 
 @dataclass(frozen=True)
 class EffectStepTerms:
-    """Energy, generalized forces and internal equations that an effect adds to one step. Forces: (n, 1) [N m or N]."""
+    """The energy, forces and internal equations that an effect adds to one step. Forces: (n, 1) [N m or N]."""
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
     generalized_force: ca.SX | None = None  # F(q, v, u, z)
@@ -163,7 +163,7 @@ class EffectStepTerms:
 
 @dataclass(frozen=True)
 class Effect:
-    """Base class of additions to the nominal model, such as friction. The base class itself changes nothing.
+    """The base class of effects, such as friction, that extend the nominal model. The base class changes nothing.
 
     With neutral parameters a subclass leaves the nominal model unchanged. `reading_from_true_value` computes a reading.
     Its inverse `true_value_from_reading` computes the true value of recorded inputs (torques that drive the model,
@@ -181,11 +181,11 @@ class Effect:
         return system
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
-        """Return the energy, forces and internal equations that this effect adds to a step at its midpoint."""
+        """Return the energy, forces and internal equations that this effect adds to a time step at its midpoint."""
         return EffectStepTerms()
 
     def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
-        """Predict a reading from the error-free `output`. `channel` is `group.point` or `joints.quantity.JOINT`."""
+        """Predict a sensor reading from its error-free value. `channel` is `group.point` or `joints.quantity.JOINT`."""
         return output
 
     def true_value_from_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
@@ -193,14 +193,14 @@ class Effect:
         return reading
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """Added delay [s] of a channel, named as in `reading_from_true_value`: recorded minus true time of a sample.
+        """Return the delay [s] that this effect adds to a channel: the recorded minus the true time of a sample.
 
         `camera` marks points of a camera. For a driving torque, `torque.JOINT`, the delay is from recording to action.
         """
         return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
-        """Time constant [s] of a channel's first-order lag.
+        """Return the time constant [s] of a channel's first-order lag.
 
         For `torque.JOINT`, the applied torque lags behind the recorded torque. For `joints.effort.JOINT`, the recorded
         effort lags behind the true effort.
@@ -231,7 +231,7 @@ class _ServoIntegral(Effect):
 
 
 class SystemBuildArguments(TypedDict, total=False):
-    """Keyword arguments of `System.build`, such as objects, grasps and driven joints."""
+    """The keyword arguments of `System.build`, such as objects, grasps and driven joints."""
 
     objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]]
     """Each object with its parent frame among the previous parts (None: world) and its pose (4, 4) in this frame."""
@@ -253,7 +253,7 @@ class SystemBuildArguments(TypedDict, total=False):
 
 @dataclass(frozen=True, repr=False)
 class System(ReprMixin):
-    """Complete model of robot and object: parameters, springs, dampers, grasps, inputs and effects."""
+    """The complete model of robot and object, with parameters, springs, dampers, grasps, inputs and effects."""
 
     mechanism: Mechanism
     parameters: Parameters
@@ -347,38 +347,38 @@ class System(ReprMixin):
 
     @property
     def n_coordinates(self) -> int:
-        """Number n of generalized coordinates."""
+        """The number n of generalized coordinates."""
         return len(self.mechanism.joints)
 
     @property
     def n_constraints(self) -> int:
-        """Total number m of scalar constraint equations of all grasps."""
+        """The total number m of scalar constraint equations of all grasps."""
         return sum(grasp.n_constraint_equations for grasp in self.grasps)
 
     @cached_property
     def actuated_coordinate_indices(self) -> tuple[int, ...]:
-        """Indices in q of the joints that inputs u drive, in the order of `driven`."""
+        """The indices in q of the joints that the inputs u drive, in the order of `driven`."""
         return tuple(self.mechanism.joint_index(name) for name in self.driven)
 
     @cached_property
     def prescribed_coordinate_indices(self) -> tuple[int, ...]:
-        """Indices in q of the joints with prescribed motion."""
+        """The indices in q of the joints whose motion is prescribed."""
         return tuple(self.mechanism.joint_index(name) for name in self.prescribed)
 
     @cached_property
     def unprescribed_coordinate_indices(self) -> tuple[int, ...]:
-        """Indices in q of the joints without prescribed motion."""
+        """The indices in q of the joints whose motion is not prescribed."""
         return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_coordinate_indices)
 
     @cached_property
     def symbols_and_kinematics(self) -> tuple[ca.SX, Kinematics]:
-        """Symbols q of a configuration, (n, 1), and the kinematics there, which several functions share."""
+        """The symbols q (n, 1) of a configuration and the kinematics at q, which several functions share."""
         q = ca.SX.sym("q", self.n_coordinates)
         return q, forward_kinematics(self.mechanism, q)
 
     @property
     def effect_internal_coordinate_symbols(self) -> dict[str, ca.SX]:
-        """Symbols of the effects' internal coordinates by name, in the order of z. Grasps and placements use them."""
+        """The symbols of effects' internal coordinates by name, in the order of z. Grasps and placements use them."""
         return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
     def layout_of_segment(self, name: str) -> SegmentLayout:
@@ -393,7 +393,7 @@ class System(ReprMixin):
         return replace(mapped, effects=self.effects)
 
     def numeric_mechanism(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """Mechanism with numbers, from `values` or nominal, in place of all parameters."""
+        """Return the mechanism with numbers, from `values` or nominal, in place of all parameters."""
         key = tuple(self.parameters.vector(values).tolist())
         found = self._last_numeric_mechanism.get(key)
         if found is None:
@@ -408,13 +408,13 @@ class System(ReprMixin):
         return {}
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
-        """Elastic energy of all elastic joints [J]: the sum of 1/2 stiffness (q - rest)^2."""
+        """Return the elastic energy of all elastic joints [J], the sum of 1/2 stiffness (q - rest)^2."""
         index = self.mechanism.joint_index
         terms = (0.5 * s.stiffness * (q[index(s.joint_name)] - s.rest_angle) ** 2 for s in self.elastic_joints)
         return sum(terms, ca.SX(0))
 
     def viscous_force(self, v: ca.SX) -> ca.SX:
-        """Generalized force of all viscous dampers at velocity v, shape (n, 1) [N m]."""
+        """Return the generalized force of all viscous dampers at velocity v, shape (n, 1) [N m]."""
         force, index = [ca.SX(0)] * self.n_coordinates, self.mechanism.joint_index
         dampers = [(spring.joint_name, spring.damping) for spring in self.elastic_joints]
         for joint, coefficient in (*dampers, *self.joint_damping.items()):
@@ -422,7 +422,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """Generalized force (n, 1) [N m] of motor torques or servo commands u, at coordinates q and velocities v."""
+        """Return the generalized force (n, 1) [N m] of motor torques or servo commands u, at position q and rate v."""
         force = [ca.SX(0)] * self.n_coordinates
         for row, (joint, index) in enumerate(zip(self.driven, self.actuated_coordinate_indices, strict=True)):
             servo = self.servos.get(joint)
@@ -430,7 +430,7 @@ class System(ReprMixin):
         return ca.vertcat(*force)
 
     def gravity_and_grasp_force_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
-        """Generalized force [N m or N] at coordinate `index` from grasps and the weight of all bodies that it moves."""
+        """Return the force [N m or N] that grasps and the weight of moved bodies exert on coordinate `index`."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)
         for j, joint in enumerate(tree.joints):
@@ -443,23 +443,23 @@ class System(ReprMixin):
         return force
 
     def gear_torque_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
-        """Torque [N m or N] through the gear of a driven joint: input minus weight and grasps beyond."""
+        """Return the torque [N m or N] that the gear of a driven joint carries: the input minus weight and grasps."""
         outside = self.gravity_and_grasp_force_on_coordinate(state, index)
         return self.input_force(state.u, state.q, state.v)[index] - outside
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual phi(q) of all grasps, shape (m, 1)."""
+        """Return the constraint residual phi(q) of all grasps, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))
 
     def constraint_relaxation_times(self) -> ca.SX | None:
-        """Relaxation times T (m, 1) [s] of the constraints phi + T dphi/dt = C lam / h. None if no grasp has one."""
+        """Return the relaxation times T (m, 1) [s] in phi + T dphi/dt = C lam / h. None if no grasp has one."""
         if all(grasp.relaxation_time is None for grasp in self.grasps):
             return None
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
         return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
     def constraint_compliance_diagonal(self) -> ca.SX:
-        """Constraint compliances (m, 1): the diagonal of C in phi(q_{k+1}) = C lam_k / h."""
+        """Return the constraint compliances (m, 1), the diagonal of C in phi(q_{k+1}) = C lam_k / h."""
         return ca.vertcat(ca.SX(0, 1), *(g.compliance for g in self.grasps for _ in range(g.n_constraint_equations)))
 
 

@@ -1,4 +1,4 @@
-"""Read and write mechanisms as URDF."""
+"""Functions that read and write mechanisms as URDF."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def read_urdf(
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
 ) -> Mechanism:
-    """Read a mechanism from a URDF or MJCF file. Chosen joints are movable, all others are locked.
+    """Read a mechanism from a URDF or MJCF file. The chosen joints can move, and all others are locked.
 
     Each movable joint has the parameter `JOINT.mass` [kg], which also scales the inertia of its bodies. Links without a
     movable joint before them are fixed to the world. Every link is a frame of the same name. Raises `ModelError` for a
@@ -447,7 +447,7 @@ def _unit_axis(joint: Any) -> Array:
 
 
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
-    """Write a mechanism as URDF text. Each joint's bodies become one link, each frame a link on a fixed joint.
+    """Write a mechanism as URDF text. The bodies of each joint become one link, and each frame a link on a fixed joint.
 
     `read_urdf` reads the same numbers back to 1e-12.
     """

@@ -1,4 +1,4 @@
-"""Parallel work in threads, processes and on cluster workers. Long work of other packages runs here."""
+"""Parallel work in threads, processes and on cluster workers. Other packages run their long work here."""
 
 from yid_ocp.parallel.resumable_tasks import LOCAL_WORKER_CONFIG as LOCAL_WORKER_CONFIG
 from yid_ocp.parallel.resumable_tasks import Task as Task

@@ -1,4 +1,4 @@
-"""Run tasks in local processes or on a scheduler's workers, and store their results.
+"""Tasks that run in local processes or on a scheduler's workers, with stored results.
 
 A task is a call of a module-level function with plain data and paths. Its result is one JSON file, which its worker
 writes in one operation. The file name is the hash of the function's name, the sources that it depends on, and the
@@ -44,7 +44,7 @@ TaskProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Task:
-    """Arguments of one call of a task function, and a name for display."""
+    """The arguments for one call of a task function, and a name for display."""
 
     name: str  # for display only, without influence on resuming
     arguments: Mapping[str, Any]  # text, numbers, None, lists and mappings of them, and `Path` for what is read
@@ -52,7 +52,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Return value of a task, read from its file, or the reason why it failed."""
+    """The return value of a task, read from its file, or the reason why the task failed."""
 
     name: str
     value: Any = None
@@ -63,7 +63,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Workers of a run: local processes or a Dask scheduler (address or file). Raises `ConfigError` for both."""
+    """The workers of a run: local processes, or a Dask scheduler (address or file). Raises `ConfigError` for both."""
 
     n_processes: int | None = None
     scheduler_address: str = ""
@@ -77,7 +77,7 @@ class WorkerConfig:
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_scheduler_available(self) -> None:
-        """Raise `ParallelWorkError` if no scheduler answers or a worker is unsuitable. Call it before long work."""
+        """Check that a scheduler answers and its workers are suitable, before long work. Raises `ParallelWorkError`."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
                 pass
@@ -95,7 +95,7 @@ def run_tasks(
     progress: TaskProgressCallback | None = None,
     code: str | None = None,
 ) -> list[TaskResult]:
-    """Run a function for all tasks and return results in their order. Results stored in `folder` are reused.
+    """Run a function for all tasks and return the results in the same order. Results stored in `folder` are reused.
 
     A task that raises writes `HASH.error.json` and a warning. The other tasks continue, and the next run repeats the
     failed task. After an interruption, finished results are kept. Workers whose sources differ from this process do not
@@ -137,7 +137,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Return all tasks' values. Raises `ParallelWorkError` for failures with a known cause, else `RuntimeError`."""
+    """Return the values of all tasks. `ParallelWorkError` for failures with a known cause, else `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]

@@ -29,7 +29,7 @@ _Answer = TypeVar("_Answer")
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Apply a function to items in all available threads. Returns results in the order of the items."""
+    """Apply a function to items in all available threads. Returns the results in the order of the items."""
     entries = list(items)
     workers = min(len(entries), _max_threads())
     if workers < 2:
@@ -40,7 +40,7 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item])
 
 
 def available_processor_count() -> int:
-    """Number of processors available to this process."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -65,7 +65,7 @@ CASADI_LOCK = threading.RLock()
 
 
 class CasadiLockedCache(Generic[_Key, _Value]):
-    """Cache of values by key. `compute_value` computes each value once from its key, under the CasADi lock."""
+    """A cache that computes the value of each key once, under the CasADi lock, with `compute_value`."""
 
     def __init__(self, compute_value: Callable[[_Key], _Value]) -> None:
         self._make = compute_value
@@ -159,7 +159,7 @@ def _answer(requests: Sequence[_Request]) -> None:
 def call_merged_with_other_threads(
     function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
 ) -> list[_Answer]:
-    """Evaluate `questions` in one batch with those of other items of `map_with_merged_calls`."""
+    """Evaluate `questions` in one batch with the questions from other items of `map_with_merged_calls`."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
@@ -168,7 +168,7 @@ def call_merged_with_other_threads(
 
 
 def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Apply a function to items concurrently, so that simulations of different items run together as one batch.
+    """Apply a function to items concurrently, so that simulations of different items run together in one batch.
 
     The calls of `call_merged_with_other_threads` are merged. At most as many items run as there are threads. Which
     calls are merged depends only on the items. An item must not hold a lock during such a call.
@@ -217,7 +217,7 @@ def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[
 
 
 class InlineExecutor(Executor):
-    """An executor that runs each call at once in the calling process, for small work."""
+    """An executor for small work that runs each call at once in the calling process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run a call and return a completed future with its result or exception."""

@@ -1,4 +1,4 @@
-"""Plan informative motions that identify parameters or discriminate between similar effects."""
+"""Planning of motions that best identify parameters or distinguish similar effects."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class _ParameterPrecision:
 
 @dataclass(frozen=True, eq=False)
 class InformativeMotionPlan(PlannedMotion):
-    """Best informative motion found, with predicted standard deviations and distances between effects."""
+    """The most informative motion found, with predicted standard deviations and distances between effects."""
 
     parameter_precisions: Mapping[str, _ParameterPrecision]
     # for each pair of effects: distance of the first effect's change from its best imitation by the second effect and
@@ -68,7 +68,7 @@ def plan_informative_motion(
     effects: Mapping[str, Mapping[str, float]] | None = None,
     progress: Progress = NULL_PROGRESS,
 ) -> InformativeMotionPlan:
-    """Plan the arm motion, within limits, that best identifies parameters or discriminates between effects.
+    """Plan the arm motion, within limits, that best identifies parameters or distinguishes effects.
 
     Raises `ConfigError`, `ModelError` or `DataError` if a parameter or effect does not exist or is unobservable, if no
     motion is possible within the limits, if there is no start equilibrium, or if a sensor has no noise level. Raises

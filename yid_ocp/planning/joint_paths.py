@@ -1,4 +1,4 @@
-"""Settings, joint paths and equilibria of planned motions, and their simulation."""
+"""Settings, joint paths, equilibria and simulation of planned motions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PlanGoal = Literal["place", "path", "box", "information"]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """Limits of a planned motion on velocity, acceleration, effort and spring angles."""
+    """The limits of a planned motion on velocity, acceleration, effort and spring angles."""
 
     velocity_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("used fraction of the URDF's velocity limits")] = 0.9
     max_acceleration: Annotated[float, Gt(0), OptionInfo("limit of every joint", "rad/s^2 or m/s^2")] = 20.0
@@ -42,7 +42,7 @@ class PlanLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions:
-    """Goal, duration and numerics of a planned motion of the arms."""
+    """The goal, duration and numerical settings of a planned motion of the arms."""
 
     goal: Annotated[
         _PlanGoal,
@@ -109,7 +109,7 @@ class PlanOptions:
 
 
 class FramePositionEvaluator:
-    """World positions of named frames, and their Jacobian with respect to the configuration.
+    """A function of the configuration that gives world positions of named frames and their Jacobian.
 
     Raises `ConfigError` if a frame does not exist.
     """
@@ -128,7 +128,7 @@ class FramePositionEvaluator:
             self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
 
     def positions_and_jacobian(self, q: Array, theta: Array) -> tuple[Array, Array]:
-        """Positions (N, 3 np) [m] of np frames at configurations (N, n), and their Jacobian (N, 3 np, n)."""
+        """Return positions (N, 3 np) [m] of np frames at configurations (N, n), and their Jacobian (N, 3 np, n)."""
         at, slope = (np.array(x).T for x in self._function(np.asarray(q).T, np.asarray(theta)))
         return at, slope.reshape(len(at), at.shape[1], np.shape(q)[1])
 
@@ -139,7 +139,7 @@ _N_REST_CONTROL_POINTS = 3  # equal control points at each end, for zero velocit
 
 @dataclass(frozen=True)
 class RestToRestSplineBasis:
-    """Spline path of joints between standstills: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
+    """A spline path of joints from rest to rest: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
     The coefficients w_k are the control points. The spline has degree 5 and clamped ends. The path and its derivatives
     lie within the convex hulls of their control points, so limits on control points hold at all times, not only at
@@ -159,17 +159,17 @@ class RestToRestSplineBasis:
         return BSpline(knots, controls, _SPLINE_DEGREE).derivative(order)
 
     def coefficients_to_control_points_matrix(self, order: int = 0) -> Array:
-        """Matrix (..., K) from K coefficients to the control points of the spline or its `order`-th time derivative."""
+        """Return the matrix (..., K) from coefficients to the control points of the spline's `order`-th derivative."""
         splines = self._splines(order)
         return np.asarray(splines.c[: len(splines.t) - splines.k - 1])
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
-        """Values (N, K) of the K basis functions, or of their `order`-th time derivative, at the times `t` (N,) [s]."""
+        """Return the values (N, K) of K basis functions or their `order`-th time derivatives at times `t` (N,) [s]."""
         values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight_line_coefficients(self, change: Array) -> Array:
-        """Coefficients (K, nj) of a straight line in joint space with the displacement `change` (nj,)."""
+        """Return the coefficients (K, nj) of a straight line in joint space with the displacement `change` (nj,)."""
         t = np.linspace(0.0, self.duration, 200)
         s = t / self.duration
         smooth = s**3 * (10 - 15 * s + 6 * s**2)
@@ -179,7 +179,7 @@ class RestToRestSplineBasis:
 
 @dataclass(frozen=True, eq=False)
 class PathSimulator:
-    """Simulates a system, initially at rest, whose prescribed joints follow a spline path."""
+    """A simulator of a system, initially at rest, whose prescribed joints follow a spline path."""
 
     step: Step  # all moving joints are prescribed, none is driven
     theta: Array  # (ntheta,)
@@ -189,30 +189,30 @@ class PathSimulator:
 
     @property
     def moved_joint_indices(self) -> list[int]:
-        """Indices of the moved joints in the configuration vector."""
+        """The indices of the moved joints in the configuration vector."""
         return list(self.step.system.prescribed_coordinate_indices)
 
     @property
     def moved_joint_start_positions(self) -> Array:
-        """Start positions of the moved joints, shape (nc,) [rad or m]."""
+        """The start positions of the moved joints, shape (nc,) [rad or m]."""
         return np.asarray(self.start_equilibrium.state[self.moved_joint_indices])
 
     def coefficient_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the coefficients from joint position limits, each (K, nc)."""
+        """Return the lower and upper bounds of the coefficients, from the joints' position limits, each (K, nc)."""
         shape, limits = (self.path.n_coefficients, 1), _position_limits(self.step.system)
         lower, upper = (np.tile(side - self.moved_joint_start_positions, shape) for side in limits)
         return lower, upper
 
     @cached_property
     def node_times(self) -> Array:
-        """Times of the nodes from the start of the motion, shape (N + 1,) [s]."""
+        """The times of the nodes from the start of the motion, shape (N + 1,) [s]."""
         moving = round(self.path.duration / self.step.time_step)
         standing = max(1, round(self.hold_duration / self.step.time_step))
         return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
 
     @cached_property
     def node_indices_after_motion(self) -> IntArray:
-        """Indices of the nodes at which the motion has ended and the joints stand still."""
+        """The indices of the nodes at which the motion has ended and the joints stand still."""
         return np.flatnonzero(self.node_times >= self.path.duration - 1e-9)
 
     @cached_property
@@ -220,11 +220,11 @@ class PathSimulator:
         return self.path.basis_values(self.node_times)
 
     def joint_positions(self, w: Array) -> Array:
-        """Positions (N + 1, nc) of the moved joints at the nodes, for spline coefficients `w` (K, nc)."""
+        """Return the positions (N + 1, nc) of the moved joints at the nodes, for spline coefficients `w` (K, nc)."""
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """Simulate a path `w` (K, nc), with sensitivities to parameters `names`, then to `w` if `slopes`."""
+        """Simulate the path with coefficients `w` (K, nc), with sensitivities to `names` and, if `slopes`, to `w`."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
@@ -242,13 +242,13 @@ class PathSimulator:
         return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
 
     def frame_positions_along_states(self, frames: FramePositionEvaluator, state: Array) -> Array:
-        """Positions of frames along a trajectory (N, nx), shape (N, frames, 3) [m]."""
+        """Return the positions of frames along a trajectory (N, nx), shape (N, frames, 3) [m]."""
         q = state[:, : self.step.system.n_coordinates]
         return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
 
     @property
     def start_system_configuration(self) -> Array:
-        """Configuration q at the start, shape (n,)."""
+        """The configuration q of the system at the start, shape (n,)."""
         return np.asarray(self.start_equilibrium.state[: self.step.system.n_coordinates])
 
 
@@ -259,7 +259,7 @@ TARGET_REACHED_TOLERANCE_FACTOR = 1.5  # in position tolerances; beyond it, a ta
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A planned motion of the arms, with its simulator, rollout, success and message."""
+    """A planned motion of the arms, with its simulator, simulated motion, success and message."""
 
     simulator: PathSimulator
     spline_coefficients: Array  # (K, nc)
@@ -269,37 +269,37 @@ class PlannedMotion:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the moved joints."""
+        """The names of the moved joints."""
         return self.simulator.step.system.prescribed
 
     @property
     def t(self) -> Array:
-        """Times of the nodes, shape (N + 1,) [s]."""
+        """The times of the nodes, shape (N + 1,) [s]."""
         return self.simulator.node_times
 
     @property
     def joint_positions(self) -> Array:
-        """Positions of the moved joints, shape (N + 1, nc) [rad or m]."""
+        """The positions of the moved joints, shape (N + 1, nc) [rad or m]."""
         return self.simulator.joint_positions(self.spline_coefficients)
 
     @property
     def joint_velocities(self) -> Array:
-        """Velocities of the moved joints, shape (N + 1, nc) [rad/s or m/s]."""
+        """The velocities of the moved joints, shape (N + 1, nc) [rad/s or m/s]."""
         return self.simulator.path.basis_values(self.t, 1) @ self.spline_coefficients
 
     @property
     def joint_accelerations(self) -> Array:
-        """Accelerations of the moved joints, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
+        """The accelerations of the moved joints, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
         return self.simulator.path.basis_values(self.t, 2) @ self.spline_coefficients
 
     @property
     def joint_efforts(self) -> Array:
-        """Required efforts of the moved joints, shape (N + 1, nc) [N m or N]. The last row is repeated."""
+        """The efforts that the moved joints need, shape (N + 1, nc) [N m or N]. The last row is repeated."""
         return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
 
     @cached_property
     def point_trajectories(self) -> dict[str, Array]:
-        """World trajectories (N + 1, 3) [m] of the system's points and of the target point, if any, by name."""
+        """The world trajectories (N + 1, 3) [m] of the system's points and of the target point, if any, by name."""
         system = self.simulator.step.system
         names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
         places = self.simulator.frame_positions_along_states(FramePositionEvaluator(system, names), self.rollout.state)
@@ -316,7 +316,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 
 
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
-    """Start positions (nc,) of the moved joints. Raises `ConfigError` if one is missing or out of range."""
+    """Return the start positions (nc,) of the moved joints. `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
@@ -337,7 +337,7 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
 
 
 def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, guess: Array | None = None) -> Equilibrium:
-    """Solve for the equilibrium at which a motion begins, near the configuration `guess` if given.
+    """Compute the equilibrium at which a motion begins, near the configuration `guess` if given.
 
     Raises `ModelError` if there is no equilibrium, for example because a grasp cannot be closed.
     """
@@ -352,7 +352,7 @@ def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, gues
 def check_rest_effort_and_spring_limits(
     step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str
 ) -> None:
-    """Raise `ConfigError` if efforts or spring angles exceed their limits at the equilibrium `rest`."""
+    """Check that efforts and spring angles at the equilibrium `rest` are within limits. Raises `ConfigError`."""
     system, joints = step.system, step.system.mechanism.joints
     efforts = zip(system.prescribed_coordinate_indices, simulate(step, theta, rest.state, 1).effort[0], strict=True)
     springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
@@ -417,7 +417,7 @@ def solve_equilibrium_at_point_target(
 
 
 def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """Cache a function's latest value, because searches request residual and Jacobian at the same point."""
+    """Wrap a function so that it remembers its latest value, because searches ask twice for the same point."""
     last: list[tuple[Array, _Value]] = []
 
     def at(x: Array) -> _Value:

@@ -1,4 +1,4 @@
-"""Plan a motion that brings a point to a target: statics gives the final equilibrium, shooting the path."""
+"""Planning of a motion that brings a point to a target: statics gives the final equilibrium, shooting the path."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _CONVERGED_TOLERANCE_FRACTION = 0.1  # change after halving, as a fraction of th
 
 @dataclass(frozen=True)
 class ParameterCovarianceBeforePlan:
-    """Covariance matrix of uncertain model parameters, in the order of `parameter_names`."""
+    """The covariance matrix of uncertain model parameters, in the order of `parameter_names`."""
 
     parameter_names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -69,7 +69,7 @@ def plan_motion_to_target(
     known: ParameterCovarianceBeforePlan | None = None,
     progress: Progress = NULL_PROGRESS,
 ) -> TargetMotionPlan:
-    """Plan a motion of a step's prescribed joints that brings a point to a target.
+    """Plan a motion of the prescribed joints that brings a point to a target.
 
     `theta` holds the parameter values; default: those of the system. `known` is the covariance of uncertain parameters.
     If no motion keeps the limits, the result is still a plan, whose `message` names the violated limit and the excess.

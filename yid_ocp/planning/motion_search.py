@@ -1,4 +1,4 @@
-"""Search for motions within limits that reach a goal or maximise information.
+"""Search for motions within limits that reach a goal or give the most information.
 
 To reach a goal, single shooting is used. The trust region keeps the bounds of the unknowns. An augmented Lagrangian
 keeps all other limits: a row g <= u adds rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until all rows
@@ -50,7 +50,7 @@ def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array,
 
 @dataclass(eq=False)
 class PlanResidualAndLimitFunctions:
-    """Goal residuals and limited quantities of a planned motion, as functions, for one set of model parameters."""
+    """The functions that compute the goal residuals and limited quantities of a planned motion."""
 
     simulator: PathSimulator
     options: PlanOptions
@@ -69,7 +69,7 @@ class PlanResidualAndLimitFunctions:
 
     @property
     def desired_point_trajectory(self) -> Array | None:
-        """Reference position of the point at every node, (N + 1, 3) [m]. None if only the end position counts."""
+        """The reference position of the point at every node, (N + 1, 3) [m]. None if only the end position counts."""
         if self.options.goal != "path":
             return None
         begin = self.simulator.start_system_configuration[None]
@@ -106,7 +106,7 @@ class PlanResidualAndLimitFunctions:
         return parts
 
     def limited_values_and_jacobian(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
-        """Values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
+        """Return the values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
         Also returns their Jacobian (rows, K nc) with respect to the spline coefficients, K for each of nc prescribed
         joints, or None if `rollout` has no sensitivities.
@@ -150,12 +150,12 @@ class PlanResidualAndLimitFunctions:
         return found
 
     def split_values_by_limit_kind(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
-        """Iterate over pairs (limit rows, values), one per kind of limit. `value` is ordered as `limit_rows`."""
+        """Split `value`, ordered as `limit_rows`, into pairs (limit rows, values), one for each kind of limit."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
     def worst_value_and_bound_by_violated_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
-        """For each kind of limit that `value` violates: name, value and bound of the row that violates it most."""
+        """Return the worst row of each violated kind of limit: its name, value and bound."""
         found = {}
         for rows, own in self.split_values_by_limit_kind(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
@@ -190,7 +190,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 @dataclass(frozen=True)
 class MotionToTargetResult:
-    """Coefficients w (K, nc) of a planned motion, and whether the search converged within the limits."""
+    """The coefficients w (K, nc) of a planned motion, and whether the search converged within the limits."""
 
     w: Array
     is_converged: bool
@@ -199,7 +199,7 @@ class MotionToTargetResult:
 
 
 class MotionToTargetSearch:
-    """Shooting search for a motion to a target. Goal residuals cover several parameter cases, limits only the first."""
+    """A search for a motion that reaches a target. Goal residuals cover all parameter cases, limits only the first."""
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
@@ -220,7 +220,7 @@ class MotionToTargetSearch:
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> MotionToTargetResult:
-        """Optimise the spline coefficients of a motion, (K, nc): K coefficients for each of nc prescribed joints.
+        """Optimise the spline coefficients (K, nc) of a motion: K coefficients for each of nc prescribed joints.
 
         The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
         bounds `lower` and `upper` of the coefficients are enforced by an interior trust-region method (Branch, Coleman
@@ -276,7 +276,7 @@ def _prior(columns: int, bounded: Sequence[int]) -> Array:
 
 @dataclass(frozen=True)
 class DOptimalityCriterion:
-    """Criterion of how well a motion determines chosen parameters: -1/2 log det of their covariance.
+    """A measure of how well a motion determines chosen parameters: -1/2 log det of their covariance.
 
     All other unknowns are eliminated. This is D-optimality, or D_s-optimality if only some parameters are chosen
     (Atkinson, Donev and Tobias 2007, Optimum Experimental Designs, with SAS, sections 10.2 and 10.3).
@@ -286,7 +286,7 @@ class DOptimalityCriterion:
     parameter_columns: tuple[int, ...]
 
     def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] and, if `slope`, its gradient with respect to sensitivities `rows` (nr, columns)."""
+        """Return the criterion [nat] and, if `slope`, its gradient (nr, columns) with respect to `rows`."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
@@ -301,7 +301,7 @@ class DOptimalityCriterion:
 
 @dataclass(frozen=True)
 class EffectDiscriminationCriterion:
-    """Criterion of how well the measurements separate effects: -1/2 log sum_ij 1 / (1 + d_ij^2).
+    """A measure of how well the measurements separate effects: -1/2 log sum_ij 1 / (1 + d_ij^2).
 
     d_ij^2 = min_b |J_i a - J_j b|^2 is the distance of effect i (amplitudes a, sensitivities J_i) from the best
     imitation by effect j and the nuisance unknowns (b, J_j). The smallest distances dominate the sum.
@@ -313,14 +313,14 @@ class EffectDiscriminationCriterion:
     parameter_columns: tuple[int, ...]  # columns with a prior: nominal parameters and parameters of effects
 
     def distances_from_best_imitation(self, rows: Array) -> Array:
-        """Distances [data stds] of effect i (row) from its best imitation by effect j; infinite diagonal."""
+        """Return the distance [data stds] of each effect (row) from its best imitation by another (column)."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
     def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Compute the criterion [nat] and its gradient (nr, columns) by the sensitivity matrix `rows`."""
+        """Return the criterion [nat] and its gradient with respect to sensitivities `rows` (nr, columns)."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
@@ -355,7 +355,7 @@ _MAX_LIMIT_CORRECTIONS = 2  # largest number of corrections of the linear limits
 
 @dataclass(frozen=True)
 class MotionSearchResult:
-    """Result of a search for an informative motion, with coefficients w (K, nc) and criteria [nat]."""
+    """The result of a search for an informative motion, with coefficients w (K, nc) and criteria [nat]."""
 
     w: Array
     initial_criterion: float
@@ -366,7 +366,7 @@ class MotionSearchResult:
 
 
 class InformativeMotionSearch:
-    """Search for the motion of a planned experiment that maximises an optimality criterion within limits."""
+    """A search for the motion, within limits, that maximises an optimality criterion of a planned experiment."""
 
     def __init__(
         self,

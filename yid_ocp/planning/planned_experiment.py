@@ -1,4 +1,4 @@
-"""Predict recording and sensitivities of a planned arm motion with the configured sensors.
+"""Prediction of the recording and sensitivities that a planned arm motion would give with the configured sensors.
 
 During the search, the arm motion is prescribed and the required torques are measured, each with a constant error. The
 effect of errors of a driven arm's motion on all readings is computed once, at standstill, and eliminated (Golub and
@@ -59,7 +59,7 @@ class SplineMotionExperiment:
     def from_options(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
     ) -> SplineMotionExperiment:
-        """Make a planned experiment from a plan's options, at parameter `values` and with the free parameters `names`.
+        """Make a planned experiment from plan options, at parameter `values` and with the free parameters `names`.
 
         Raises `ConfigError` if there is no joint whose motion can be planned, or if the arms have servos. Raises
         `ModelError` if no equilibrium is found.
@@ -159,11 +159,11 @@ class SplineMotionExperiment:
 
     @property
     def zero_coefficients(self) -> Array:
-        """Zero spline coefficients (K, nc), with which the arms stay at their start."""
+        """The zero spline coefficients (K, nc), with which the arms stay at their start."""
         return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.moved_joint_indices)))
 
     def planned_estimation_problem(self, w: Array) -> EstimationProblem:
-        """Configured estimation problem, with the planned recording of coefficients `w` as its only recording."""
+        """Return the configured problem with the planned recording of coefficients `w` as its only recording."""
         return self._problem(self.configured_problem.step, self._noise_free_recording(w), self._options())
 
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
@@ -173,12 +173,12 @@ class SplineMotionExperiment:
         return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
     def planned_sensitivities_to_unknowns(self, w: Array) -> Array:
-        """Whitened sensitivities of the planned recording to relative changes. `SolverError` if its rollout fails."""
+        """Return a planned recording's whitened sensitivities to relative changes of unknowns. Raises `SolverError`."""
         return self._weighted(self.planned_estimation_problem(w))
 
     @property
     def existing_recording_sensitivities(self) -> Array:
-        """Whitened sensitivities of existing recordings to relative changes of the configured problem's unknowns."""
+        """The whitened sensitivities of existing recordings to relative changes of the problem's unknowns."""
         problem = self.configured_problem.with_parameter_values(self.parameter_values)
         return self._weighted(problem.with_free_parameters_without_recompiling(self.free_parameters))
 
@@ -217,12 +217,12 @@ class SplineMotionExperiment:
 
     @cached_property
     def estimated_unknown_scales(self) -> Array:
-        """Size of each unknown of the search problem, in column order, to which relative changes refer."""
+        """The typical size of each unknown, relative to which its changes are given, in column order."""
         return _sizes(self._known)
 
     @cached_property
     def sensitivity_column_names(self) -> tuple[str, ...]:
-        """Column names of `sensitivities_to_unknowns`: parameters, other unknowns, torque offsets."""
+        """The column names of `sensitivities_to_unknowns`: parameters, other unknowns, torque offsets."""
         return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
 
     @cached_property
@@ -249,7 +249,7 @@ class SplineMotionExperiment:
         return np.vstack([found, np.eye(len(std))])
 
     def sensitivities_to_unknowns(self, w: Array) -> Array | None:
-        """Whitened sensitivities (nr, columns) to relative changes of the unknowns, or None if the rollout fails."""
+        """Return whitened sensitivities (nr, columns) to relative changes of unknowns, or None if the rollout fails."""
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None
@@ -301,7 +301,7 @@ class SplineMotionExperiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
-        """Derivatives (w.size, nr, columns) by w of sensitivities that are `rows` at w; None if a rollout fails."""
+        """Return the derivatives (w.size, nr, columns) of sensitivities `rows` by w; None if a rollout fails."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()

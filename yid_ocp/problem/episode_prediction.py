@@ -1,4 +1,4 @@
-"""Predict an episode's initial state, rollout and sensor readings, with derivatives."""
+"""Prediction of an episode's initial state, rollout and sensor readings, with derivatives."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class _Prepared:
 
 @dataclass(frozen=True)
 class EpisodePredictor:
-    """Predicts episodes with the model, from the initial state to readings with derivatives. It is stateless."""
+    """A predictor that computes an episode from the initial state to readings with derivatives. It is stateless."""
 
     model_functions: ModelFunctions
     options: ProblemOptions
@@ -62,17 +62,17 @@ class EpisodePredictor:
 
     @property
     def integrator_step(self) -> Step:
-        """Integrator step with which episodes are rolled out."""
+        """The integrator step that simulates the episodes."""
         return self.model_functions.step
 
     @property
     def system(self) -> System:
-        """System whose motion the step computes."""
+        """The mechanical system whose motion is predicted."""
         return self.model_functions.step.system
 
     @property
     def estimated_initial_state_entries(self) -> tuple[int, ...]:
-        """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
+        """The indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
         hidden, begin = list(self.system.effect_internal_coordinate_symbols), {"q": 0, "p": n, "z": 2 * n}
         split = (name.split(".", 1) for name in self.unknowns.initial_state_names)
@@ -93,7 +93,7 @@ class EpisodePredictor:
         return replace(episode, fixed_initial_state=start)
 
     def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
-        """Copy parameters `theta`; insert an episode's known ones and those fitted with its initial state."""
+        """Return a copy of `theta` with the values that are known for an episode or fitted with its initial state."""
         start = episode.fixed_initial_state
         return self._with(theta, {**episode.known_parameters, **({} if start is None else start.fitted_parameters)})
 
@@ -112,7 +112,7 @@ class EpisodePredictor:
         guess: Array | None = None,
         inputs: CorrectedInputs | None = None,
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode's rollout, with derivatives with respect to the parameters `names` and `offset`.
+        """Return the initial state of an episode and its derivatives with respect to `names` and `offset`.
 
         `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `guess`
         (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy).
@@ -142,7 +142,7 @@ class EpisodePredictor:
         return InitialStateWithSensitivity(state, np.hstack([by_theta, by_offset]), rest, "")
 
     def are_input_corrections_neutral_and_fixed(self, episode: Episode, theta: Array) -> bool:
-        """Whether all effects that correct the episode's inputs, times or tracked reference are neutral and fixed."""
+        """Check whether all effects on the episode's inputs, times and tracked reference are neutral and fixed."""
         wanted = self.unknowns.free_parameter_names
         inputs = self.corrected_inputs(episode, theta, wanted)
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
@@ -222,7 +222,7 @@ class EpisodePredictor:
     def predict_episode(
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
     ) -> EpisodePrediction | str:
-        """Roll out one episode and predict its samples. Returns an error message if the rollout fails."""
+        """Simulate an episode and predict its samples. Returns an error message if the simulation fails."""
         return self.predict_episodes([(episode, theta, offset, guess)], derivatives)[0]
 
     def predict_episodes(
@@ -318,7 +318,7 @@ class EpisodePredictor:
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
     def rollout_node_values(self, rollout: Rollout) -> NodeStateValues:
-        """State values at all nodes of a rollout. Loads are efforts (prescribed joints) or torques (driven joints)."""
+        """Return the states at all nodes of a rollout. Loads: efforts of prescribed or torques of driven joints."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.actuated_coordinate_indices)] = rollout.torque
@@ -350,7 +350,7 @@ class EpisodePredictor:
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
     def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeValueSmoother | None:
-        """Smoother of predicted efforts, equal to the filter of measured efforts. None if no efforts are compared."""
+        """Make a smoother of predicted efforts that equals the filter of measured efforts. None if there are none."""
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
@@ -408,7 +408,7 @@ class EpisodePredictor:
     def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
-        """Gradient of a cost of one episode's predictions, with respect to its (shared, local, initial state) unknowns.
+        """Return the gradient of an episode's cost with respect to its unknowns (shared, local, initial state).
 
         `result` holds the predictions, `pulls` (M, k) the derivatives of the cost with respect to each prediction.
         """
@@ -492,7 +492,7 @@ class _Trajectory:
 def episode_at_equilibrium_with_denoised_gear_loads(
     predictor: EpisodePredictor, episode: Episode, theta: Array
 ) -> Episode:
-    """Start an episode at the equilibrium near its first points, and remove effort noise from gear loads."""
+    """Start an episode at the equilibrium near its first points, and remove effort noise from the gear loads."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
 
@@ -568,7 +568,7 @@ def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epis
 
 
 def sensor_not_predictable_at_nodes_error(group: str) -> SolverError:
-    """Make the `SolverError` for a sensor whose readings do not follow from the states at nodes."""
+    """Make the `SolverError` for a sensor whose readings cannot be computed from the states at nodes."""
     what = f"multiple shooting cannot use '{group}', which measures velocities, accelerations or constraint forces"
     hint = f"set solver.name: gauss_newton, or sensors.{group}.use: false"
     allowed = "sensors whose readings follow from the states at nodes"

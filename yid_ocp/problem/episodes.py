@@ -1,4 +1,4 @@
-"""Episodes: recordings placed on the nodes of a rollout."""
+"""Episodes, which are recordings placed on the nodes of a rollout."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from yid_ocp.sensors.joints import (
 
 @dataclass(frozen=True)
 class EpisodePrediction:
-    """Prediction of one episode: rollout, initial equilibrium, sensor readings and sensitivities."""
+    """The prediction of one episode: rollout, initial equilibrium, sensor readings and sensitivities."""
 
     rollout: Rollout
     equilibrium: Equilibrium | None
@@ -64,7 +64,7 @@ class EpisodePrediction:
 
     @property
     def feedback_torque_and_sensitivity(self) -> Array | None:
-        """`torque_correction` and its derivative, if known, as one array (N, nu, 1 + d). None without a correction."""
+        """The array (N, nu, 1 + d) of `torque_correction` and its derivative, if known. None without a correction."""
         if self.torque_correction is None:
             return None
         known, slopes = self.torque_correction[:, :, None], self.torque_correction_sensitivity
@@ -73,7 +73,7 @@ class EpisodePrediction:
 
 @dataclass(frozen=True)
 class InitialStateWithSensitivity:
-    """Initial state of a rollout, its derivative and its equilibrium, or the reason why there is no initial state."""
+    """The initial state of a rollout, its derivative and equilibrium, or the reason why there is no initial state."""
 
     state: Array  # (q, p, z), (nx,)
     state_sensitivity: Array  # by the wanted parameters, then the state offset, (nx, d)
@@ -89,7 +89,7 @@ _MIN_TORQUE_ERROR_FRACTION = 1e-3
 
 @dataclass(frozen=True)
 class TorqueAndAngleErrorModel:
-    """Noise levels and current estimates of the errors of recorded torques and angles that drive a rollout.
+    """The noise levels and current error estimates of the recorded torques and angles that drive a rollout.
 
     A recorded torque has an error w in each step and a constant error b [N m]. A recorded angle has an error v [rad].
     """
@@ -109,24 +109,24 @@ class TorqueAndAngleErrorModel:
 
     @property
     def recorded_minus_true_torque(self) -> Array:
-        """Estimated torque error, recorded minus true, in every step, (N, nu) [N m]. It includes offset and noise."""
+        """The estimated torque error in every step, recorded minus true, with offset and noise, (N, nu) [N m]."""
         return self.torque_bias + self.torque_noise
 
     @property
     def remaining_torque_error_after_effects(self) -> Array:
-        """Torque error that remains to be subtracted after effects on torques were applied, (N, nu) [N m]."""
+        """The torque error that is still to be subtracted after effects on torques were applied, (N, nu) [N m]."""
         return self.recorded_minus_true_torque - self.transmitted_torque_noise
 
     @property
     def with_torque_bias_only(self) -> TorqueAndAngleErrorModel:
-        """The same error model with the constant torque offset only, without torque noise and smoothed reference."""
+        """The same error model with only the constant torque offset, without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
     def on_finer_steps(self, ratio: int) -> TorqueAndAngleErrorModel:
-        """The same error model for `ratio` times shorter steps. Torques are held, the reference is interpolated."""
+        """Return this error model for `ratio` times shorter steps. Torques are held, the reference is interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
         if (known := self.smoothed_reference) is not None:
@@ -178,7 +178,7 @@ def _recorded_input_errors(
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording on the time grid of a rollout: inputs, measurements, tracking filter and input errors."""
+    """A recording on the time grid of a rollout, with inputs, measurements, tracking filter and input errors."""
 
     recording: Recording
     grid: TimeGrid
@@ -201,7 +201,7 @@ class Episode:
 
     @property
     def tracking_feedback_to_smoothed_reference(self) -> TrackingFeedback | None:
-        """Tracking filter about the Kalman smoother's estimate, or unchanged if there is no such estimate."""
+        """The tracking filter, which follows the Kalman smoother's estimate if there is one."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
@@ -213,14 +213,14 @@ class Episode:
 
     @property
     def name(self) -> str:
-        """Name of the episode's recording."""
+        """The name of the episode's recording."""
         return self.recording.name
 
 
 def prepare_episode(
     functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array, free: Sequence[str]
 ) -> Episode:
-    """Prepare a recording for prediction: place its inputs and measurements on the nodes of a rollout's time grid.
+    """Prepare a recording for prediction: place its inputs and measurements on the nodes of a time grid.
 
     The nominal parameters `theta` are used to convert encoder noise to effort and to compute the tracking filter's
     gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level.
@@ -277,7 +277,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
 
 
 def truncate_episode(episode: Episode, steps: int) -> Episode:
-    """Truncate an episode to its first `steps` steps and the measurements in them."""
+    """Shorten an episode to its first `steps` steps and the measurements in them."""
     steps = min(steps, episode.grid.steps)
     samples = []
     for entry in episode.measurements:
@@ -301,7 +301,7 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
 
 
 def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
-    """Diagonal (k,) of the mass matrix of the named joints at zero configuration [kg m^2 or kg]."""
+    """Return the mass matrix's diagonal entries (k,) of the named joints at zero configuration [kg m^2 or kg]."""
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]

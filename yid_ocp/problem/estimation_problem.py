@@ -1,4 +1,4 @@
-"""Estimation problem of a model and recordings: unknowns, residual and derivatives."""
+"""The estimation problem of a model and recordings: unknowns, residual and derivatives."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _HELD_OUT_ITERATIONS = 3  # Gauss-Newton iterations of this nearly linear estima
 
 
 class EstimationProblem(ReprMixin):
-    """Immutable, thread-safe problem of estimating free parameters from recordings.
+    """An immutable, thread-safe problem of estimating free parameters from recordings.
 
     It evaluates the cost, predicts held-out recordings, and derives problems with other parameters, data, options or
     whitening filters (made by `inference.whitening`). Raises `ConfigError` if a parameter is unknown, listed twice,
@@ -174,7 +174,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_unknowns(self) -> Array:
-        """Initial unknown vector (nx,): initial parameter values, and zero offsets of initial states."""
+        """The initial unknown vector (nx,): initial parameter values, and zero offsets of initial states."""
         index, parts = self.system.parameters.index, (self.shared_parameters, self.local_parameters)
         shared, local = ([self.theta[index(name)] for name in part] for part in parts)
         offset = np.zeros(len(self.unknowns.initial_state_names))
@@ -182,7 +182,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the unknown vector, (nx,) each."""
+        """The lower and upper bounds of the unknown vector, (nx,) each."""
         parts = (self.shared_parameters, self.local_parameters)
         (low, high), (own_low, own_high) = (self.system.parameters.lower_and_upper_bounds(part) for part in parts)
         wide = max_abs_initial_internal_state_offsets(self.system, self.unknowns.initial_state_names)
@@ -191,7 +191,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def unknown_scales(self) -> Array:
-        """Typical size (nx,) of each unknown: its initial value, or if that is 0 the prior's std or 0.1 x range."""
+        """The typical size (nx,) of each unknown: its initial value, or if that is 0 the prior's std or 0.1 x range."""
         lower, upper = self.bounds
         size = np.abs(self.initial_unknowns)
         width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
@@ -199,7 +199,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def positive_unknowns_mask(self) -> BoolArray:
-        """Mask (nx,) of nonnegative unknowns with positive start, without amplitudes that may become zero.
+        """The mask (nx,) of nonnegative unknowns that start above zero, except amplitudes that may become zero.
 
         An amplitude of zero is a common result. Where an effect has shape parameters, these would lose their influence.
         """
@@ -213,7 +213,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def stated_rms_noise_of_data_residuals(self) -> float:
-        """RMS noise of all data residuals: 1 for whitened residuals, else the noise of the points [m]."""
+        """The RMS noise of all data residuals: 1 for whitened residuals, else the noise of the points [m]."""
         if self.options.weighting != "paper":
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
@@ -221,13 +221,13 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_state_prior_std(self) -> Array:
-        """Prior standard deviations of the estimated initial state components, ordered as `initial_state_names`."""
+        """The prior standard deviations of estimated initial state components, ordered as `initial_state_names`."""
         at = len(self.unknowns.free_parameter_names)
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
     @property
     def are_input_corrections_neutral_and_fixed(self) -> bool:
-        """Whether all effects that correct recorded inputs, times or tracked references are neutral and fixed."""
+        """Whether all effects on recorded inputs, times and tracked references are neutral and fixed."""
         neutral_and_fixed = self.predictor.are_input_corrections_neutral_and_fixed
         return all(neutral_and_fixed(episode, self.theta) for episode in self.episodes)
 
@@ -236,18 +236,18 @@ class EstimationProblem(ReprMixin):
         return self.unknowns.unpack_episode_unknowns(x, episode, self.theta, self.system)
 
     def unknown_vector(self, values: Mapping[str, float]) -> Array:
-        """Copy (nx,) of the initial unknown vector, with the named `values` inserted and clipped to the bounds."""
+        """Return a copy (nx,) of the initial unknown vector with the named `values`, clipped to the bounds."""
         start = self.named_values(self.initial_unknowns)
         return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
 
     def named_values(self, x: Array) -> dict[str, float]:
-        """Values of the unknown vector `x` by unknown name."""
+        """Return the values of the unknown vector `x` by unknown name."""
         return dict(zip(self.unknown_names, map(float, x), strict=True))
 
     def evaluate(
         self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
-        """Evaluate residual and cost at the unknown vector `x`, and the Jacobian if `derivatives` is True.
+        """Compute residual and cost at the unknown vector `x`, and the Jacobian if `derivatives` is True.
 
         If an equilibrium or a rollout fails, `ok` is False and `message` holds the reason. `equilibrium_guesses` from
         the evaluation at a nearby point shorten the search for the equilibrium of least energy.
@@ -282,7 +282,7 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Compute cost, gradient (adjoint method; with process noise, sensitivities) and evaluation.
+        """Compute the cost, its gradient (adjoint method; with process noise, sensitivities) and the evaluation.
 
         A known `evaluation` at `x` saves the rollout, which is most of the work. The returned evaluation has no
         Jacobian.
@@ -310,7 +310,7 @@ class EstimationProblem(ReprMixin):
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
     def prior_residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
+        """Return the residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
         stated, weak, start = self._stated, self._weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
         spread = np.log(max(self.options.weak_prior_geometric_std, 1.0 + 1e-9))
@@ -321,7 +321,7 @@ class EstimationProblem(ReprMixin):
     def initial_state_and_derivative(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialStateWithSensitivity:
-        """Initial state of an episode, with derivatives with respect to the free parameters and the equilibrium offset.
+        """Return an episode's initial state and its derivatives by the free parameters and the equilibrium offset.
 
         `guess` (n,) is a configuration near the equilibrium.
         """
@@ -331,7 +331,7 @@ class EstimationProblem(ReprMixin):
         return self.predictor.initial_state_and_derivative(episode, own, none, names, guess)
 
     def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[PredictedEpisodeOrFailure]:
-        """Predict held-out recordings with the parameters of `held_out_parameter_vector`.
+        """Predict the held-out recordings with the parameters of `held_out_parameter_vector`.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
         prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free
@@ -341,7 +341,7 @@ class EstimationProblem(ReprMixin):
         return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """Inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
+        """Return the inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
         x, found = np.asarray(x, float), []
         for held in self.held_out:
             theta, shared = self.held_out_parameter_vector(x, held), held.initial_state_shared_with
@@ -355,7 +355,7 @@ class EstimationProblem(ReprMixin):
         return found
 
     def held_out_parameter_vector(self, x: Array, held: Episode) -> Array:
-        """Vector theta (ntheta,) of a held-out recording, with the shared parameters in `x`.
+        """Return the parameter vector theta (ntheta,) of a held-out recording, with the shared parameters in `x`.
 
         Local parameters have the values in `x` if it is part of an estimation recording, else their initial values.
         """
@@ -385,18 +385,18 @@ class EstimationProblem(ReprMixin):
         return synthesize_recording(self.predictor, self.episodes[recording], theta, seed)
 
     def with_free_parameters_without_recompiling(self, names: Sequence[str]) -> EstimationProblem:
-        """Problem with other free parameters, from `free` and `may_free`. It shares the compiled functions."""
+        """Return a problem with other free parameters, from `free` and `may_free`. It shares the compiled functions."""
         return self._changed(free=tuple(names))
 
     def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
-        """Problem with other values of fixed and initial values of free parameters. Filters are kept."""
+        """Return a problem with other fixed values and other initial values of free parameters. Filters are kept."""
         theta = self.theta.copy()
         for name, value in values.items():
             theta[self.system.parameters.index(name)] = value
         return self._changed(theta=theta)
 
     def with_model_functions(self, functions: ModelFunctions) -> EstimationProblem:
-        """Use functions of a system with the free and some fixed parameters. Episodes are kept as they are."""
+        """Return a problem with other model functions, which have the free and some fixed parameters. Episodes stay."""
         index, names = self.system.parameters.index, functions.step.system.parameters.names
         return self._changed(model_functions=functions, theta=self.theta[[index(name) for name in names]])
 
@@ -407,28 +407,28 @@ class EstimationProblem(ReprMixin):
         whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
         held_out_whitening_filters: Sequence[ProcessNoiseWhitener | None] = (),
     ) -> EstimationProblem:
-        """Problem with other episodes. Without filters, residuals are whitened by sensor noise alone."""
+        """Return a problem with other episodes. Without filters, residuals are whitened by sensor noise alone."""
         filters = {"whitening_filters": whitening_filters, "held_out_whitening_filters": held_out_whitening_filters}
         changes = {"episodes": episodes, "held_out": held_out, **filters}
         return self._changed(**{name: tuple(value) for name, value in changes.items()})
 
     @property
     def has_process_noise(self) -> bool:
-        """Whether errors of recorded torques or angles are process noise in at least one recording."""
+        """Whether errors of recorded torques or angles are treated as process noise in at least one recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
 
     def whitened_held_out_residual_and_jacobian(
         self, i: int, episode: Episode, result: EpisodePrediction
     ) -> ResidualAndJacobian:
-        """Whitened residual of held-out recording `i` without robust loss; `result` is from `predict_held_out`."""
+        """Whiten the residual of held-out recording `i` without robust loss; `result` is from `predict_held_out`."""
         return whitened_prediction_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
     def truncated_to_duration(self, duration: float) -> EstimationProblem:
-        """Problem rebuilt on the first `duration` [s] of each recording, without held-out recordings."""
+        """Return a problem with only the first `duration` [s] of each recording, without held-out recordings."""
         return self._prepared(options=replace(self.options, duration=duration), held_out=())
 
     def with_time_step(self, time_step: float) -> EstimationProblem:
-        """Problem with another time step [s], without whitening filters and held-out recordings.
+        """Return a problem with another time step [s], without whitening filters and held-out recordings.
 
         Initial states, guesses of equilibria and gear loads are copied from this problem.
         """
@@ -445,11 +445,11 @@ class EstimationProblem(ReprMixin):
         return self._changed(model_functions=functions).with_episodes(list(map(placed, self.episodes)), ())
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
-        """Problem with other options, prepared anew from its recordings."""
+        """Return a problem with other options, prepared anew from its recordings."""
         return self._prepared(options=options)
 
     def with_multivariate_prior(self, prior: MultivariateGaussianPrior) -> EstimationProblem:
-        """Problem with another multivariate prior. Filters are kept."""
+        """Return a problem with another multivariate prior. Filters are kept."""
         return self._changed(options=replace(self.options, multivariate_prior=prior))
 
     def _prepared(self, **changes: Any) -> EstimationProblem:

@@ -1,4 +1,4 @@
-"""Layout of unknowns and residual of an estimation problem, priors, bounds and evaluations."""
+"""The layout of an estimation problem's unknowns and residual, and its priors, bounds and evaluations."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ EquilibriumGuesses = tuple[Array | None, ...]
 
 
 class ProcessNoiseWhitener(Protocol):
-    """Interface of a fixed-gain Kalman filter that whitens one recording's residual against process noise."""
+    """The interface of a Kalman filter with fixed gain that whitens one recording's residual against process noise."""
 
     @property
     def input_error_model(self) -> TorqueAndAngleErrorModel:
-        """Standard deviations of torque and angle errors, and the errors about which the filter is linearised."""
+        """The standard deviations of torque and angle errors, and the errors about which the filter is linearised."""
         ...
 
     def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
@@ -49,7 +49,7 @@ class ProcessNoiseWhitener(Protocol):
 
 @dataclass(frozen=True)
 class ResidualVectorLayout:
-    """Slices of the residual vector: measurements of all episodes, then stated priors, then weak priors."""
+    """The slices of the residual vector: measurements of all episodes, then stated priors, then weak priors."""
 
     measurements: tuple[tuple[slice, ...], ...]  # slices by episode and sensor group
     data: slice
@@ -58,7 +58,7 @@ class ResidualVectorLayout:
 
     @property
     def slice_without_weak_priors(self) -> slice:
-        """Slice of the residual vector with data and stated priors."""
+        """The slice of the residual vector that holds data and stated priors."""
         return slice(0, self.stated_priors.stop)
 
     @staticmethod
@@ -77,7 +77,7 @@ class ResidualVectorLayout:
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(ReprMixin):
-    """Cost, residual, Jacobian and predictions of an estimation problem at one unknown vector."""
+    """The cost, residual, Jacobian and predictions of an estimation problem at one unknown vector."""
 
     cost: float  # 1/2 |r|^2, or the robust loss; infinite if the rollout failed
     residual: Array  # (nr,)
@@ -93,7 +93,7 @@ class Evaluation(ReprMixin):
 
     @property
     def equilibrium_guesses(self) -> EquilibriumGuesses:
-        """Initial equilibrium configuration of each episode, as a guess for the evaluation at a nearby point."""
+        """The start equilibrium of each episode, or None: first guesses for an evaluation at similar unknowns."""
         return tuple(result.equilibrium_guess for result in self.episode_predictions)
 
 
@@ -151,7 +151,7 @@ SOFT_LOGARITHM_MIN_RATIO = 1e-3
 
 @dataclass(frozen=True)
 class UnknownVectorLayout:
-    """Order of the unknown vector: shared parameters, then each recording's local parameters and state offset."""
+    """The order of the unknown vector: shared parameters, then each recording's local parameters and state offset."""
 
     shared_parameters: tuple[str, ...]  # free, with one value for all recordings
     local_parameters: tuple[str, ...]  # free, with a value in each
@@ -160,18 +160,18 @@ class UnknownVectorLayout:
 
     @cached_property
     def unknown_names(self) -> tuple[str, ...]:
-        """Names of all unknowns. Local parameters and initial states include the recording's name."""
+        """The names of all unknowns. Local parameters and initial states include the recording's name."""
         own = [*self.local_parameters, *(f"{INITIAL_STATE_UNKNOWN_PREFIX}{name}" for name in self.initial_state_names)]
         each = (f"{name}[{recording}]" for recording in self.recording_names for name in own)
         return (*self.shared_parameters, *each)
 
     @property
     def free_parameter_names(self) -> tuple[str, ...]:
-        """Names of the free parameters, shared then local: the order of one recording's derivative columns."""
+        """The names of the free parameters, shared then local: the order of one recording's derivative columns."""
         return (*self.shared_parameters, *self.local_parameters)
 
     def unknown_indices_affecting_recording(self, recording: int) -> IntArray:
-        """Indices of the shared unknowns and of one recording's local parameters and initial state."""
+        """Return the indices of the shared unknowns and of one recording's local parameters and initial state."""
         shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
 
@@ -184,7 +184,7 @@ class UnknownVectorLayout:
     def unpack_episode_unknowns(
         self, x: ArrayLike, recording: int, theta: Array, system: System
     ) -> tuple[Array, Array]:
-        """Copy of `theta` with one recording's values from `x`, and that recording's initial state offset."""
+        """Return a copy of `theta` with one recording's values from `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
         result = theta.copy()
         for name, value in zip(self.free_parameter_names, own, strict=False):
@@ -192,7 +192,7 @@ class UnknownVectorLayout:
         return result, own[len(self.free_parameter_names) :]
 
     def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
-        """Pack an unknown vector with the same local parameters and initial state offset for all recordings."""
+        """Make an unknown vector with the same local parameters and initial state offset for all recordings."""
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
         return np.concatenate(parts)
@@ -201,7 +201,7 @@ class UnknownVectorLayout:
 def stated_prior_stds_of_unknowns(
     unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
 ) -> Array:
-    """Standard deviation of each unknown's stated Gaussian prior, (nx,). It is infinite for unknowns without prior.
+    """Return the standard deviation of each unknown's stated Gaussian prior, (nx,). Infinite without prior.
 
     `inertia` returns the mass matrix diagonal, which converts an initial velocity to a momentum. An effect's internal
     coordinate has a uniform prior within its limits, of which the standard deviation is returned.
@@ -225,7 +225,7 @@ def stated_prior_stds_of_unknowns(
 
 
 def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Jacobian (k, nx) of the whitened residual of the stated priors, Jacobian x (x - initial x)."""
+    """Return the Jacobian (k, nx) of the stated priors' whitened residual, which equals Jacobian x (x - initial x)."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -240,7 +240,7 @@ def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions
 def estimated_initial_state_names(
     system: System, options: ProblemOptions, free: Sequence[str], theta: Array
 ) -> tuple[str, ...]:
-    """Names of the estimated components of initial states, such as `q.JOINT`, `p.JOINT` and `z.NAME`.
+    """List the names of the estimated components of initial states, such as `q.JOINT`, `p.JOINT` and `z.NAME`.
 
     With the option "estimated", q and p are estimated of coordinates that are not driven by torques, not prescribed and
     not compliant. Unobserved internal coordinates z of effects that are free or not neutral are always estimated.
@@ -266,13 +266,13 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
 
 
 def max_abs_initial_internal_state_offsets(system: System, names: Sequence[str]) -> Array:
-    """Largest absolute initial offset (len(names),) of effects' internal coordinates, infinite for other names."""
+    """Return the largest absolute initial offset of each effect's internal coordinate, infinite for other names."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 
 
 def check_free_parameter_names(system: System, free: Sequence[str], options: ProblemOptions) -> None:
-    """Raise `ConfigError` if a free parameter is unknown or repeated, or if a local or prior parameter is not free."""
+    """Check that free parameters exist and are listed once, and that local ones and those in `prior_stds` are free."""
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)
     if twice := [name for name in free if list(free).count(name) > 1]:
@@ -286,14 +286,14 @@ def check_free_parameter_names(system: System, free: Sequence[str], options: Pro
 
 
 def check_unique_recording_names(names: Sequence[str]) -> None:
-    """Raise `ConfigError` if two estimation recordings have the same name."""
+    """Check that no two estimation recordings have the same name. Raises `ConfigError`."""
     if twice := [name for name in names if names.count(name) > 1]:
         what, hint = f"two recordings are called '{twice[0]}'", "rename one of them"
         raise ConfigError(what, where="recordings.estimate", allowed="every name once", hint=hint)
 
 
 def check_no_known_value_of_free_parameters(episodes: Iterable[Episode], free: Sequence[str]) -> None:
-    """Raise `ConfigError` if a recording has a known value of a free parameter."""
+    """Check that no recording has a known value of a free parameter. Raises `ConfigError`."""
     for episode in episodes:
         known = {*episode.known_parameters, *getattr(episode.fixed_initial_state, "fitted_parameters", ())}
         if found := [name for name in free if name in known]:
@@ -303,7 +303,7 @@ def check_no_known_value_of_free_parameters(episodes: Iterable[Episode], free: S
 
 
 def check_initial_values_and_bounds(system: System, free: Sequence[str], theta: Array) -> None:
-    """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or if its bounds coincide."""
+    """Check that each free parameter has distinct bounds and an initial value within them. Raises `ConfigError`."""
     for name in free:
         entry, value = system.parameters[name], theta[system.parameters.index(name)]
         replace(entry, value=float(value))  # it checks its bounds
@@ -313,7 +313,7 @@ def check_initial_values_and_bounds(system: System, free: Sequence[str], theta: 
 
 
 def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
-    """Logarithm of a ratio and its derivative; below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
+    """Return the logarithm of a ratio and its derivative, continued by a parabola below `SOFT_LOGARITHM_MIN_RATIO`."""
     below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
     small = below < 0
     kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)

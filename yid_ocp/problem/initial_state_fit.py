@@ -1,4 +1,4 @@
-"""Fit an initial state to the first measured points of a recording that does not start at equilibrium."""
+"""The fit of an initial state to the first measured points of a recording that does not start at equilibrium."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TRIALS_PER_PARAMETER = 4
 
 @dataclass(frozen=True)
 class FixedInitialState:
-    """Initial state that does not depend on the unknowns, given or fitted to the first measured points."""
+    """An initial state that does not depend on the unknowns. It is given or fitted to the first measured points."""
 
     state: Array  # (q, p, z) at node 0, (nx,)
     fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # in their units
@@ -57,7 +57,7 @@ class _Task:
 
 
 class InitialStateFitter:
-    """Fits an initial state, and optionally parameters, to the first measured points of an episode.
+    """A solver that fits an initial state, and optionally parameters, to the first measured points of an episode.
 
     At the first frame, Gauss-Newton over the configuration q (and the parameters `fitted_parameters`, which need finite
     bounds) minimises the misfit of the points w(q), the elastic energy (stiffnesses kappa_i) and the violation of the

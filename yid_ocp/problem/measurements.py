@@ -1,4 +1,4 @@
-"""Measurements of one sensor on rollout nodes: time grid, interpolation, whitening and constant errors."""
+"""The measurements of one sensor on rollout nodes: time grid, interpolation, whitening and constant errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as secon
 
 @dataclass(frozen=True)
 class TimeGrid:
-    """Uniform time grid of a rollout, t_k = start_time + k time_step [s] for k = 0..steps."""
+    """A uniform time grid of a rollout, t_k = start_time + k time_step [s] for k = 0..steps."""
 
     start_time: float
     time_step: float
@@ -32,11 +32,11 @@ class TimeGrid:
 
     @property
     def node_times(self) -> Array:
-        """Times of all nodes, shape (steps + 1,) [s]."""
+        """The times of all nodes, shape (steps + 1,) [s]."""
         return np.asarray(self.start_time + self.time_step * np.arange(self.steps + 1), dtype=float)
 
     def node_and_fraction(self, t: ArrayLike) -> tuple[IntArray, Array]:
-        """Node before each time, and the time since that node as a fraction of a step (rounded within 1e-6 steps)."""
+        """Find the node before each time, and the time since it as a fraction of a step (rounded within 1e-6 steps)."""
         position = (np.asarray(t, float) - self.start_time) / self.time_step
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-6, near, position)
@@ -45,7 +45,7 @@ class TimeGrid:
 
 
 def rollout_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
-    """Make a time grid over the time span of the joint samples or, in a recording without joints, of the first group.
+    """Make a time grid that spans the joint samples or, in a recording without joints, the first group.
 
     Raises `DataError` if the span is shorter than two steps, or has more than `_MAX_STEPS` steps or too many steps per
     sample.
@@ -70,7 +70,7 @@ ResidualWeightingName = Literal["whitened", "paper"]
 
 @dataclass(frozen=True)
 class ResidualAndJacobian:
-    """One block of the residual vector, with its cost, Jacobian and robust loss factors."""
+    """A block of the residual vector, with its cost, Jacobian and robust loss factors."""
 
     cost: float  # half the sum of squares, or Huber's loss
     residual: Array  # (nr,)
@@ -80,7 +80,7 @@ class ResidualAndJacobian:
 
 @dataclass(frozen=True)
 class SensorMeasurements:
-    """M samples of a sensor's k outputs, located between rollout nodes, with weights and noise levels."""
+    """The M samples of a sensor's k outputs, located between rollout nodes, with weights and noise levels."""
 
     sensor: Sensor
     node: IntArray  # node before each sample, (M,), or (M, k) if outputs have different delays
@@ -95,24 +95,24 @@ class SensorMeasurements:
 
     @property
     def has_uncertain_biases_or_clock(self) -> bool:
-        """Whether outputs have constant errors of unknown size, or the clock has an offset of unknown size."""
+        """Whether an output has a constant error of unknown size, or the clock has an offset of unknown size."""
         return bool(np.any(self.bias_std > 0)) or self.change_by_clock is not None
 
     @property
     def output_changes_per_bias_and_clock_std(self) -> Array:
-        """Change (M, k, m) of the outputs by one std of each constant error and of the clock offset."""
+        """The change (M, k, m) of the outputs that one std of each constant error or of the clock offset causes."""
         own = self.bias_std * np.eye(len(self.bias_std))[self.bias_std > 0]
         constant = np.broadcast_to(own.T, (len(self.value), *own.T.shape))
         return constant if self.change_by_clock is None else np.dstack([constant, self.change_by_clock])
 
     @property
     def channel_name_per_output(self) -> tuple[str, ...]:
-        """Channel name of each of the k outputs."""
+        """The name of the channel to which each of the k outputs belongs."""
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @property
     def evaluation_nodes(self) -> IntArray:
-        """Sorted indices of the nodes at which the sensor is predicted, for interpolation to the samples."""
+        """The sorted indices of the nodes at which the sensor is predicted, for interpolation to the samples."""
         if self.node.ndim > 1:
             # including the neighbours needed for derivatives
             low = int(self.node.min(initial=self.predictable_nodes[1]))
@@ -122,17 +122,17 @@ class SensorMeasurements:
 
     @property
     def positive_weight_mask(self) -> BoolArray:
-        """Mask of measured outputs with positive weight, shape (M, k)."""
+        """The mask of measured outputs with positive weight, shape (M, k)."""
         return self.weight > 0
 
     @property
     def n_residuals(self) -> int:
-        """Number of scalar residuals, one for each output with positive weight."""
+        """The number of scalar residuals, which is the number of outputs with positive weight."""
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
     def output_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
-        """Matrix R^(-1/2) (nr, nr) that decorrelates the nr normalised residuals. None if outputs are independent.
+        """The matrix R^(-1/2) (nr, nr) that decorrelates the nr normalised residuals. None if outputs are independent.
 
         R is the correlation matrix of the noise; only outputs of one sample are correlated. The whitening is zero-phase
         (ZCA; Kessy, Lewin and Strimmer 2018, doi:10.1080/00031305.2016.1277159).
@@ -148,18 +148,18 @@ class SensorMeasurements:
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.n_residuals, self.n_residuals))
 
     def decorrelate_residual_rows(self, rows: Any) -> Any:
-        """Decorrelate rows (nr,) or (nr, d), dense or sparse, already divided by their standard deviations."""
+        """Decorrelate rows (nr,) or (nr, d), dense or sparse, that are in units of their standard deviations."""
         return rows if self.output_decorrelation_matrix is None else self.output_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
-        """Whitened residual (M, k), prediction minus measurement. It is zero for outputs without measurement."""
+        """Compute the whitened residual (M, k), prediction minus measurement. It is zero where nothing was measured."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
         if self.output_decorrelation_matrix is not None:
             plain[self.positive_weight_mask] = self.output_decorrelation_matrix @ plain[self.positive_weight_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
-        """Convert a cost's gradient by the residual to a gradient by the prediction, both (M, k) (adjoint)."""
+        """Convert a cost's gradient with respect to the residual to one with respect to the prediction, both (M, k)."""
         if self.output_decorrelation_matrix is not None:
             pull = pull.copy()
             pull[self.positive_weight_mask] = self.output_decorrelation_matrix.T @ pull[self.positive_weight_mask]
@@ -168,7 +168,7 @@ class SensorMeasurements:
     def residual_and_jacobian(
         self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf
     ) -> ResidualAndJacobian:
-        """Residual block with Huber weights, and with a Jacobian if `slopes` (M, k, d) of the prediction are given."""
+        """Compute residuals with Huber weights, and the Jacobian if `slopes` (M, k, d) of the prediction are given."""
         raw = self.whitened_residual(predicted)
         cost, factor = huber_loss_and_sqrt_weights(raw, threshold)
         seen, jacobian = self.positive_weight_mask, None
@@ -187,7 +187,7 @@ class SensorMeasurements:
         return replace(self, node=node, fraction=position - node)
 
     def prediction_change_per_step(self, at_nodes: Array, unmoved: SensorMeasurements, steps: Array) -> Array:
-        """Rate of change of a prediction at delayed samples, per time step, (M, k).
+        """Return the change of a prediction during one time step at each delayed sample, (M, k).
 
         At a node it is the mean of adjacent steps. `at_nodes` (len(nodes), k) is the prediction. `unmoved` are the
         measurements before the delay of `steps` (k,).
@@ -207,7 +207,7 @@ class SensorMeasurements:
         return np.where((position < first - 1e-9) | (position > last + 1e-9), 0.0, rate)
 
     def interpolate_to_samples(self, at_nodes: Array) -> Array:
-        """Interpolate values (len(nodes), ...) at `evaluation_nodes` linearly to the samples, (M, ...)."""
+        """Interpolate values (len(nodes), ...) linearly from `evaluation_nodes` to the samples, (M, ...)."""
         nodes = self.evaluation_nodes
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
         before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
@@ -216,7 +216,7 @@ class SensorMeasurements:
         return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
     def interpolation_adjoint(self, at_samples: Array) -> Array:
-        """Apply the transpose of `interpolate_to_samples` to values (M, ...), with the result (len(nodes), ...)."""
+        """Apply the transpose of `interpolate_to_samples` to values (M, ...). The result is (len(nodes), ...)."""
         nodes = self.evaluation_nodes
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
@@ -249,7 +249,7 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
 
 
 def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid) -> SensorMeasurements:
-    """Weight measurements at nearest nodes as in Caldwell et al. (2014): 0 at k = 0, 2 at the last node, else 1.
+    """Weight measurements at the nearest nodes as Caldwell (2014) did: 0 at k = 0, 2 at the last node, else 1.
 
     The cost is sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points wbar_k [m].
     """
@@ -263,7 +263,7 @@ def measurements_with_paper_weights(samples: SensorMeasurements, grid: TimeGrid)
 
 
 def huber_loss_and_sqrt_weights(residual: Array, scale: float) -> tuple[float, Array]:
-    """Huber loss sum rho(r) of whitened residuals, and the least-squares factors sqrt(rho'(r)/r).
+    """Return the Huber loss, sum rho(r) of whitened residuals, and the least-squares factors sqrt(rho'(r)/r).
 
     Beyond `scale` [standard deviations] the loss is linear. An infinite `scale` gives plain least squares.
     """
@@ -291,7 +291,7 @@ def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
 
 
 def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements]) -> Array:
-    """Derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
+    """Return derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
 
     Derivatives of the residual, prediction minus measurement, have the opposite sign.
     """
@@ -309,7 +309,7 @@ def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[Sensor
 def subtract_estimated_bias_and_clock_errors(
     samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
 ) -> tuple[SensorMeasurements, ...]:
-    """Subtract constant errors and clock offsets, estimated from a prediction (M, k) per sensor, from measurements."""
+    """Estimate constant errors and clock offsets from predictions (M, k), one per sensor, and subtract them."""
     slopes = whitened_measurement_sensitivities_to_sensor_errors(samples)
     if not slopes.shape[1]:
         return tuple(samples)

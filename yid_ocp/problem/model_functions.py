@@ -27,7 +27,7 @@ from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 
 @dataclass(frozen=True)
 class CorrectedInputs:
-    """Inputs of a rollout corrected for effects, with derivatives (..., d) by d parameters (None: zero)."""
+    """The inputs of a rollout, corrected for effects, with derivatives (..., d) by d parameters (None: zero)."""
 
     torque: Array  # (N, nu) [N m]
     first_torque: Array  # torque of the initial equilibrium, (nu,) [N m]
@@ -42,11 +42,11 @@ class CorrectedInputs:
 
     @property
     def initial_known_coordinates(self) -> Array:
-        """Coordinates (nk,) of driven, then prescribed joints at node 0."""
+        """The coordinates (nk,) of the driven joints, then the prescribed joints, at node 0."""
         return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
 
     def initial_known_coordinate_sensitivities(self, width: int) -> Array:
-        """Derivative (nk, d) of `initial_known_coordinates` with respect to the parameters."""
+        """The derivatives (nk, d) of `initial_known_coordinates` with respect to the parameters."""
         by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
@@ -54,7 +54,7 @@ class CorrectedInputs:
     def tracking_feedback_with_corrected_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
-        """Correct a feedback's reference from measured to true angles, and add the momentum due to effects."""
+        """Correct the tracking reference from measured to true angles, and add the momentum that effects cause."""
         turned = None if self.driven_angles_sensitivity is None else self.driven_angles - measured
         if feedback is None or (turned is None and self.momentum_shift is None):
             return feedback
@@ -74,7 +74,7 @@ class CorrectedInputs:
         names: Sequence[str],
         by_internal: Array | None,
     ) -> CorrectedInputs:
-        """Add the momentum that effects cause to the reference of the tracking filter, in every step.
+        """Return a copy with the momentum that effects add to the tracking filter's reference in every step.
 
         The angles in `recorded` are smoothed, the angles `measured` (N + 1, nu) are not. `by_internal` (nz, d) is the
         derivative of the initial internal coordinates.
@@ -92,7 +92,7 @@ class CorrectedInputs:
     def torque_sensitivity_with_feedback_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
-        """Sensitivity (N, nu, width) of the corrected torque plus the tracking feedback's gain times its reference."""
+        """Return the sensitivity (N, nu, width) of the corrected torque plus the feedback gain times its reference."""
         reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
         for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
             if feedback is not None and slope is not None:
@@ -113,7 +113,7 @@ class CorrectedInputs:
 
 
 class InputCorrectionFunctions:
-    """Compiled maps from recorded to true inputs and times, defined by the system's effects on recordings.
+    """A set of compiled functions from recorded to true inputs and times, defined by the system's effects.
 
     `names` are the parameters for which derivatives are available. A method's `wanted` is a subset of `names`.
     """
@@ -190,7 +190,7 @@ class InputCorrectionFunctions:
     def joint_delays_or_lag_times(
         self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Delays or lag time constants (nj,) [s] of driven joints' torques or of prescribed joints' efforts.
+        """Return the delays or lag times (nj,) [s] of driven joints' torques or of prescribed joints' efforts.
 
         Also returns their derivatives (nj, d) with respect to the parameters `names`. None if no effect has a delay or
         lag.
@@ -200,7 +200,7 @@ class InputCorrectionFunctions:
     def sensor_delays_with_derivatives(
         self, sensor: Sensor, theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Recorded minus true time (k,) [s] of each output and its derivatives (k, d) by `names`; None if no delays."""
+        """Return each output's recorded minus true time (k,) [s] and its derivatives (k, d) by `names`, or None."""
         return self._evaluate(self._sensor_delays(sensor), theta, names)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
@@ -230,7 +230,7 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 @dataclass(frozen=True)
 class NodeStateValues:
-    """Numerical values of `NodeStateSymbols` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m)."""
+    """The numerical values of `NodeStateSymbols` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m)."""
 
     q: Array
     v: Array
@@ -257,14 +257,14 @@ class NodeStateValues:
 
 
 def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Velocity (len(nodes), ...) at `nodes`, by central differences of the positions `q` (K, ...)."""
+    """Compute the velocity (len(nodes), ...) at `nodes` by central differences of the positions `q` (K, ...)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
 
 
 def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of `central_difference_velocity`, from (len(nodes), n) to (count, n)."""
+    """Apply the transpose of `central_difference_velocity` to values (len(nodes), n). The result is (count, n)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
     scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))
     np.add.at(result, after, scaled)
@@ -273,13 +273,13 @@ def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int
 
 
 def second_difference_acceleration(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Acceleration (len(nodes), ...) at `nodes`, by second differences of the positions `q` (K, ...)."""
+    """Compute the acceleration (len(nodes), ...) at `nodes` by second differences of the positions `q` (K, ...)."""
     middle = _inner_nodes(nodes, len(q))
     return np.asarray((q[middle + 1] - 2 * q[middle] + q[middle - 1]) / time_step**2) if len(q) > 2 else 0 * q[nodes]
 
 
 def second_difference_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of `second_difference_acceleration`, from (len(nodes), n) to (count, n)."""
+    """Apply the transpose of `second_difference_acceleration` to values (len(nodes), n). The result is (count, n)."""
     middle, result = _inner_nodes(nodes, count), np.zeros((count, pull.shape[1]))
     for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
         np.add.at(result, middle + shift, factor / time_step**2 * pull)
@@ -309,7 +309,7 @@ class _SensorReadings(NamedTuple):
 
 
 class ModelFunctions:
-    """Compiled functions of a system: sensor readings, equilibrium, initial state fit and input corrections.
+    """The compiled functions of a system: sensor readings, equilibrium, initial state fit and input corrections.
 
     `names` are the parameters for which derivatives are available. `start_parameters` are fitted with initial states.
     """
@@ -327,7 +327,7 @@ class ModelFunctions:
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
-        """The same functions for another time step [s]. Functions independent of the time step are shared."""
+        """Return these functions for another time step [s]. Functions independent of the time step are shared."""
         made = ModelFunctions(step_with_time_step(self.step, time_step), self.parameter_names, self._start_parameters)
         made.input_corrections, made._sensors = self.input_corrections, self._sensors
         made._arms = CasadiLockedCache(lambda _: step_with_time_step(self.arms_only_integrator_step, time_step))
@@ -335,28 +335,28 @@ class ModelFunctions:
 
     @property
     def equilibrium_solver(self) -> EquilibriumSolver:
-        """Solver of the system's equilibrium equations."""
+        """The solver of the system's equilibrium equations."""
         return self._statics(None)
 
     @property
     def initial_state_fitter(self) -> InitialStateFitter:
-        """Solver that fits an initial state to the first measured points."""
+        """The solver that fits an initial state to the first measured points."""
         return self._start_fit(None)
 
     @property
     def arms_only_integrator_step(self) -> Step:
-        """Compiled step of the arms alone, from which the tracking filter's gains are computed."""
+        """The compiled step of the arms alone, from which the tracking filter's gains are computed."""
         return self._arms(None)
 
     @property
     def reference_momentum_correction(self) -> EffectMomentumCalculator:
-        """Correction of the tracking feedback's reference momentum for the effects in the model."""
+        """The calculator of the momentum that the model's effects add to the tracking feedback's reference."""
         return self._momentum(None)
 
     def compiled_sensor_function(
         self, sensor: Sensor, names: tuple[str, ...] = ()
     ) -> Callable[[NodeStateValues, Array], _SensorReadings]:
-        """Compiled function of a sensor's readings at nodes, with derivatives by the parameters `names`."""
+        """Return the compiled function of a sensor's readings at nodes, with derivatives by the parameters `names`."""
         function, columns = self._sensors((sensor, bool(names))), [self.parameter_names.index(name) for name in names]
 
         def read(at: NodeStateValues, theta: Array) -> _SensorReadings:

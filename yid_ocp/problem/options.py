@@ -1,4 +1,4 @@
-"""Settings of an estimation problem: initial state, noise, priors and tracking filter."""
+"""The settings of an estimation problem: initial state, noise, priors and tracking filter."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RefinementKind = Literal["links", "time_step"]
 
 @dataclass(frozen=True)
 class MultivariateGaussianPrior:
-    """Multivariate Gaussian prior of shared parameters about their initial values, such as an earlier estimate.
+    """A Gaussian prior of several shared parameters about their initial values, such as an earlier estimate.
 
     The covariance (n, n) is positive definite, in the parameters' units.
     """
@@ -33,19 +33,19 @@ class MultivariateGaussianPrior:
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def with_parameters_scaled_by(self, factors: Mapping[str, float]) -> MultivariateGaussianPrior:
-        """Prior of the parameters multiplied by `factors`. Parameters without a factor are unchanged."""
+        """Return the prior of the parameters multiplied by `factors`. Parameters without a factor are unchanged."""
         by = np.array([factors.get(name, 1.0) for name in self.parameter_names])
         return MultivariateGaussianPrior(self.parameter_names, self.covariance * np.outer(by, by))
 
     def restricted_to(self, names: Sequence[str]) -> MultivariateGaussianPrior:
-        """Return the marginal prior of those named parameters that have this prior, in the given order."""
+        """Return the prior of the named parameters alone, in the given order. Names without this prior are omitted."""
         at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
         return MultivariateGaussianPrior(tuple(self.parameter_names[i] for i in at), self.covariance[np.ix_(at, at)])
 
 
 @dataclass(frozen=True)
 class ExcessResidualCriteria:
-    """Criteria by which a residual exceeds its noise: a significance level and a smallest excess of chi2.
+    """The limits beyond which a residual exceeds its noise: a significance level and a smallest excess of chi2.
 
     A residual exceeds its noise if it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`. The fraction
     `noise_fraction_of_stated_std` of stated standard deviations is noise; the rest represents model error.
@@ -58,7 +58,7 @@ class ExcessResidualCriteria:
 
 @dataclass(frozen=True)
 class DividedLinksModel:
-    """Model of an object with each link divided in two. Factors on parameters keep its stiffness."""
+    """A model of the object in which each link is divided in two. Factors on parameters keep its stiffness."""
 
     build_step: Callable[[bool], Step]  # function of whether the step is compiled
     parameter_factors: Mapping[str, float]
@@ -66,7 +66,7 @@ class DividedLinksModel:
 
 @dataclass(frozen=True)
 class ProblemOptions:
-    """Settings of an estimation problem besides model and data, such as initial states, weighting and priors.
+    """The settings of an estimation problem besides model and data, such as initial states, weighting and priors.
 
     Attributes
     ----------

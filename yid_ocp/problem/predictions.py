@@ -79,7 +79,7 @@ def naive_cable_predictions(
 
 
 def measured_point_positions(recording: Recording, points: Sequence[str]) -> Array:
-    """Measured positions (M, len(points), 3) [m] of points of one group of a recording."""
+    """Return the measured positions (M, len(points), 3) [m] of points in one group of a recording."""
     group = _group_with_points(recording, points)
     return group.position[:, [group.names.index(point) for point in points]]
 
@@ -101,7 +101,7 @@ def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelPrediction(ReprMixin):
-    """Measured and predicted samples (M, w) of one channel; w is 3 for a point, 1 for a joint."""
+    """The measured and predicted samples (M, w) of one channel; w is 3 for a point, 1 for a joint."""
 
     recording: str
     channel: str
@@ -113,12 +113,12 @@ class ChannelPrediction(ReprMixin):
 
     @property
     def predicted_minus_measured(self) -> Array:
-        """Error (M, w) of the prediction, predicted minus measured."""
+        """The error (M, w) of the prediction, predicted minus measured."""
         return self.predicted - self.measured
 
     @property
     def rmse(self) -> float:
-        """Root mean square error in the channel's unit; for a point, of the Euclidean distance."""
+        """The root mean square error in the channel's unit; for a point, of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
     def predicted_at(self, t: Array) -> Array:
@@ -131,7 +131,7 @@ class ChannelPrediction(ReprMixin):
 
 
 def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[ChannelPrediction, ...]:
-    """Measured and predicted samples of an episode, one `ChannelPrediction` per channel."""
+    """Return the measured and predicted samples of an episode, one `ChannelPrediction` for each channel."""
     found = []
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         sensor = samples.sensor
@@ -148,7 +148,7 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
 def rmse_unit_and_count_by_channel(
     results: Sequence[EpisodePrediction], episodes: Sequence[Episode]
 ) -> dict[str, dict[str, Any]]:
-    """Root mean square error, unit and number of samples by channel, with the keys `rmse`, `unit`, `n`.
+    """Compute the root mean square error, unit and number of samples by channel, with the keys `rmse`, `unit`, `n`.
 
     For points, the error of a sample is the Euclidean distance.
     """
@@ -205,7 +205,7 @@ def recording_from_prediction(
 def synthesize_recording(
     predictor: EpisodePredictor, episode: Episode, theta: Array, seed: int | None = None
 ) -> Recording:
-    """Roll out an episode at `theta` and make a synthetic recording, with noise if a `seed` is given."""
+    """Simulate an episode at `theta` and make a synthetic recording, with noise if a `seed` is given."""
     refit = predictor.options.initial_state == "fitted_to_points"
     bare = replace(episode, fixed_initial_state=None)
     fresh = predictor.episode_with_fitted_initial_state(bare, theta) if refit else episode

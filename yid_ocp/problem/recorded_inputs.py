@@ -1,4 +1,4 @@
-"""Inputs of a rollout from a recording: torques, commands, prescribed paths and joint angles."""
+"""The inputs of a rollout from a recording: torques, commands, prescribed paths and joint angles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion i
 
 
 def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -> float:
-    """Lowest cutoff [Hz], 10 Hz or octaves above it, above which angles are noise alone; at most a fifth of the rate.
+    """Choose the lowest cutoff [Hz], from 10 Hz in octaves to rate / 5, above which angles contain only noise.
 
     What a filter of twice the cutoff keeps beyond this one is compared with white noise of the angles' own size. A
     lower cutoff removes motion, and the prediction of efforts lacks the torques that this motion needs.
@@ -62,7 +62,7 @@ def mean_step_inputs(
     delay: Array | None = None,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Mean input (steps, nu) of driven joints in every step: torque [N m] or servo command [rad or m].
+    """Return the mean input (steps, nu) of driven joints in every step: torque [N m] or servo command [rad or m].
 
     Effort samples are interpolated by a cubic spline. Efforts that are interval means are integrated, and the input is
     the derivative of a spline through the integral, which preserves every mean. Efforts of kind `command` and held
@@ -89,7 +89,7 @@ def mean_step_input_delay_derivative(
     delay: Array,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Derivative (steps, nu) of `mean_step_inputs` by each joint's delay; at jumps, the mean of both sides."""
+    """Return the derivative (steps, nu) of `mean_step_inputs` by each joint's delay; at jumps, a mean of both sides."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
@@ -112,7 +112,7 @@ def _motor_off_steps(
 
 
 def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
-    """Firmware gains stated in recordings, as `JOINT.servo_gain_factor` values by recording name.
+    """Read the firmware gains in recordings, as `JOINT.servo_gain_factor` values by recording name.
 
     Raises `DataError` if only some of the recordings with motors on state gains, because gains cannot be compared then.
     """
@@ -196,7 +196,7 @@ def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
 def smoothed_joint_angles_at_nodes(
     joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: ZeroPhaseLowPassFilter
 ) -> Array:
-    """Low-pass filter recorded joint angles and sample them at every node, (steps + 1, len(names)) [rad]."""
+    """Low-pass filter the recorded joint angles and sample them at every node, (steps + 1, len(names)) [rad]."""
     columns = recorded_joint_column_indices(joints, names, where)
     return _smoothed_at_nodes(joints.t, joints.position[:, columns], grid, low_pass)
 
@@ -209,7 +209,7 @@ def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: ZeroPh
 def smoothed_joint_efforts(
     recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter
 ) -> Array:
-    """Low-pass filtered joint efforts (steps + 1, len(names)) [N m] at every node. `DataError` without efforts."""
+    """Low-pass filter joint efforts and sample them at each node, (steps + 1, len(names)) [N m]. Raises `DataError`."""
     joints = recording.joints
     if joints is None or joints.effort is None:
         what = "the elastic gears of the model need joint efforts, but the recording has none"
@@ -222,7 +222,7 @@ def smoothed_joint_efforts(
 
 
 def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Remove effort noise from gear loads: the result is the model's loads plus the slow part of measured minus model.
+    """Remove effort noise from gear loads: return the model's loads plus the slow part of measured minus model.
 
     `measured` and `model` are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
     difference is constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
@@ -232,7 +232,7 @@ def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: A
 
 
 def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Signal kinds that the recordings contain, of those that effects can require, such as `joints.effort`.
+    """Return the kinds of signals in the recordings that effects can require, such as `joints.effort`.
 
     Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, each point group that
     neither a camera nor an arm measured is a kind too: `points:GROUP`.
@@ -259,7 +259,7 @@ def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
 
 
 def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
-    """Kinds of effects that cannot be candidates, by the signals that they require but the recordings lack."""
+    """Return the kinds of effects that cannot be candidates, by the signals that they require but recordings lack."""
     present, found = signal_kinds_for_effects(recordings), dict[str, list[str]]()
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):
@@ -274,7 +274,7 @@ def prescribed_coordinates_at_nodes(
     low_pass: ZeroPhaseLowPassFilter,
     clamps: tuple[ClampPosePointNames, ...] = (),
 ) -> Array:
-    """Prescribed coordinates (steps + 1, nc) at every node, from smoothed recorded joints and clamp points.
+    """Return the prescribed coordinates (steps + 1, nc) at every node, from smoothed joints and clamp points.
 
     Raises `DataError` if a joint or clamp point is not recorded or has too few measurements.
     """

@@ -1,4 +1,4 @@
-"""Zero-phase low-pass filter and first-order lags of recorded and predicted signals."""
+"""A zero-phase low-pass filter and first-order lags of recorded and predicted signals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MIN_RELATIVE_WEIGHT = 1e-4  # fraction of the largest weight below which weight
 
 @dataclass(frozen=True)
 class ZeroPhaseLowPassFilter:
-    """Zero-phase Butterworth low-pass filter of order 4 on an even clock, run forward and backward."""
+    """A zero-phase Butterworth low-pass filter of order 4 on an even clock, run forward and backward."""
 
     cutoff: float  # frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter
     passes: int = 1
@@ -42,17 +42,17 @@ class ZeroPhaseLowPassFilter:
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def decorrelation_stride(self, step: float) -> int:
-        """Number of samples, `step` [s] apart, after which filtered white noise is nearly uncorrelated."""
+        """Return the number of samples, `step` [s] apart, after which filtered white noise is nearly uncorrelated."""
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 
     @property
     def end_distortion_duration(self) -> float:
-        """Time [s] after which the distortion at the ends of a record has decayed to a thousandth."""
+        """The time [s] after which the distortion at the ends of a record has decayed to a thousandth."""
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * _FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
     def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]:
-        """Standard deviations of filtered unit white noise and of its first [1/s] and second [1/s^2] derivatives."""
+        """Compute the stds of filtered unit white noise and of its first [1/s] and second [1/s^2] derivatives."""
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
         response = self._response(step)
@@ -99,19 +99,19 @@ class ZeroPhaseLowPassFilter:
 
 @dataclass(frozen=True)
 class NodeValueSmoother:
-    """A smoothing filter as a matrix (M, N). It smooths values at M of N nodes and keeps the others."""
+    """A linear filter that smooths values at M of N nodes with a matrix (M, N) and keeps the others unchanged."""
 
     nodes: IntArray
     matrix: scipy.sparse.csr_array
 
     def smooth(self, values: Array) -> Array:
-        """Smooth values (N, ...) at all nodes."""
+        """Smooth the values (N, ...), which are given at all nodes."""
         smooth = values.copy()
         smooth[self.nodes] = (self.matrix @ values.reshape(len(values), -1)).reshape(len(self.nodes), *values.shape[1:])
         return smooth
 
     def smoothing_adjoint(self, pull: Array) -> Array:
-        """Convert a cost's gradient by the smoothed values to a gradient by the input values, both (N, k) (adjoint)."""
+        """Convert a cost's gradient with respect to smoothed values to one with respect to inputs, both (N, k)."""
         passed = pull.copy()
         passed[self.nodes] = 0.0
         return np.asarray(passed + self.matrix.T @ pull[self.nodes])
@@ -128,13 +128,13 @@ def _weights(low_pass: ZeroPhaseLowPassFilter, step: float) -> Array:
 
 
 def zero_phase_effort_filter(cutoff: float) -> ZeroPhaseLowPassFilter:
-    """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
+    """Make the low-pass filter of measured and predicted efforts: two passes of the zero-phase filter of paths."""
     return ZeroPhaseLowPassFilter(cutoff, 2)
 
 
 @dataclass(frozen=True)
 class FirstOrderLag:
-    """First-order lags of k channels, T dz/dt = x - z, with derivatives with respect to their time constants T.
+    """The first-order lags of k channels, T dz/dt = x - z, with derivatives by their time constants T.
 
     With the time step h, E = exp(-h/T) and f = T/h (1 - E). At T = 0 both are zero and the output z equals the input x.
     Node values allow a negative T: then z leads x, with z = x - T dx/dt.
@@ -145,7 +145,7 @@ class FirstOrderLag:
     time_step: float  # h [s]
 
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
-        """Mean output z of the lag over each step, with derivatives, for inputs x (N, k) that are constant in a step.
+        """Compute the lag's mean output z in each step, with derivatives, for inputs x (N, k) held over a step.
 
         The mean is x + (z - x) f with z_{k+1} = x + (z - x) E, with E and f as in the class. The output starts at the
         first input. `slope` (N, k, d) is the derivative of x.
@@ -159,7 +159,7 @@ class FirstOrderLag:
         return value + share * gap, by_value + share[:, None] * (followed - by_value) + mean_by_time
 
     def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
-        """Output of the lag at nodes, with derivatives, for an input x (N, k) that is linear between nodes.
+        """Compute the lag's output at the nodes, with derivatives, for an input x (N, k) that is linear between nodes.
 
         The lag starts at node 1. The output is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1} or, for negative T, x -
         T dx/dt by central differences. `slope` (N, k, d) is the derivative of x; its first columns are the parameters
@@ -178,7 +178,7 @@ class FirstOrderLag:
         return followed, total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Convert a cost's gradient by lagged node values to gradients by input and parameters (adjoint)."""
+        """Convert a cost's gradient with respect to lagged values to gradients with respect to input and parameters."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         by_time = self._by_time(value, self._straight(value, decay, share))

@@ -1,1 +1,1 @@
-"""Figures, report sections and the HTML page. A new section is one file in `sections`."""
+"""The figures, report sections and HTML page of a run. A new section is one file in `sections`."""

@@ -1,4 +1,4 @@
-"""Animation data over time, measured and predicted: sticks, points, robot meshes and applied forces."""
+"""Data for animations of measured and predicted motion: sticks, points, robot meshes and applied forces."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class _AnimatedMotion:
 
 @dataclass(frozen=True)
 class AnimationData:
-    """Data of one animation: several motions on a common time axis t (F,) [s]."""
+    """The data of one animation: several motions on a common time axis t (F,) [s]."""
 
     title: str
     t: Array
@@ -165,7 +165,7 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
 
 @dataclass(frozen=True)
 class ConfigurationTrajectory:
-    """Trajectory of a model, with configurations q (N, n) at times t (N,) [s].
+    """A trajectory of a model, with configurations q (N, n) at times t (N,) [s].
 
     `acting` lists the applied forces and effects to draw: label, location (joint, segment, grasp or frame), unit and
     values (N, k). Values are vectors in world axes (k = 3) or scalars (k = 1). Effects have no values.

@@ -1,4 +1,4 @@
-"""Plotly figures of the report: over time, curves, and one row per name.
+"""Plotly figures of the report: plots over time, curves, and plots with one row for each name.
 
 A figure is plain data, the traces `data` and the `layout`, as plotly's script reads it; plotly's Python objects take
 longer to make than all else of a page.
@@ -101,7 +101,7 @@ def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]], later_das
 
 
 def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> _Figure:
-    """Plot the cost of every accepted iterate, with one curve per intermediate horizon."""
+    """Plot the cost of every accepted iterate, with one curve for each intermediate horizon."""
     figure = _styled_figure(320, "accepted point", "cost")
     _set_axis(figure, "yaxis", **_POWERS)
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
@@ -111,7 +111,7 @@ def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -
 
 @dataclass(frozen=True)
 class TimePlotData:
-    """Data of one plot over time: measured values (M,) at t (M,), predicted lines (t, value), shaded intervals."""
+    """The data of one plot over time: measured values (M,) at t (M,), predicted lines (t, value), shaded intervals."""
 
     axis_title: str
     lines: Mapping[str, tuple[Array, Array]]
@@ -131,7 +131,7 @@ def channel_prediction_and_residual_plot_data(
     lines: Mapping[str, Array],
     dense_line: tuple[Array, Array] | None = None,
 ) -> tuple[TimePlotData, TimePlotData]:
-    """Plot measured and predicted values, and their residual with a band of two standard deviations of the noise.
+    """Prepare plot data of measured and predicted values, and of their residual with a band of two noise stds.
 
     All arrays have shape (M,). For sparse measurements, `dense_line` (t (K,), value (K,)) draws the first line densely.
     """
@@ -153,7 +153,7 @@ def channel_prediction_and_residual_plot_data(
 def time_plots_figure(
     curves: Sequence[TimePlotData], dots: str = LINE_PALETTE[1], lines: Mapping[str, str] | None = None
 ) -> _Figure:
-    """Plot measured points and lines over time, one row per plot.
+    """Plot measured points and lines over time, one row for each plot.
 
     `dots` is the color of measured points. `lines` maps line names to colors (default: the palette, in order).
     """
@@ -229,7 +229,7 @@ def lines_over_time_figure(curve: TimePlotData) -> _Figure:
 
 
 def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> _Figure:
-    """Plot a histogram of whitened residuals per sensor group, with the standard normal density."""
+    """Plot a histogram of the whitened residuals of each sensor group, with the standard normal density."""
     figure = _styled_figure(340, "residual in standard deviations", "density")
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
     for i, (name, values) in enumerate(residuals.items()):
@@ -245,7 +245,7 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> _Figur
 
 
 def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
-    """Plot each method's relative excess cost over wall time, from (seconds, cost)."""
+    """Plot each method's relative excess cost over wall time, from pairs (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     _set_axis(figure, "yaxis", **_POWERS)
     least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}
@@ -254,13 +254,13 @@ def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
 
 
 def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
-    """Make plotly's error-bar settings for values with lower ends `low` and upper ends `high`."""
+    """Make plotly's settings for error bars from lower ends `low` to upper ends `high`."""
     above, below = np.maximum(np.subtract(high, values), 0.0), np.maximum(np.subtract(values, low), 0.0)
     return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
 
 
 def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Figure:
-    """Plot the increase of chi2 over the parameter's value relative to the estimate (profile likelihood)."""
+    """Plot how much chi2 rises as the parameter moves away from the estimate (profile likelihood)."""
     figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items(), "dash")
     _add_line(figure, "y", level, color=_TEXT_COLOR, dash="dot")
     at = {"x": 1, "xref": "x domain", "xanchor": "right", "y": level, "yref": "y", "yanchor": "bottom"}
@@ -270,7 +270,7 @@ def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Fi
 
 
 def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> _Figure:
-    """Plot points by name at (x, y)."""
+    """Plot named points at the positions (x, y)."""
     figure = _styled_figure(340, x, y)
     for i, (name, (across, up)) in enumerate(clouds.items()):
         points = {"x": np.asarray(across, np.float32), "y": np.asarray(up, np.float32)}
@@ -306,7 +306,7 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
 def parameter_values_by_source_figure(
     rows: Mapping[str, Mapping[str, tuple[float, float | None]]], axis: str, colors: Mapping[str, str] | None = None
 ) -> _Figure:
-    """Plot values ± 2 std from several sources, with one row per name and one color per source (default: palette)."""
+    """Plot values ± 2 std from several sources: a row for each name, a color for each source (default: palette)."""
     sources = list(dict.fromkeys([*(colors or ()), *(source for row in rows.values() for source in row)]))
     names = list(rows)
     figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), axis, "")
@@ -332,7 +332,7 @@ def parameter_values_by_source_figure(
 
 
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
-    """Plot a heat map of explained fractions (n, n) in per cent: how much of the row the column explains."""
+    """Plot a heat map (n, n) in per cent that shows how much of each row's effect the column's effect explains."""
     figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
     _add_trace(
         figure, "heatmap", x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False,
@@ -350,7 +350,7 @@ def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
 
 @dataclass(frozen=True)
 class TimeHeatMapRow:
-    """One row of a heat map over time. Rows of one group are adjacent."""
+    """A row of a heat map over time. Rows of one group are adjacent."""
 
     name: str
     group: str
@@ -359,7 +359,7 @@ class TimeHeatMapRow:
 
 
 def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> _Figure:
-    """Plot a heat map over intervals with edges (J + 1,) [s], one row per quantity. Grey: no information.
+    """Plot a heat map over intervals with edges (J + 1,) [s], one row for each quantity. Grey: no information.
 
     `axis` is the title of the color scale.
     """
@@ -400,7 +400,7 @@ def _even(value: Any) -> Any:
 def gap_closure_and_screening_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, predicted: str
 ) -> _Figure:
-    """Plot each candidate's gap closure after a refit [%], with interval, and the decrease that screening predicts.
+    """Plot how much of the gap [%] each candidate closes after a refit, with interval, and how much screening predicts.
 
     `entries` maps each label to (closure, low, high), or None without a refit, and the decrease. `closed` and
     `predicted` are the titles of the two axes.

@@ -1,4 +1,4 @@
-"""Build the HTML report, one self-contained page of the registered sections."""
+"""The HTML report, a self-contained page that consists of the registered sections."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 
 def write_shared_plotly_script(folder: Path) -> None:
-    """Write plotly's script to a folder, shared by pages up to two levels below. Raises `OutputError`."""
+    """Write plotly's script to a folder, for pages there and up to two levels below. Raises `OutputError`."""
     if _installed():
         name, text = _plotly_script()
         if not _is_plotly_script(folder / name):

@@ -1,4 +1,4 @@
-"""Figures written as PNG: sparsity patterns and blind validation."""
+"""Figures that are written as PNG: sparsity patterns and blind validation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> list[Path]:
-    """Write and return `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
+    """Draw `detection.png`, `confusion.png` and `calibration.png` from a `yid-blind/1` result, and return their paths.
 
     The figures show the detection rate over effect size with binomial 95 % intervals, the first answers against the
     truth, and observed against nominal rates of intervals and p-values. Raises `OutputError` if writing fails.

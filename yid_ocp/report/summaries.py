@@ -1,4 +1,4 @@
-"""Summaries of every command's result, by result format, shared by terminal and HTML report."""
+"""Summaries of the results of all commands, by result format, for the terminal and the HTML report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blocks of a summary (statements, tables, code), text that summaries share, and its lines on a terminal."""
+"""The blocks of a summary (statements, tables, code), shared texts, and the lines that a terminal shows."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 
 @dataclass(frozen=True)
 class SummaryStatement:
-    """One sentence of a summary, with its importance.
+    """A sentence of a summary, with its importance.
 
     The kind is `verdict` (answers the question of the command), `conclusion` (summarises several verdicts) or `note`. A
     report shows conclusions first.
@@ -56,7 +56,7 @@ class SummaryTable:
 
 @dataclass(frozen=True)
 class CodeBlock:
-    """Preformatted lines, such as a shell command to copy."""
+    """A block of preformatted lines, such as a shell command to copy."""
 
     text: str
 
@@ -74,7 +74,7 @@ SUMMARY_BY_RESULT_FORMAT: dict[str, _Summary] = {}
 def register_summary(
     result_format: str,
 ) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]], _Summary]:
-    """Decorator that registers the summary of a result format. The summary returns a list of blocks.
+    """Return a decorator that registers the summary of a result format. The summary returns a list of blocks.
 
     Empty texts, and tables with only a header, are omitted.
     """
@@ -92,12 +92,12 @@ def register_summary(
 
 
 def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:
-    """Scale factor and unit for display: metres become millimetres, other units stay."""
+    """Return the factor and unit with which a quantity is shown: metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, str]:
-    """Format an error's value, and its display unit. None gives a dash."""
+    """Format an error's value and its display unit. None gives a dash."""
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     return ("–" if value is None else f"{factor * value:.3g}"), shown
 
@@ -108,7 +108,7 @@ def p_value_text(p_value: float) -> str:
 
 
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise issues of the recordings as a table and advice."""
+    """Summarise the issues of the recordings as a table and advice."""
     doubts = result.get("doubts", ())
     rows: TableRows = [("in doubt", "where", "certainty", "times its limit")]
     advice: list[StatementTableOrCode | str] = []
@@ -128,7 +128,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
 def misfit_summary_blocks(
     fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
 ) -> SummaryBlockOrTextIterator:
-    """Summarise a poor fit: channels worse than a naive baseline, misfit, and still meaningful parameters.
+    """Summarise a poor fit: channels worse than a naive baseline, misfit, and parameters that are still meaningful.
 
     A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 %.
     """
@@ -157,7 +157,7 @@ def misfit_summary_blocks(
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
-    """One sentence per refined discretisation, on the estimates that it shifts by more than their std."""
+    """Write a sentence for each finer discretisation that shifts estimates by more than their std."""
     said = []
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
@@ -171,7 +171,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
-    """Table rows of the torque offsets of a result, one per joint; only the header if there are none."""
+    """Make table rows of a result's torque offsets, one for each joint; only the header if there are none."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
     rows: TableRows = [("torque offset [N m]", *shown, "expected")]

@@ -1,4 +1,4 @@
-"""Measurement models of the sensors: each computes its readings at a trajectory node. A new kind is one file."""
+"""Measurement models of the sensors, which compute readings at the nodes of a trajectory. A new kind is one file."""
 
 from importlib import import_module
 from pkgutil import iter_modules

@@ -1,4 +1,4 @@
-"""Interface of all sensors: recorded channels, symbolic readings, and measurements from a recording."""
+"""The interface of all sensors: recorded channels, symbolic readings, and measurements from a recording."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NonNegative = Annotated[float, Ge(0)]
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """Settings of one sensor group, such as `points` or `joints.effort`."""
+    """The settings of one sensor group, such as `points` or `joints.effort`."""
 
     use: Annotated[
         bool | None,
@@ -79,7 +79,7 @@ class SensorOptions:
 
 @dataclass(frozen=True)
 class RecordedChannelSpec:
-    """One kind of recorded quantity: its group, dataset, unit, components and sensor constants.
+    """A kind of recorded quantity, with its group, dataset, unit, components and sensor constants.
 
     Noise levels are stored in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std` or, for points, in the
     dataset `std`.
@@ -94,11 +94,11 @@ class RecordedChannelSpec:
 
     @property
     def std_attribute_names(self) -> tuple[str, str]:
-        """Attribute names of the standard deviations of white noise and of a constant error."""
+        """The names of the attributes that hold the standard deviations of white noise and of a constant error."""
         return f"{self.quantity}_std", f"{self.quantity}_bias_std"
 
     def matches_group_name(self, name: str) -> bool:
-        """Whether a group's name is `GROUP` or `GROUP_NAME` of this channel kind. Contents are not checked."""
+        """Check whether a group's name is `GROUP` or `GROUP_NAME` of this channel kind. Contents are not checked."""
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
@@ -107,7 +107,7 @@ CHANNEL_KINDS: Registry[RecordedChannelSpec] = Registry("recorded channel")
 
 
 def channel_kinds_of_sensor_group(group: str) -> tuple[RecordedChannelSpec, ...]:
-    """Channel kinds registered for a recording's group of this name; empty for joints and points."""
+    """Return the channel kinds that are registered for a recorded group's name. Empty for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
 
@@ -122,7 +122,7 @@ class _RecordedGroup(Protocol):
 
 
 class RecordedPointGroup(_RecordedGroup, Protocol):
-    """Interface of a recorded point group, with times and positions; implemented by `data.recording.PointGroup`."""
+    """The interface of a recorded point group, with times and positions. `data.recording.PointGroup` implements it."""
 
     @property
     def sensor_name(self) -> str: ...
@@ -137,7 +137,7 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
 
 
 class RecordedJointsInterface(Protocol):
-    """Interface of recorded joints, with names, times and channels; implemented by `data.recording.JointGroup`."""
+    """The interface of recorded joints, with names, times and channels. `data.recording.JointGroup` implements it."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -160,7 +160,7 @@ class RecordedJointsInterface(Protocol):
 
 
 class RecordedExtraSensor(_RecordedGroup, Protocol):
-    """Interface of an additional sensor's recorded channels; implemented by `data.recording.SensorChannelGroup`."""
+    """The interface of an additional sensor's recorded channels. `data.recording.SensorChannelGroup` implements it."""
 
     @property
     def values_by_quantity(self) -> Mapping[str, Array]: ...
@@ -188,7 +188,7 @@ def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> Dat
 
 
 def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[str, ...], where: str) -> list[int]:
-    """Column indices of the named joints in the recorded arrays. Raises `DataError` if one is not recorded."""
+    """Return the columns of the named joints in the recorded arrays. Raises `DataError` if one is not recorded."""
     for name in names:
         if name not in joints.names:
             what = f"joint '{name}' of the model is not recorded"
@@ -200,7 +200,7 @@ def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[
 def expand_to_joint_values(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
-    """One value per joint in `names`, from a single value, one value per recorded joint, or a mapping by joint."""
+    """Return a value for each joint in `names`, from one value, an array over recorded joints or a mapping by joint."""
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
@@ -212,7 +212,7 @@ def expand_to_joint_values(
 
 
 class Sensor(ABC):
-    """Base class of sensors, which predict a group of measured channels with a common clock. Sensors are hashable.
+    """The base class of sensors, which predict a group of measured channels on one clock. Sensors are hashable.
 
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
     """
@@ -227,49 +227,49 @@ class Sensor(ABC):
 
     @property
     def unit(self) -> str:
-        """Unit of the sensor's readings."""
+        """The unit of the sensor's readings."""
         return self.channel.unit
 
     @property
     def outputs_per_channel(self) -> int:
-        """Number of outputs of each channel, such as 3 for a point and 1 for a joint."""
+        """The number of outputs of each channel, such as 3 for a point and 1 for a joint."""
         return max(len(self.channel.components), 1)
 
     @property
     @abstractmethod
     def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels in the order of the outputs."""
+        """The names of the channels, in the order of the outputs."""
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """Name of each scalar output: the channel, followed by the component if there are several."""
+        """The name of each scalar output: the channel, followed by the component if there are several."""
         parts = [f".{part}" for part in self.channel.components] or [""]
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
     def measurement_frame_names(self) -> tuple[str, ...]:
-        """Name of the frame at which each output is measured; empty for joints."""
+        """The name of the frame at which each output is measured; empty for joints."""
         frames = self.frame_names or ("",) * len(self.channel_names)
         return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """Names of the joints whose measured efforts the sensor predicts; empty if it measures no efforts."""
+        """The names of the joints whose measured efforts the sensor predicts; empty if it measures no efforts."""
         return ()
 
     @property
     def effort_per_unit_reading(self) -> Array:
-        """Joint effort per unit of each output, (len(effort_joints),) [N m per unit]."""
+        """The joint effort that corresponds to one unit of each output, (len(effort_joints),) [N m per unit]."""
         return np.ones(len(self.effort_joints))
 
     @property
     def camera_pose(self) -> Placement | None:
-        """Pose of the camera in the world. None if the sensor is not a camera."""
+        """The pose of the camera in the world. None if the sensor is not a camera."""
         return None
 
     @abstractmethod
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
-        """Symbolic error-free reading at a node, (outputs_per_channel * len(channel_names), 1)."""
+        """Return the symbolic reading without errors at a node, (outputs_per_channel * len(channel_names), 1)."""
 
 
 def sensor_function_with_jacobians(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
@@ -319,7 +319,7 @@ class _SmoothingFilter(Protocol):
 
 @dataclass(frozen=True)
 class SensorDataInputs:
-    """System, recording, options, nodes and filters from which a sensor's measurements are computed.
+    """The system, recording, options, nodes and filters from which a sensor's measurements are computed.
 
     `joint_mass_matrices` maps k joint names and K configurations of these joints (K, k) to the joints' blocks (K, k, k)
     of the mass matrix [kg m^2 or kg].
@@ -340,7 +340,7 @@ class SensorDataInputs:
 
 @dataclass(frozen=True)
 class SensorData:
-    """Measurements of one sensor in one recording, with standard deviations of noise and bias."""
+    """The measurements of one sensor in one recording, with standard deviations of noise and bias."""
 
     sensor: Sensor
     t: Array  # shape (M,) [s]

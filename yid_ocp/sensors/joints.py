@@ -39,7 +39,7 @@ NOISE_ESTIMATE_DIFFERENCE_ORDER = 6  # of differences: they remove motion slower
 
 @dataclass(frozen=True)
 class JointSensor(Sensor):
-    """Base class of sensors of named joints. Each joint has one output."""
+    """The base class of sensors of named joints. Each joint has one output."""
 
     frame_names = point_names = ()
 
@@ -51,13 +51,13 @@ class JointSensor(Sensor):
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
     def select_sensor_joint_entries(self, values: ca.SX, state: NodeStateSymbols) -> ca.SX:
-        """Select the rows of the sensor's joints from a column for all joints, (n, 1) to (nj, 1)."""
+        """Select the sensor's joints from a column (n, 1) for all joints. The result is (nj, 1)."""
         return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
 @dataclass(frozen=True)
 class PositionSensor(JointSensor):
-    """Encoders of named driven joints. They measure joint positions [rad or m]."""
+    """The encoders of named driven joints, which measure joint positions [rad or m]."""
 
     channel = _POSITION
     has_paper_weight = False
@@ -69,7 +69,7 @@ class PositionSensor(JointSensor):
 
 @dataclass(frozen=True)
 class PrescribedJointEffortSensor(JointSensor):
-    """Efforts of named prescribed joints, predicted by discrete inverse dynamics."""
+    """A sensor of the efforts of named prescribed joints, predicted by discrete inverse dynamics."""
 
     channel = _EFFORT
     naive_prediction = "zero"
@@ -84,7 +84,7 @@ class PrescribedJointEffortSensor(JointSensor):
 
 
 def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
-    """Whether the arm itself measured a point group, usually by its encoders and forward kinematics."""
+    """Check whether the arm itself measured a point group, usually by its encoders and forward kinematics."""
     return "arm" in (group.sensor_name, group.name.rpartition("_")[2])
 
 
@@ -134,7 +134,7 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
 def filtered_effort_measurements(
     inputs: SensorDataInputs, sensor: JointSensor, t: Array, values: Array, std: Array, bias: Array, *, is_sample: bool
 ) -> SensorData:
-    """Low-pass filter an effort sensor's measurements and thin them until their noise is nearly independent.
+    """Low-pass filter an effort sensor's measurements, and thin them until their noise is nearly independent.
 
     `values` (M, k) are in the sensor's unit. `std` and `bias` (k,) are the standard deviations of white noise and of a
     constant error. With `is_sample`, a value is measured at its time, otherwise it is the mean until the next value's
@@ -180,7 +180,7 @@ def filter_and_thin_to_nodes(
 
 
 def is_noise_std_stated(joints: RecordedJointsInterface, group: str, choice: SensorOptions) -> bool:
-    """Whether recording or settings specify the noise of `group` (`joints.effort` or `joints.position`).
+    """Check whether the recording or settings give the noise of `group` (`joints.effort` or `joints.position`).
 
     A recorded encoder resolution also specifies the noise of joint positions.
     """
@@ -234,7 +234,7 @@ joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_SENSOR_KEY
 
 
 def joint_torque_bias_std(joints: RecordedJointsInterface, names: Sequence[str], choice: SensorOptions) -> Array:
-    """Standard deviation of the recorded torques' constant errors, (len(names),) [N m]. Zero if unknown."""
+    """Return the standard deviation of the recorded torques' constant errors, (len(names),) [N m]. Zero if unknown."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
     key = f"sensors.{JOINT_EFFORT_SENSOR_KEY}.bias_std"
     return expand_to_joint_values(0.0 if given is None else given, joints.names, names, key)

@@ -1,4 +1,4 @@
-"""Motor currents of prescribed joints, predicted as the joint effort over a torque constant."""
+"""Motor currents of prescribed joints, predicted as the joint effort divided by a torque constant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Base of sensors that are mounted on a link's frame and read vectors along its axes, and inertial units."""
+"""Sensors on a link's frame that read vectors along its axes: the base class, and inertial units."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _Kind = TypeVar("_Kind", bound="MountedSensor")
 
 @dataclass(frozen=True)
 class MountedSensor(base.Sensor):
-    """Base class of sensors mounted on frames. Each sensor has three components along its frame's axes."""
+    """The base class of sensors mounted on frames. Each sensor has three components along its frame's axes."""
 
     naive_prediction: ClassVar = "stays"
     has_paper_weight = False
@@ -48,7 +48,7 @@ class MountedSensor(base.Sensor):
 
 
 def register_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
-    """Register the reader of a kind of mounted sensor, which makes one `SensorData` per recorded group."""
+    """Register the reader of a kind of mounted sensor. It makes one `SensorData` for each recorded group."""
     base.SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
     return kind
 

@@ -20,7 +20,7 @@ _POINTS = base.CHANNEL_KINDS.register("points")(base.RecordedChannelSpec("points
 
 @dataclass(frozen=True)
 class PointSensor(base.Sensor):
-    """Sensor of the world positions of named frames [m], such as motion capture or a camera."""
+    """A sensor of the world positions of named frames [m], such as motion capture or a camera."""
 
     channel = _POINTS
     group_name: str
@@ -112,7 +112,7 @@ def _rates(t: Array, values: Array) -> Array:
 
 
 def measuring_camera_pose(group: base.RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
-    """Pose (4, 4) of the camera that measured a point group. None if no camera measured it.
+    """Return the pose (4, 4) of the camera that measured a point group. None if no camera measured it.
 
     A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Without a pose, the camera is
     assumed at the world origin.

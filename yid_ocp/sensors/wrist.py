@@ -1,4 +1,4 @@
-"""Wrist force/torque sensors, which read the wrench that bodies and grasps beyond their frame exert on them.
+"""Wrist force/torque sensors, which measure the wrench that bodies and grasps beyond their frame exert on them.
 
 The model is cut at the frame. The part beyond hangs on six locked joints, three along and three about the frame's axes.
 By the Euler-Lagrange equations of the cut model, the efforts of these joints are

@@ -1,4 +1,4 @@
-"""Entry point `solve`, the solver interface, and the solution with its status and history."""
+"""The function `solve`, the solver interface, and the solution with its status and history."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 
 
 class Status(str, Enum):
-    """Termination status of a solver."""
+    """The status with which a solver ended."""
 
     CONVERGED = "converged"
     ITERATION_LIMIT = "iteration_limit"
@@ -63,7 +63,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class Iterate:
-    """One accepted iterate of a solver: cost, gradient norm, evaluations and seconds since the start."""
+    """An accepted iterate of a solver, with cost, gradient norm, evaluations and seconds since the start."""
 
     iteration: int
     cost: float
@@ -76,7 +76,7 @@ class Iterate:
 
 @dataclass(frozen=True, repr=False)
 class Solution(ReprMixin):
-    """Solution of an estimation problem, with estimates, covariance, goodness of fit and history.
+    """The solution of an estimation problem, with estimates, covariance, goodness of fit and history.
 
     Attributes
     ----------
@@ -137,17 +137,17 @@ class Solution(ReprMixin):
 
     @property
     def n_iterations(self) -> int:
-        """Number of accepted steps."""
+        """The number of accepted steps."""
         return max(len(self.history) - 1, 0)
 
     @property
     def std(self) -> dict[str, float]:
-        """Standard deviation of every shared free parameter."""
+        """The standard deviation of every shared free parameter."""
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
 
     @cached_property
     def episode_predictions(self) -> tuple[EpisodePrediction | str, ...]:
-        """Prediction of each recording from its torques minus their offsets. A failed rollout gives a message."""
+        """The prediction of each recording from its torques minus their offsets. A failed rollout gives a message."""
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
         problem = problem_with_sensor_noise_only(self.problem)
@@ -159,7 +159,7 @@ class Solution(ReprMixin):
         return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
-        """Measured and predicted samples of all recorded channels at the estimate. Empty if it was not evaluated."""
+        """The measured and predicted samples of all recorded channels at the estimate. Empty if not evaluated."""
         pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
         known = [(episode, result) for episode, result in pairs if not isinstance(result, str)]
         return tuple(sample for pair in known for sample in channel_predictions(*pair))
@@ -181,12 +181,12 @@ IterationCallback = Callable[[Iterate], None]
 
 
 class StopSearch(Exception):  # noqa: N818
-    """Raised by a callback to end a search at its last iterate. Its text is the message of the solution."""
+    """An exception that a callback raises to end a search at its last iterate. Its text is the solution's message."""
 
 
 @dataclass(frozen=True)
 class SolverResult:
-    """Raw result of a solver: status, best unknown vector, history, and equilibria there (None if unknown)."""
+    """The raw result of a solver: status, best unknown vector, history, and equilibria there (None if unknown)."""
 
     status: Status
     message: str
@@ -201,7 +201,7 @@ class SolverResult:
 
 @runtime_checkable
 class Solver(Protocol):
-    """Interface of a solver, which is a frozen dataclass of settings, registered under its name.
+    """The interface of a solver, which is a frozen dataclass of settings, registered under its name.
 
     Optional class attributes, with their defaults: `needs_rollout` (True), whether the rollout must succeed at the
     start; `uses_process_noise_covariance` (False), whether the solver can whiten residuals by process noise;
@@ -211,7 +211,7 @@ class Solver(Protocol):
 
     @property
     def name(self) -> str:
-        """Registered name of the solver."""
+        """The registered name of the solver."""
         ...
 
     def minimize_cost(
@@ -222,7 +222,7 @@ class Solver(Protocol):
 
 
 class SolverWithCheckedSettings:
-    """Base of the package's own solvers, which checks settings against their annotated bounds."""
+    """The base class of the package's own solvers, which checks settings against their annotated bounds."""
 
     name: ClassVar[str]
 
@@ -236,7 +236,7 @@ _DEFAULT_SOLVER = "gauss_newton"
 
 @dataclass
 class AcceptedIterateRecorder:
-    """Records a solver's accepted iterates, evaluations and time, and passes iterates to a callback."""
+    """A recorder of a solver's accepted iterates, evaluations and time, which passes iterates to a callback."""
 
     callback: IterationCallback | None
     start_time: float = field(default_factory=time.perf_counter)
@@ -580,7 +580,7 @@ def _doubtful(fit: _Fit, first: Array) -> BoolArray:
 
 
 def uses_process_noise_covariance(solver: Solver) -> bool:
-    """Whether a solver can whiten residuals by process noise."""
+    """Check whether a solver can whiten residuals by process noise."""
     return bool(getattr(solver, "uses_process_noise_covariance", False))
 
 

@@ -39,7 +39,7 @@ _LOWEST = "the cost cannot be lowered any further"
 @base.SOLVERS.register("gauss_newton")
 @dataclass(frozen=True)
 class GaussNewton(base.SolverWithCheckedSettings):
-    """Gauss-Newton method with bounded, damped linear least-squares steps on the cost 1/2 |r(x)|^2.
+    """The Gauss-Newton method with bounded, damped linear least-squares steps on the cost 1/2 |r(x)|^2.
 
     Each iteration solves min |J d + r|^2 + mu |d/s|^2 for the step d, subject to lower <= x + d <= upper, with the
     Jacobian J, the damping mu and the scales s. The step is accepted if the cost falls by a sufficient part of the
@@ -66,7 +66,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
 
     @property
     def with_coarse_tolerances(self) -> GaussNewton:
-        """Return this solver with looser step and cost tolerances, for preliminary searches."""
+        """This solver with looser step and cost tolerances, for preliminary searches."""
         steps, costs = max(self.step_tolerance, 1e-3), max(self.cost_tolerance, 1e-5)
         return replace(self, step_tolerance=steps, cost_tolerance=costs)
 
@@ -173,7 +173,7 @@ def _saved(problem: EstimationProblem, history: Sequence[base.Iterate], now: Eva
 @base.SOLVERS.register("single_shooting")
 @dataclass(frozen=True)
 class SingleShooting(base.SolverWithCheckedSettings):
-    """Single shooting with SciPy's L-BFGS-B on unknowns scaled to order one.
+    """The single shooting method with SciPy's L-BFGS-B, in which the unknowns are scaled to order one.
 
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
     """
@@ -227,7 +227,7 @@ class SingleShooting(base.SolverWithCheckedSettings):
 @base.SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
 class SteepestDescent(base.SolverWithCheckedSettings):
-    """Projected steepest descent with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
+    """The steepest descent method with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
 
     The gradient g comes from the adjoint method and is not scaled, as in the paper (Caldwell et al. 2014). The first
     trial step s of an iteration is twice the last accepted step (`last`, as in the paper), or the Barzilai-Borwein step

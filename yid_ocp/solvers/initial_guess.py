@@ -1,4 +1,4 @@
-"""Initial guesses with active free effects, and node states for solvers with states as unknowns."""
+"""Initial guesses of the unknowns, in which free effects are active, and of the states at nodes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 
 @dataclass(frozen=True)
 class UnknownsAndNodeStateGuess:
-    """Guess of the unknowns, and each recording's initial state, node states and constraint multipliers."""
+    """A guess of the unknowns, and of each recording's initial state, node states and constraint multipliers."""
 
     x: Array
     initial_states: tuple[InitialStateWithSensitivity, ...]
@@ -92,7 +92,7 @@ def guess_unknowns_and_node_states(
 
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
-    """Mean square whitened residual, without effort channels, of a trajectory (N + 1, nx) of recording `i`."""
+    """Compute the mean square whitened residual of recording `i` on a trajectory (N + 1, nx), without efforts."""
     shared, _ = problem.unpack_episode_unknowns(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameter_names)))
@@ -151,7 +151,7 @@ def _resting(
 
 
 def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array) -> Array:
-    """Return an initial unknown vector (nx,) in which the free effects of zero amplitude have a small amplitude.
+    """Return an initial unknown vector (nx,) in which free effects of zero amplitude get a small amplitude.
 
     At zero amplitude, an effect's shape parameters (rest angle of a spring, relaxation time) have no influence and
     cannot be estimated, and a poor shape can drive the amplitude to its bound. Several shapes are therefore tried for
@@ -224,7 +224,7 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
 
 
 def starts_toward_other_minima(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
-    """Starts from which a poorly known unknown may reach another minimum, the most likely start first."""
+    """Find start vectors from which an uncertain unknown may reach another minimum, the most likely one first."""
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, finish)

@@ -50,7 +50,7 @@ _CLOSED_DEFECT = 1e-7
 @base.SOLVERS.register("multiple_shooting")
 @dataclass(frozen=True)
 class MultipleShooting(base.SolverWithCheckedSettings):
-    """Multiple shooting, which minimises 1/2 |r|^2 over parameters and node states under the equations of motion.
+    """A multiple shooting method that minimises 1/2 |r|^2 over parameters and node states, subject to the dynamics.
 
     IPOPT solves the program of `transcribe`, whose constraints are the discrete Euler-Lagrange equations of every step.
     Defects (violations of these constraints) are scaled to order one, the cost by its initial value, and IPOPT's own

@@ -1,4 +1,4 @@
-"""General nonlinear program in CasADi, composed of residual and constraint terms.
+"""A general nonlinear program in CasADi, composed of residual and constraint terms.
 
     min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
 
@@ -46,7 +46,7 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Symbolic function y(v; d, s) of local variables v, data d and shared data s, with derivatives by v.
+    """A symbolic function y(v; d, s) of local variables v, data d and shared data s, with derivatives by v.
 
     v are local variables, d data and s data shared by all calls. `jacobian` dy/dv (ny, nv) is derived from the value by
     default. Derivatives can be compiled. The value stays a CasADi expression, so that terms built on it can be
@@ -106,7 +106,7 @@ class MappedFunctionTerm:
 
     @property
     def n_values(self) -> int:
-        """Number of output values in all: ny of each of K places."""
+        """The total number of output values: ny at each of K places."""
         return len(self.row_names) * len(self.variable_indices)
 
     def _map_over_places(self, function: ca.Function, w: ca.MX, p: ca.MX, *more: ca.MX) -> ca.MX:
@@ -143,7 +143,7 @@ class MappedFunctionTerm:
 
 @dataclass(frozen=True)
 class ResidualTerm:
-    """Residual term of a program's objective, r = weight (combination values - target)."""
+    """A residual term of a program's objective, r = weight (combination values - target)."""
 
     term: MappedFunctionTerm
     combination: ca.DM | None = None  # shape (nr, ny K); None takes the values as they are
@@ -153,7 +153,7 @@ class ResidualTerm:
 
     @property
     def n_residuals(self) -> int:
-        """Number nr of residuals."""
+        """The number nr of residuals."""
         return self.term.n_values if self.combination is None else self.combination.size1()
 
     def _residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:
@@ -177,7 +177,7 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Sparse Jacobian (nr, nw) of the residuals with respect to the program's unknowns w."""
+        """Return the sparse Jacobian (nr, nw) of the residuals with respect to the program's unknowns w."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
         matrix = self._residual_jacobian_by_term_values(p)
@@ -209,7 +209,7 @@ class ResidualTerm:
 
 @dataclass(frozen=True)
 class GaussNewtonHessianRidge:
-    """Ridge that keeps Gauss-Newton steps of poorly informed unknowns small.
+    """A term added to the Gauss-Newton Hessian that keeps steps of poorly determined unknowns small.
 
     For such unknowns, the curvature that Gauss-Newton neglects can be as large as its own. The ridge adds factor * mean
     square residual / max(|w_i|, scale_i)^2 to the Gauss-Newton Hessian only. `factor` is a number or a function of the
@@ -253,7 +253,7 @@ class _VectorBlock:
 
 @dataclass
 class ProgramVectorLayout:
-    """Layout of a program's variables or parameters in successive blocks, with values and bounds."""
+    """The layout of a program's variables or parameters in successive blocks, with values and bounds."""
 
     size: int = 0
     blocks: dict[str, _VectorBlock] = field(default_factory=dict)
@@ -272,7 +272,7 @@ class ProgramVectorLayout:
         return np.arange(self.size - len(values), self.size)
 
     def assign_block_name(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Name existing indices of the vector as a block. Without indices nothing is named."""
+        """Name a block of existing indices of the vector. Nothing is named if there are no indices."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
@@ -295,7 +295,7 @@ class _UserTerms(NamedTuple):
 
 
 def available_memory_bytes() -> float:
-    """Available memory [bytes]. Infinite if the system does not report it."""
+    """Return the available memory [bytes]. Infinite if the system does not report it."""
     told = Path("/proc/meminfo")
     lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
     found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
@@ -304,7 +304,7 @@ def available_memory_bytes() -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NonlinearProgram(ReprMixin):
-    """Nonlinear program in CasADi that minimises f(w, p) over the variables w, under bounds and constraints.
+    """A nonlinear program in CasADi that minimises f(w, p) over the variables w, under bounds and constraints.
 
     `nlp[name]` is a block of the variables w or of the parameters p, an MX of the block's shape. With one recording,
     `nlp["q"]` is short for `nlp["q[NAME]"]`.
@@ -349,7 +349,7 @@ class NonlinearProgram(ReprMixin):
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 
     def variable_names(self) -> tuple[str, ...]:
-        """Names of all unknowns w, composed of block, row and, if there are several, column."""
+        """Return the names of all unknowns w, composed of block, row and, if there are several, column."""
         named = np.full(self.w.numel(), "", dtype=object)
         for name, block in self.variables.items():
             for row, places in zip(block.row_names, block.index, strict=True):
@@ -358,19 +358,19 @@ class NonlinearProgram(ReprMixin):
         return tuple(named)
 
     def constraint_names(self) -> tuple[str, ...]:
-        """Names of all constraint rows by term, row and place. Rows of `with_user_terms` are named `added.I`."""
+        """Return the names of all constraint rows by term, row and place. Rows of `with_user_terms` are `added.I`."""
         places = ((t, k) for t in self.constraint_terms for k in range(len(t.variable_indices)))
         terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
 
     @_ThreadSafeCachedProperty
     def f(self) -> ca.MX:
-        """Symbolic scalar objective f(w, p)."""
+        """Return the symbolic scalar objective f(w, p)."""
         return sum((*self._losses, *(extra.objective for extra in self.user_terms)), ca.MX(0))
 
     @_ThreadSafeCachedProperty
     def g(self) -> ca.MX:
-        """Symbolic constraint functions g(w, p), shape (ng, 1)."""
+        """Return the symbolic constraint functions g(w, p), shape (ng, 1)."""
         terms = (term._symbolic_outputs(self.w, self.p) for term in self.constraint_terms)
         return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.user_terms))
 
@@ -381,7 +381,7 @@ class NonlinearProgram(ReprMixin):
 
     @property
     def solver_arguments(self) -> dict[str, Array]:
-        """Initial guess, parameter values and bounds: the arguments for a call of a CasADi solver."""
+        """The initial guess, parameter values and bounds, which are the arguments for a call of a CasADi solver."""
         zero = np.zeros(sum(term.n_values for term in self.constraint_terms))
         low, high = ([zero, *(getattr(extra, side) for extra in self.user_terms)] for side in ("lower", "upper"))
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
@@ -401,17 +401,17 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def residual(self) -> ca.MX:
-        """Symbolic residuals r(w, p) of the objective's least-squares terms, (nr, 1)."""
+        """Return the symbolic residuals r(w, p) of the objective's least-squares terms, (nr, 1)."""
         return ca.vertcat(ca.MX(0, 1), *self._residuals)
 
     @_ThreadSafeCachedProperty
     def jac_r(self) -> ca.MX:
-        """Sparse Jacobian of all residuals r with respect to the unknowns w."""
+        """Return the sparse Jacobian of all residuals r with respect to the unknowns w."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
     @_ThreadSafeCachedProperty
     def jac_g(self) -> ca.MX:
-        """Sparse Jacobian of the constraints g with respect to the unknowns w."""
+        """Return the sparse Jacobian of the constraints g with respect to the unknowns w."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
             row, column = term._jacobian_nonzero_indices()
@@ -425,7 +425,7 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def grad_f(self) -> ca.MX:
-        """Gradient of the objective f with respect to the unknowns w, shape (nw, 1)."""
+        """Return the gradient of the objective f with respect to the unknowns w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
         for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
@@ -434,12 +434,12 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def lam_f(self) -> ca.MX:
-        """Symbolic factor on the objective f in the Lagrangian of `hessian`."""
+        """Return the symbolic factor on the objective f in the Lagrangian of `hessian`."""
         return ca.MX.sym("lam_f")
 
     @_ThreadSafeCachedProperty
     def lam_g(self) -> ca.MX:
-        """Symbolic multipliers of the constraints g in the Lagrangian, shape (ng, 1)."""
+        """Return the symbolic multipliers of the constraints g in the Lagrangian, shape (ng, 1)."""
         return ca.MX.sym("lam_g", self.g.numel())
 
     @_ThreadSafeCachedProperty
@@ -447,7 +447,7 @@ class NonlinearProgram(ReprMixin):
         return {}
 
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
-        """Sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
+        """Return the sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
 
         Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps the curvature of user
         terms.
@@ -496,7 +496,7 @@ class NonlinearProgram(ReprMixin):
         return ca.MX(pattern, factor * 2 * sum(self._losses, ca.MX(0)) / count / size**2)
 
     def estimated_solver_memory(self, hessian: HessianKind = "gauss_newton") -> float:
-        """Estimate the additional memory of an interior-point method with a direct linear solver [bytes]."""
+        """Estimate how much more memory [bytes] an interior-point method with a direct linear solver needs."""
         return _BYTES_PER_ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
 
     def with_user_terms(
@@ -506,7 +506,7 @@ class NonlinearProgram(ReprMixin):
         lower: ArrayLike = 0.0,
         upper: ArrayLike = 0.0,
     ) -> NonlinearProgram:
-        """Program with an additional objective term and constraint rows, expressions of its variables and parameters.
+        """Return the program with an added objective term and constraint rows, which use its variables and parameters.
 
         Rows without bounds are equalities to zero. Raises `SolverError` if an expression contains other symbols, or if
         the number of bounds is neither one nor the number of rows.

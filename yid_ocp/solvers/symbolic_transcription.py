@@ -1,4 +1,4 @@
-"""Symbolic transcription of an estimation problem into a CasADi program with the equations of every step.
+"""The symbolic conversion of an estimation problem to a CasADi program with the equations of every step.
 
 The unknowns are, in this order,
 
@@ -56,7 +56,7 @@ MIN_HESSIAN_RIDGE = 0.1
 def transcribe(
     problem: EstimationProblem, initial_unknowns: ArrayLike | None = None, use_compiler: bool | None = None
 ) -> NonlinearProgram:
-    """Transcribe an estimation problem into a nonlinear program with a node at every step.
+    """Convert an estimation problem to a nonlinear program with a node at every step.
 
     Equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955. Raises
     `SolverError` if an effect changes recorded inputs or times.
@@ -94,7 +94,7 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
-    """Raise `SolverError` if an effect changes recorded inputs or times, which node-state solvers do not support."""
+    """Check that no effect changes recorded inputs or times, as node-state solvers require. Raises `SolverError`."""
     if not problem.are_input_corrections_neutral_and_fixed:
         message = "an effect changes recorded inputs, times or the reference of the tracking feedback"
         allowed = "effects that change the mechanics or the readings of sensors"

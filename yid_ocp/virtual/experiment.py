@@ -55,7 +55,7 @@ def baxter_foam_y_system(arms: int) -> System:
 
 @dataclass(frozen=True)
 class ArmSensorNoise:
-    """Standard deviations of the arm's sensor noise. Noise is drawn per sample, the effort bias per recording.
+    """The standard deviations of the arm's sensor noise. Noise differs in each sample, effort bias in each recording.
 
     Units are rad (angles), rad/s (velocities), N m (efforts, one value or one per joint) and m (each coordinate of a
     grasped point). The noise of efforts is in the recording, not in the applied torque. The recording states all
@@ -74,7 +74,7 @@ class ArmSensorNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualArmImperfections:
-    """Properties of the arms in virtual experiments of `blind` that their description lacks, such as friction.
+    """The properties, such as friction, that arms have in virtual experiments of `blind` but not in their description.
 
     The nominal model contains the friction law, with free amplitudes, and uncertain link masses.
     """
@@ -110,7 +110,7 @@ class PointCamera:
 
 @dataclass(frozen=True)
 class VirtualExperimentSettings:
-    """Settings of a virtual experiment: motion, simulation, sensors and noise.
+    """The settings of a virtual experiment: motion, simulation, sensors and noise.
 
     The noise of each sensor has its own random stream from `seed`, so removing a sensor changes no other noise.
     """
@@ -156,7 +156,7 @@ def run_virtual_experiment(
 def recording_from_simulation(
     system: System, values: Mapping[str, float] | None, experiment: VirtualExperimentSettings, run: SimulationResult
 ) -> Recording:
-    """Record a finished simulation `run` with the experiment's sensors and noise."""
+    """Make a recording of a finished simulation `run` with the experiment's sensors and noise."""
     chosen, streams = experiment, _random_generators(experiment.seed)
     held, visible = _held_and_visible_points(system)
     groups = [_arm_points(system, held, run, chosen.arm_noise, streams)] if held else []
@@ -275,7 +275,7 @@ _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[st
 def recording_with_sensor_error(
     recording: Recording, system: System, kind: str, location: str, values: Mapping[str, float]
 ) -> Recording:
-    """Copy of a recording with one sensor error: the sensor effect `kind` at `location` with parameters `values`."""
+    """Add a sensor error to a copy of a recording: the sensor effect `kind` at `location` with parameters `values`."""
     if kind.startswith("camera") or kind == "surface_offset":
         last = recording.duration
         seen = (g if g.camera_pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)

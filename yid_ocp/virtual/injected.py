@@ -1,4 +1,4 @@
-"""Add unmodelled effects to a virtual experiment in MuJoCo's own terms, independently of `yid_ocp.effects`.
+"""Effects that MuJoCo adds to a virtual experiment but the model lacks, independent of `yid_ocp.effects`.
 
 Effects for which MuJoCo has a term (joint damping, armature, inertias, sites) are set in its model. Other forces are
 computed here in NumPy at every inner step. Sensor and clock errors are applied to the finished recording. The equations
@@ -99,7 +99,7 @@ _MAX_RATED_EFFORT = 100.0  # larger effort limits are not a motor's rating [N m]
 
 
 def typical_friction_amplitude_range(effect: EffectBase, system: System) -> tuple[float, float]:
-    """Smallest and largest amplitude of the ordinary dry friction of a joint, in the amplitude's unit."""
+    """Return the smallest and largest amplitude of a joint's ordinary dry friction, in the amplitude's unit."""
     low, high = _ORDINARY_FRICTION[effect.kind]
     if effect.definitions[0].unit == "1":
         return low, high
@@ -487,7 +487,7 @@ class InjectedEffect:
 
     @property
     def label(self) -> str:
-        """Label of the effect, `kind@location`."""
+        """The label of the effect, `kind@location`."""
         return f"{self.kind}@{self.location}"
 
 

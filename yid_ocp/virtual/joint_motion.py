@@ -30,19 +30,19 @@ _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
 
 class JointOffsetMotion(Protocol):
-    """Interface of a motion of the driven joints about their initial angles, from standstill."""
+    """The interface of a motion of the driven joints about their initial angles that starts from standstill."""
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of the nj joints that the motion moves."""
+        """The names of the nj joints that the motion moves."""
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset (nj,) from the initial angles at time t [s], with its first and second time derivative."""
+        """Return the offset (nj,) from the initial angles at time t [s], with its first and second time derivative."""
 
 
 @dataclass(frozen=True)
 class MultisineMotion:
-    """Multisine motion of the driven joints about their initial angles, starting from standstill.
+    """A multisine motion of the driven joints about their initial angles that starts from standstill.
 
     The offset of joint j is r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji). The ramp r = 10 s^3 - 15 s^4 +
     6 s^5, s = min(t / ramp, 1), is twice continuously differentiable.
@@ -55,7 +55,7 @@ class MultisineMotion:
     ramp_time: float = 1.0  # [s]
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset (nj,) from the initial angles at time t [s], with its first and second time derivative."""
+        """Return the offset (nj,) from the initial angles at time t [s], with its first and second time derivative."""
         omega = 2 * math.pi * self.frequency
         angle = omega * t + self.phase
         sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
@@ -69,7 +69,7 @@ class MultisineMotion:
 
 @dataclass(frozen=True)
 class MultisineOptions:
-    """Amplitude, speed and frequency limits of a random multisine motion.
+    """The amplitude, speed and frequency limits of a random multisine motion.
 
     The motion of each arm is scaled separately to the travel of its gripper. With two arms, much more travel than the
     default makes the foam Y snap between shapes. Each frequency band is divided into equal parts in log frequency, with

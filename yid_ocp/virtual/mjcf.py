@@ -1,4 +1,4 @@
-"""Express a system in the terms of a rigid-body engine, and as a MuJoCo model (MJCF).
+"""A conversion of a system to the terms of a rigid-body engine, and to a MuJoCo model (MJCF).
 
 An effect is classified by its equations and the parts of the description that it changes, so kinds from plug-ins are
 treated like those of the library.
@@ -44,13 +44,13 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 @functools.cache
 def format_elements_by_model_aspect() -> Mapping[str, Mapping[str, str]]:
-    """Aspects of a model that an engine may or may not represent: a description (`is`) and elements of each format."""
+    """Return the aspects of a model that an engine may lack: a description (`is`) and the elements of each format."""
     return dict(YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml")))
 
 
 @dataclass(frozen=True)
 class JointDynamicsTerms:
-    """Stiffness, damping, dry friction, armature and constant force of one joint, in SI units.
+    """The stiffness, damping, dry friction, armature and constant force of one joint, in SI units.
 
     The force is constant - stiffness q - cubic q^3 - damping v - friction.
     """
@@ -67,7 +67,7 @@ class JointDynamicsTerms:
 
 
 class ExpressionEvaluator:
-    """Evaluates CasADi expressions at parameter values (default: nominal). Matrices are flattened by columns."""
+    """An evaluator of CasADi expressions at parameter values (default: nominal). Matrices are flattened by columns."""
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
         self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
@@ -116,7 +116,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ExpressionEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
-    """Find the joint terms that an effect adds, by joint, and the keys of the model aspects it changes."""
+    """Find the terms that an effect adds to each joint, and the keys of the model aspects that it changes."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
@@ -141,7 +141,7 @@ def effect_joint_terms_and_changed_aspects(
 
 
 def system_joint_dynamics_terms(system: System, value: ExpressionEvaluator) -> dict[str, JointDynamicsTerms]:
-    """Springs, dampers, rotor inertia and friction by joint, from the description and single-joint effects."""
+    """Return the springs, dampers, rotor inertia and friction of each joint, from description and joint effects."""
     found: dict[str, JointDynamicsTerms] = {}
 
     def add(joint: str, own: JointDynamicsTerms) -> None:
@@ -240,7 +240,7 @@ def mujoco_xml(
     actuators: bool = False,
     gear_play: Mapping[str, float] | None = None,
 ) -> str:
-    """Write the MuJoCo model of a system as MJCF, an XML text.
+    """Write a system as a MuJoCo model in MJCF, an XML text.
 
     Joints keep their names. Consecutive massless joints at one location become one body with several joints, which is
     kinematically equivalent. Every point and grasp end is a site: points under their own name, grasps as

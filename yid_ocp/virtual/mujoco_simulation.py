@@ -1,4 +1,4 @@
-"""Simulate in MuJoCo a controller that moves driven joints along a motion, or the replay of a recording.
+"""Simulation in MuJoCo of a controller that moves driven joints along a motion, or of a replayed recording.
 
 Simulator and estimator share only the description of the system. Equations, integrator and grasps are MuJoCo's own, so
 that estimates are not tested against the estimator's own errors.
@@ -39,13 +39,13 @@ _INSTABILITY_WARNINGS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 class InjectedSimulatorTerms(Protocol):
-    """Base class of forces and model changes in the simulator that the system's description lacks."""
+    """The interface of forces and model changes that the simulator has but the system's description lacks."""
 
     def edit_model(self, model: Any) -> None:
-        """Edit the compiled `mujoco.MjModel`."""
+        """Change the compiled `mujoco.MjModel`."""
 
     def begin_motion(self, data: Any) -> None:
-        """Prepare for a motion that starts at equilibrium. Called once per motion."""
+        """Prepare for a motion that starts at equilibrium. Called once for each motion."""
 
     def add_forces(self, model: Any, data: Any) -> None:
         """Add generalized forces to `data.qfrc_passive`. Called at every inner step."""
@@ -53,7 +53,7 @@ class InjectedSimulatorTerms(Protocol):
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """Duration [s], rates [Hz] and time step [s] of a simulation."""
+    """The duration [s], rates [Hz] and time step [s] of a simulation."""
 
     duration: float = 5.0
     sample_rate: float = 100.0
@@ -87,7 +87,7 @@ class SimulationOptions:
 
     @property
     def controller_periods_per_sample(self) -> int:
-        """Number of controller periods per recorded sample."""
+        """The number of controller periods between two recorded samples."""
         return round(self._controller_rate / self.sample_rate)
 
     @property
@@ -106,7 +106,7 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
+    """The noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
 
     Depending on `effort_kind`, `effort` is the torque at t_k, its mean from t_k to t_{k+1} [N m], or the servo command
     at t_k. The last row of `effort` was computed but not applied. Points are `system.point_frames` in the world.
@@ -194,7 +194,7 @@ class MujocoModelAndState:
 
     @staticmethod
     def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoModelAndState:
-        """Make the scene of a compiled model. It moves the driven joints, or else the prescribed joints."""
+        """Make the simulation scene of a compiled model. It moves the driven joints, or else the prescribed joints."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
@@ -252,7 +252,7 @@ def _lost(scene: MujocoModelAndState) -> bool:
 
 
 class TrackingController:
-    """Computed-torque controller that keeps the driven joints on a motion.
+    """A computed-torque controller that keeps the driven joints on a motion.
 
     The torque is the inverse dynamics along the motion, plus the load of the grasps at equilibrium, plus feedback.
     Before the motion the scene is at equilibrium, held by the torques `balance` (nu,) [N m].
@@ -396,7 +396,7 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 @dataclass(frozen=True)
 class ReplayErrorAgainstRecording:
-    """Root mean square error of a replayed model against the recording, in one channel or group of channels.
+    """The root mean square difference between a replayed model and the recording, in one channel or group of channels.
 
     The error of a point is the distance. `noise_rms` is expected from sensor noise alone, zero if not recorded.
     """
@@ -407,14 +407,14 @@ class ReplayErrorAgainstRecording:
 
     @property
     def rmse_beyond_noise(self) -> float:
-        """Root mean square deviation beyond noise. Zero if noise explains all."""
+        """The root mean square difference beyond noise. Zero if noise explains all."""
         return float(np.sqrt(max(self.rmse**2 - self.noise_rms**2, 0.0)))
 
 
 def replay_mismatch_by_channel(
     text: str, system: System, recording: Recording
 ) -> dict[str, ReplayErrorAgainstRecording]:
-    """Replay a recording in MuJoCo and measure deviations. `text` is the output of `mujoco_xml` with actuators.
+    """Replay a recording in MuJoCo and measure how far it deviates. `text` is from `mujoco_xml` with actuators.
 
     Driven joints are actuated by the recorded torque plus weak feedback to the recorded angles
     (`REPLAY_FEEDBACK_BANDWIDTH`). Without feedback, small torque errors would let the arm drift away. Position servos

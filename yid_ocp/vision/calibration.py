@@ -1,4 +1,4 @@
-"""Calibrate the pose, depth and clock of a sequence's camera from the visible arm, and find late frame stamps.
+"""Calibration of a camera's pose, depth and clock from the visible arm, and detection of late frame stamps.
 
 The remaining uncertainty is an error common to all frames; it is part of the standard deviation of every point. A frame
 whose own clock offset differs from the common offset was stamped late. Offset and latency cannot be separated: both are
@@ -60,7 +60,7 @@ _MIN_ARM_COVERAGE = 0.6  # fraction of the arm's visible, unoccluded surface tha
 
 @dataclass(frozen=True)
 class CameraClockOptions:
-    """Settings for the estimation of the camera clock's offset and drift relative to the joints' clock."""
+    """The settings for the estimation of the camera clock's offset and drift relative to the joints' clock."""
 
     initial_stamp_minus_joint_time: Annotated[float, OptionInfo("initial value of stamp minus joint time", "s")] = 0.0
     search_half_width: Annotated[
@@ -162,7 +162,7 @@ _CONTRADICTION_STDS = 3.0  # standard deviations
 
 @dataclass(frozen=True)
 class ArmBasedCameraCalibrationOptions:
-    """Priors of the camera calibration, and settings for the use of the visible arm."""
+    """The priors of the camera calibration, and settings for the use of the visible arm."""
 
     fix_pose: Annotated[
         bool,
@@ -187,7 +187,7 @@ class ArmBasedCameraCalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """Result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
+    """The result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
 
     camera_state: CameraState  # used pose, depth and clock
     prior_state: CameraState
@@ -201,11 +201,11 @@ class CameraCalibration:
 
     @property
     def camera_position(self) -> Array:
-        """Position of the camera in the world, (3,) [m]."""
+        """The position of the camera in the world, (3,) [m]."""
         return self.camera_state.pose[:3, 3]
 
     def point_std_from_calibration(self, points: Array, velocity: Array, stamps: Array) -> Array:
-        """Standard deviations (N, 3) [m] of points due to the camera's uncertain pose, depth and clock.
+        """Return the standard deviations (N, 3) [m] of points that the camera's uncertain pose, depth and clock cause.
 
         The error is common to all points at one location. `velocity` (N, 3) is in m/s, `stamps` (N,) in s.
         """

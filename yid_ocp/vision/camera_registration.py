@@ -1,4 +1,4 @@
-"""Register a camera's pose, depth and clock to the robot in its view.
+"""Registration of a camera's pose, depth and clock to the robot in its view.
 
 A point p that the camera measured at its time s should lie on the robot's surface at the joint angles of that time:
 
@@ -63,7 +63,7 @@ _MIN_CURVATURE_FRACTION = 0.2  # lower bound of the robust sum's curvature, rela
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Estimated camera state: pose, depth scale and offset, clock offset and drift."""
+    """The estimated state of a camera: pose, depth scale and offset, clock offset and drift."""
 
     pose: Array  # (4, 4), camera in the world, R and t
     depth_scale: float = 1.0  # factor g on a measured depth
@@ -81,7 +81,7 @@ class CameraState:
         return placed
 
     def world_to_measured_points(self, points: Array) -> Array:
-        """Transform world points (N, 3) [m] to the camera's measurements."""
+        """Transform world points (N, 3) [m] to the points that the camera would measure, in its own frame."""
         own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         return np.asarray(own * ((1.0 - self.depth_offset / own[:, 2:3]) / self.depth_scale))
 
@@ -91,7 +91,7 @@ class CameraState:
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
     def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
-        """Jacobian (N, 3, 8) of world points with respect to pose and depth."""
+        """Compute the Jacobian (N, 3, 8) of world points with respect to the camera's pose and depth."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
@@ -104,7 +104,7 @@ class CameraState:
         return result
 
     def with_state_increment(self, change: Array) -> CameraState:
-        """Camera state after a change of rotation, translation, log depth scale, depth, clock offset and drift."""
+        """Return the state after a change of rotation, translation, log depth scale, depth, clock offset and drift."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
@@ -114,7 +114,7 @@ class CameraState:
         return CameraState(pose, *depth, *clocks)
 
     def difference_from(self, other: CameraState) -> Array:
-        """Difference (10,) of this state from another one."""
+        """Compute the difference (10,) of this state from another one, this minus other."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
         clock = self.clock_offset - other.clock_offset, self.clock_drift - other.clock_drift
@@ -123,7 +123,7 @@ class CameraState:
 
 @dataclass(frozen=True, eq=False)
 class StampedCloud:
-    """One frame: its stamp [s] and its points (N, 3) [m] in the camera's frame."""
+    """A frame of a depth camera: its time stamp [s] and its points (N, 3) [m] in the camera's frame."""
 
     stamp: float
     points: Array
@@ -143,7 +143,7 @@ class _CalibrationEquations(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ArmSurface:
-    """Surface of the robot along its recorded motion."""
+    """The surface of the robot along its recorded motion."""
 
     robot_surfaces: ArticulatedSurfaces
     configuration_at: Callable[[float], Array]  # function of the joints' time
@@ -159,7 +159,7 @@ class ArmSurface:
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
     def visible_surface_points_and_parts(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
-        """World points on moving surfaces that an unobstructed camera sees, and the surface part of each point."""
+        """Return world points on moving surfaces that an unobstructed camera sees, and each point's surface part."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _MIN_INCIDENCE_COSINE) & (part >= 0) & self._moving[part]
@@ -167,7 +167,7 @@ class ArmSurface:
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
     def near_moving_surface_off_grasps_mask(self, points: Array, t: float, within: float) -> BoolArray:
-        """Whether world points are near a moving surface and not near a grasp."""
+        """Check for each world point whether it is near a moving surface and not near a grasp."""
         q = self.configuration_at(t)
         result = self.robot_surfaces.within_surface_distance_mask(points, q, within, moving_only=True)
         for held in self.grasp_positions_at(q):
@@ -202,7 +202,7 @@ class ArmSurface:
     def linearized_surface_distances(
         self, state: CameraState, frame: StampedCloud, reach: float, along: bool
     ) -> _CalibrationEquations:
-        """Distances [m] of points within `reach` of the arm, linearised in the camera state; `along`: camera rays."""
+        """Linearise distances [m] of points within `reach` from the arm in the camera state. `along`: camera rays."""
         points, t = state.measured_to_world_points(frame.points), float(state.stamps_to_joint_clock(frame.stamp))
         met = self.match_points_to_surface(points, state.pose[:3, 3], t, reach, along)
         slope = np.empty((len(met.point_indices), CAMERA_STATE_SIZE))
@@ -228,7 +228,7 @@ class _SurfaceMatches(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RobustCostDerivatives:
-    """Gradient and Hessian of the robust cost at a camera state, and the covariance of its gradient."""
+    """The gradient and Hessian of the robust cost at a camera state, and the covariance of the gradient."""
 
     gradient: Array  # (10,)
     hessian: Array  # (10, 10), of Gauss and Newton
@@ -238,7 +238,7 @@ class RobustCostDerivatives:
     score_covariance: Array
 
     def corrected_hessian_gradient_and_factor(self, precision: Array) -> tuple[Array, Array, float]:
-        """Return weight * Hessian, weight * gradient, and the weight. `precision` is the prior's inverse covariance."""
+        """Return Hessian and gradient, each times a weight, and the weight. `precision`: inverse prior covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
         excess = np.linalg.solve(whole, self.score_covariance * np.outer(scale, scale))
@@ -246,14 +246,14 @@ class RobustCostDerivatives:
         return weight * self.hessian, weight * self.gradient, weight
 
     def state_covariance(self, precision: Array) -> Array:
-        """Covariance (10, 10) of the state that minimises data and prior cost."""
+        """Compute the covariance (10, 10) of the state that minimises the cost of data and prior."""
         hessian, _, weight = self.corrected_hessian_gradient_and_factor(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
 
 def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostDerivatives:
-    """Gradient and Hessian of the robust cost over all points of all frames, scaled by their median error."""
+    """Compute the gradient and Hessian of the robust cost over the points of all frames, scaled by the median error."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     sigma = max(MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
     square = (residuals / min(_ROBUST_SCALE_STDS * sigma, reach)) ** 2
@@ -359,7 +359,7 @@ def _add_costs(
 
 @dataclass(frozen=True)
 class SurfaceObservationFractions:
-    """Fractions of the arm's surface in view that a cloud contains, occludes or sees through."""
+    """The fractions of the arm's surface in view that a cloud contains, occludes or sees through."""
 
     there: float  # a cloud has it
     covered: float  # something is before it
@@ -370,7 +370,7 @@ class SurfaceObservationFractions:
 def seen_occluded_and_seen_through_surface_fractions(
     arm: ArmSurface, frames: Sequence[StampedCloud], state: CameraState, within: float
 ) -> SurfaceObservationFractions:
-    """Fractions of the arm's visible surface that clouds contain (within `within` [m]), occlude or see through."""
+    """Return which fractions of the arm's visible surface clouds contain (within `within` [m]), hide or see through."""
     counts = np.zeros(4)
     for glimpse in frames:
         points, _ = arm.visible_surface_points_and_parts(state, glimpse.stamp)

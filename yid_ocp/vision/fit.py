@@ -1,4 +1,4 @@
-"""Robust fit of the object's shape to a cloud with derivatives. It solves equation (3) of Caldwell (ISER 2014).
+"""A robust fit of the object's shape to a cloud. It solves equation (3) of Caldwell (ISER 2014) with derivatives.
 
     q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
 
@@ -60,7 +60,7 @@ _PASS_TOLERANCE = 1e-4  # change of a bend [rad] and relative change of the cost
 
 @dataclass(frozen=True)
 class ShapeFitOptions:
-    """Settings of the shape fit."""
+    """The settings of the shape fit."""
 
     node_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
@@ -85,7 +85,7 @@ class ShapeFitOptions:
 
 
 class ShapeFitter:
-    """Fits the bending angles of a flexible object to camera points. Parameters default to nominal values.
+    """A fitter of a flexible object's bending angles to camera points. Parameters default to nominal values.
 
     The joints in `loose`, such as a free root (`shape_guesses.system_with_free_root`), are fitted too, with an almost
     flat prior. Raises `DataError` if the system has no object.
@@ -114,7 +114,7 @@ class ShapeFitter:
         self._set_values(values)
 
     def with_parameter_values(self, values: Mapping[str, float] | None) -> ShapeFitter:
-        """Make a fitter with other parameter values. It is quicker than a new one: the equations are known."""
+        """Return a fitter with other parameter values. This is faster than a new fitter: the equations are known."""
         other = copy(self)
         other._set_values(values)
         return other
@@ -255,7 +255,7 @@ class ShapeFitter:
 
     @property
     def max_informative_surface_distance(self) -> float:
-        """Distance [m] from the surface beyond which points carry no information on the shape."""
+        """The distance [m] from the surface beyond which points carry no information on the shape."""
         return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _MAX_POINT_DISTANCE_SCALES
 
     def _tasks(
@@ -423,15 +423,15 @@ class ShapeFitter:
         return FrameTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
     def tube_links_at_configuration(self, q: Array) -> TubeLinks:
-        """Links of the object as tubes in the world at the configuration `q`."""
+        """Return the links of the object as tubes in the world at the configuration `q`."""
         return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
     def gripper_positions_at_configuration(self, q: ArrayLike) -> Array:
-        """Gripper positions (grasps, 3) [m] at a configuration."""
+        """Return the gripper positions (grasps, 3) [m] at a configuration."""
         return self._holders(np.asarray(q, float))[0].reshape(-1, 3)
 
     def point_frame_positions(self, q: ArrayLike) -> Array:
-        """Positions (np, 3) [m] of the system's points at a configuration."""
+        """Return the positions (np, 3) [m] of the system's points at a configuration."""
         return self._seen(np.asarray(q, float))[0].reshape(-1, 3)
 
 

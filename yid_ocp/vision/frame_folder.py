@@ -1,4 +1,4 @@
-"""Read and write folders of clouds or depth images with time stamps and a camera (`yid-frames/1`).
+"""Functions that read and write folders of clouds or depth images with time stamps and a camera (`yid-frames/1`).
 
 PLY files (Turk 1994, The PLY polygon file format) are read in Python: a damaged file must not end the process.
 """
@@ -270,7 +270,7 @@ def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike
 
 
 def metres_per_named_unit(unit: str, where: str) -> float:
-    """Length of a cloud's unit in metres [m]. Raises `DataError` for an unknown unit."""
+    """Return the length of a cloud's unit in metres [m]. Raises `DataError` for an unknown unit."""
     if unit not in _METRES_PER_UNIT:
         raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_error_arguments(unit, _METRES_PER_UNIT))
     return _METRES_PER_UNIT[unit]

@@ -1,4 +1,4 @@
-"""Read frame sequences from a folder, a ROS bag, an MCAP file or a RealSense recording.
+"""Readers of frame sequences from a folder, a ROS bag, an MCAP file or a RealSense recording.
 
 Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`. They are
 read on demand.

@@ -1,4 +1,4 @@
-"""Select good frames, determine the object's root end in them, and the uncertainty of their points."""
+"""Selection of good frames, choice of the object's root end in them, and uncertainty of their points."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _RootPlacement = Literal["model", "fixed", "free"]
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Settings for the conversion of a frame sequence to measured points, and the selection of good frames."""
+    """The settings for the conversion of a frame sequence to measured points, and the selection of good frames."""
 
     filters: Annotated[CloudFilterOptions, OptionInfo("selection of the object's points")] = field(
         default_factory=CloudFilterOptions
@@ -108,7 +108,7 @@ _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a n
 
 
 def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str | None:
-    """Reason to reject a frame because of its own fit, without comparison with other frames. None if it is good."""
+    """Return the reason to reject a frame for its own fit, regardless of other frames. None if it is good."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
@@ -128,7 +128,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
 
 
 def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
-    """Mark frames that deviate from the other good frames as dropped. Returns all frames."""
+    """Mark frames as dropped if they deviate from the other good frames. Returns all frames."""
     fits = _good_fits(frames)
     if not fits:
         return list(frames)
@@ -160,7 +160,7 @@ def good_frame_configurations_and_points(
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Collect the good frames' times, configurations, point positions and stds, and the calibration's stds.
+    """Collect times, configurations and points of the good frames, with the points' and the calibration's stds.
 
     Only good frames and the system's points with the indices `columns` are included. Raises `DataError` if no frame is
     good, or if no point is known well enough in any frame.
@@ -300,7 +300,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
 
 
 def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
-    """Whether parts of a shape that are far apart along it touch. Links are (K, 2, 3), radii (K,) [m]."""
+    """Check whether a shape touches itself at parts that are far apart along it. Links: (K, 2, 3), radii: (K,) [m]."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
     edges = np.where(near < _TOUCHING_DISTANCE, 1e-6, 0.0)  # zero would mean no edge

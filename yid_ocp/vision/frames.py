@@ -1,4 +1,4 @@
-"""Frames of a depth camera: clouds, time stamps, lens and occlusion.
+"""The frames of a depth camera: clouds, time stamps, lens and occlusion.
 
 With x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and theta = atan r, a point has the pixel u = fx x' + cx, v = fy y' + cy, where
 
@@ -40,7 +40,7 @@ _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """Intrinsics of a camera with axes x right, y down, z forward.
+    """The intrinsic parameters of a camera with axes x right, y down, z forward.
 
     Without distortion u = fx x/z + cx, v = fy y/z + cy, with focal lengths fx, fy and principal point (cx, cy) in
     pixels. Raises `DataError` for an unknown distortion model.
@@ -67,7 +67,7 @@ class CameraIntrinsics:
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal: float) -> CameraIntrinsics:
-        """Make intrinsics from a horizontal field of view [rad], with square pixels and centred principal point."""
+        """Make intrinsics from a horizontal field of view [rad], with square pixels and a centred principal point."""
         focal = 0.5 * width / math.tan(0.5 * horizontal)
         return CameraIntrinsics(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
 
@@ -78,7 +78,7 @@ class CameraIntrinsics:
 
     @property
     def pixel_rays_at_unit_depth(self) -> Array:
-        """Direction (height, width, 3) of every pixel, with z = 1. NaN for pixels outside the lens."""
+        """The direction (height, width, 3) of every pixel, with z = 1. NaN for pixels outside the lens."""
         return _rays(self)
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
@@ -169,7 +169,7 @@ def import_open3d() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """Point clouds of one camera with stamps, names and camera pose. Each cloud is loaded on demand."""
+    """The point clouds of one camera with stamps, names and camera pose. Each cloud is loaded on demand."""
 
     stamps: Array  # (M,), as the camera gave them, in the order of the frames: neither sorted nor unique [s]
     frame_names: tuple[str, ...]
@@ -198,7 +198,7 @@ class FrameSequence:
 
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """Pose (4, 4) [m] of a camera at `eye` that looks at `target`, with axes x right, y down, z forward."""
+    """Return the pose (4, 4) [m] of a camera at `eye` that looks at `target`, with axes x right, y down, z forward."""
     ahead = np.asarray(target, float) - np.asarray(eye, float)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, np.asarray(up, float))
@@ -207,7 +207,7 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 
 
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
-    """Camera pose (4, 4) after checks. Raises `DataError` if it is missing or not a rigid transform."""
+    """Check and return a camera pose (4, 4). Raises `DataError` if it is missing or not a rigid transform."""
     allowed = "a 4x4 matrix from camera to world coordinates: x right, y down, z forward, translation in metres"
     hint = "set track.camera_pose, or, for a folder of frames, `pose` in its camera.json"
     if pose is None:
@@ -238,7 +238,7 @@ _MIN_DEPTH = 0.05  # smallest depth in front of the camera [m]
 
 @dataclass(frozen=True, eq=False)
 class OcclusionMap:
-    """Map of the regions that surfaces in a frame hide, computed from all measured points."""
+    """A map of the regions that surfaces in a frame hide, computed from all measured points."""
 
     points: Array  # (N, 3), in the world, before filtering [m]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world
@@ -248,7 +248,7 @@ class OcclusionMap:
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def hidden_mask(self, places: Array, radius: Array, margin: float) -> BoolArray:
-        """Whether world positions (S, 3) are occluded, shadowed by something nearer, or outside the image.
+        """Check for world positions (S, 3) whether they are hidden, shadowed by something nearer, or outside the image.
 
         A surface occludes a position if it is nearer to the camera by more than `radius` (S,) plus `margin` [m].
         `radius` is also the extent of the position across the line of sight.

@@ -1,4 +1,4 @@
-"""Filter the object's points in a cloud, and compute the cloud's skeleton."""
+"""Filters that keep the object's points in a cloud, and the computation of the cloud's skeleton."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MAD_TO_STD = 1.4826  # median absolute deviation to std of a normal distribution
 
 @dataclass(frozen=True, eq=False)
 class WeightedCloud:
-    """Point cloud with weights. A weight is the number of camera points that a point represents."""
+    """A point cloud with weights. A weight is the number of camera points that a point represents."""
 
     points: Array  # (N, 3), in the world [m]
     point_weights: Array  # (N,), how many of the camera's points each one represents
@@ -52,7 +52,7 @@ class WeightedCloud:
 
 @dataclass(frozen=True)
 class CloudFilterOptions:
-    """Settings of the filters that select the object's points."""
+    """The settings of the filters that select the object's points."""
 
     voxel_size: Annotated[PositiveFloat, OptionInfo("edge of the cubes in which points are averaged", "m")] = 0.008
     robot_padding: Annotated[
@@ -93,7 +93,7 @@ class CloudFilterOptions:
 
 
 class ReachableObjectRegion:
-    """Region that the object's branches can reach above the floor. For a root `anywhere`, the options define it."""
+    """The region that the object's branches can reach above the floor. For a root `anywhere`, the options define it."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class ReachableObjectRegion:
         self._base = np.mean(bases, axis=0) if bases else None
 
     def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
-        """Test of whether points (N, 3) are in the region, for a configuration (n,) and a camera at (3,) [m]."""
+        """Make a function that tests if points (N, 3) are in the region, for a configuration and a camera position."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:
@@ -169,7 +169,7 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
 
 
 def statistical_inlier_mask(cloud: WeightedCloud, mask: BoolArray | None = None) -> BoolArray:
-    """Find the inliers (N,) of a cloud by statistical outlier removal. False outside the mask `mask`.
+    """Return a mask (N,) of the points of a cloud that are not statistical outliers. False outside the mask `mask`.
 
     A point is an inlier if the mean distance d to its nearest neighbours satisfies d <= median(d) + 4 s, where s is
     the median absolute deviation scaled to a standard deviation. Median and s are computed from the whole cloud, with
@@ -193,7 +193,7 @@ def statistical_inlier_mask(cloud: WeightedCloud, mask: BoolArray | None = None)
 
 
 def wanted_colour_mask(colours: ArrayLike, wanted: ArrayLike) -> BoolArray:
-    """Whether each point has one of the wanted colours, (N,).
+    """Check for each point whether it has one of the wanted colours, (N,).
 
     `colours` (N, 3) and `wanted` (C, 3) are red, green and blue, 0 to 255 (sRGB). Matching colours are within 0.2 rad
     as directions of linear light, which do not depend on brightness.
@@ -210,7 +210,7 @@ def _light_directions(colours: Array) -> Array:
 
 
 def weighted_median(values: Array, weight: Array) -> float:
-    """Weighted median of values."""
+    """Compute the weighted median of values."""
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
@@ -218,7 +218,7 @@ def weighted_median(values: Array, weight: Array) -> float:
 
 @dataclass(frozen=True)
 class SkeletonOptions:
-    """Settings of the skeleton extraction."""
+    """The settings of the skeleton extraction."""
 
     max_cloud_points_per_node: Annotated[int, Ge(2), OptionInfo("points per segment, k1 in Caldwell et al.")] = 50
     neighbour_radius: Annotated[
@@ -233,7 +233,7 @@ class SkeletonOptions:
 
 @dataclass(frozen=True, eq=False)
 class CloudSkeleton:
-    """Skeleton of a cloud: nodes, a spanning forest between them, and the node of each point."""
+    """The skeleton of a cloud: nodes, a spanning forest between them, and the node of each point."""
 
     nodes: Array  # (K, 3), centroids of the kept segments, in order of extraction [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none

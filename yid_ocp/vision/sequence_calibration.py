@@ -1,4 +1,4 @@
-"""Calibration shared by all frames of a sequence: camera, background, foreign objects and dimensions.
+"""The estimates that all frames of a sequence share: camera, background, foreign objects and dimensions.
 
 x are the logarithms of tube lengths and radii relative to the model. The minimum over the bends of the cost of frame f
 is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). With a wide prior P, frames refitted at every x, and sums g and S:
@@ -39,7 +39,7 @@ _MIN_REPORTED_FRAMES = 2  # frames in which a thing is worth a word
 
 @dataclass(frozen=True, eq=False)
 class BackgroundPoints:
-    """Points of the static scene. Cloud points within a distance of them are removed as background."""
+    """The points of the static scene. Cloud points within a distance of them are removed as background."""
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3), in the world [m]
     match_distance: float = 0.0  # distance at which a point belongs to it [m]
@@ -49,13 +49,13 @@ class BackgroundPoints:
         return cKDTree(self.points)
 
     def near_background_mask(self, points: Array, beyond: float = 0.0) -> BoolArray:
-        """Whether points (N, 3) lie within `match_distance + beyond` [m] of the background, (N,)."""
+        """Check which points (N, 3) lie within `match_distance + beyond` [m] of the background, (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
 
     def merged_with(self, other: BackgroundPoints) -> BackgroundPoints:
-        """Union of this background and another one."""
+        """Return the union of this background and another one."""
         points = np.concatenate([self.points, other.points])
         return BackgroundPoints(points, max(self.match_distance, other.match_distance))
 
@@ -83,7 +83,7 @@ class BackgroundPoints:
 
 @dataclass(frozen=True, eq=False)
 class ForeignObject:
-    """An object seen in several frames that is neither robot nor modelled object."""
+    """An object seen in several frames that is neither the robot nor the modelled object."""
 
     centre: Array  # (3,), in the world, in the median frame [m]
     size: Array  # (3,) [m]
@@ -101,7 +101,7 @@ def foreign_objects_from_clusters(
     coloured: bool,
     background: bool = False,
 ) -> tuple[ForeignObject, ...]:
-    """Group foreign point clusters over frames into objects; objects seen in too few frames are omitted.
+    """Group clusters of foreign points from several frames into objects. Rarely seen objects are omitted.
 
     `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
     `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already
@@ -179,7 +179,7 @@ _OUTLIER_END_STDS = 3.0  # robust standard deviations from the other frames' end
 
 @dataclass(frozen=True, eq=False)
 class TubeDimensionEstimates:
-    """Tube lengths and radii estimated from frames, compared with the model."""
+    """The tube lengths and radii estimated from frames, compared with the model."""
 
     names: tuple[str, ...]  # `T1.length` and so on: lengths of all segments, then their radii
     model_values: Array  # (2 s,), the model's values [m]
@@ -190,23 +190,23 @@ class TubeDimensionEstimates:
 
     @property
     def dimension_log_ratio_std(self) -> Array:
-        """Standard deviation (2 s,) of the logarithm of estimated over model dimension."""
+        """The standard deviation (2 s,) of the logarithm of each dimension's estimate divided by the model's value."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def determined_dimension_mask(self) -> BoolArray:
-        """Mask (2 s,) of the dimensions of s tubes that the frames determine."""
+        """The mask (2 s,) of the dimensions that the frames determine, for lengths and radii of s tubes."""
         return np.asarray((self.dimension_log_ratio_std < _MAX_KNOWN_LOG_STD) & (self.n_frames > 0))
 
     @property
     def contradicted_model_value_mask(self) -> BoolArray:
-        """Whether the frames contradict each of the model's dimensions: lengths and radii of s tubes, (2 s,)."""
+        """The mask (2 s,) of the model dimensions that the frames contradict, for lengths and radii of s tubes."""
         off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
         return np.asarray(self.determined_dimension_mask & off)
 
     @property
     def contradiction_message(self) -> str:
-        """Describe model dimensions that contradict the frames and are not estimated. Empty if there are none."""
+        """A text on model dimensions that contradict the frames and are not estimated. Empty if there are none."""
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
             f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
@@ -216,7 +216,7 @@ class TubeDimensionEstimates:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """One message per contradicted or estimated dimension, with the fitting value and its interval."""
+        """A message for each contradicted or estimated dimension, with the fitting value and its interval."""
         lines = []
         for i, name in enumerate(self.names):
             value = 1e3 * self.model_values[i] * math.exp(self.log_ratio[i])
@@ -231,7 +231,7 @@ class TubeDimensionEstimates:
         return tuple(lines)
 
     def point_std_due_to_dimensions(self, points: Array) -> Array:
-        """Standard deviations (np, 3) [m] of points due to wrong or uncertain tube dimensions.
+        """Compute the standard deviations (np, 3) [m] of points due to wrong or uncertain tube dimensions.
 
         `points` (np, 3, 2 s) are the derivatives of the points with respect to the 2 s dimensions of s segments. An
         estimated dimension contributes its standard deviation, a contradicted dimension that is not estimated its whole
@@ -244,7 +244,7 @@ class TubeDimensionEstimates:
         return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
 
     def values_with_estimated_dimensions(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
-        """Parameter values with the model's dimensions replaced by the estimated ones."""
+        """Return the parameter values, with estimated dimensions in place of the model's dimensions."""
         return _changed(system, given, np.where(self.estimated_dimension_mask, self.log_ratio, 0.0))
 
 
@@ -316,7 +316,7 @@ def _changed(system: System, given: Mapping[str, float] | None, change: Array) -
 
 @dataclass(frozen=True, eq=False)
 class SequenceEstimates:
-    """Estimates shared by all frames of a sequence: camera calibration, tube dimensions and background."""
+    """The estimates that all frames of a sequence share: camera calibration, tube dimensions and background."""
 
     camera_calibration: CameraCalibration  # the camera's pose, how it scales depth, and its clock
     dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them

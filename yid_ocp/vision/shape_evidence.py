@@ -1,4 +1,4 @@
-"""Assess a shape by a frame's cloud: own points, foreign points, and links without points.
+"""Assessment of a shape by a frame's cloud: own points, foreign points, and links without points.
 
 Points away from the tubes' surface form a foreign cluster if they are connected and as many as on a piece of tube as
 long as its diameter. Where it continues the shape's surface, points within two tube radii are contested and not used.
@@ -37,7 +37,7 @@ _RIM_RADIUS_FRACTION = 0.85  # of the radius to either side, within which a tube
 
 @dataclass(frozen=True, eq=False)
 class TubeLinks:
-    """Links of a shape as cylinders in the world."""
+    """The links of a shape as cylinders in the world."""
 
     link_ends: Array  # (K, 2, 3), start and end of every link's centre line [m]
     radius: Array  # (K,) [m]
@@ -48,7 +48,7 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Project points (N, 3) on the nearest tube axis, with axis ends `corners` (K, 2, 3) and radii (K,) [m].
+    """Project points (N, 3) on the nearest tube axis. Axes have ends `corners` (K, 2, 3) and radii (K,) [m].
 
     The nearest link has the smallest distance minus `share` times its radius. Returns link index (N,), position along
     the link from 0 to 1 (N,), unit vectors (N, 3) from axis to point, and distances (N,) from the axis [m].
@@ -68,13 +68,13 @@ def tube_link_projections(
 
 
 def link_axes(link_ends: Array) -> Array:
-    """Unit vectors (K, 3) along links (K, 2, 3)."""
+    """Compute unit vectors (K, 3) along links (K, 2, 3)."""
     edge = link_ends[:, 1] - link_ends[:, 0]
     return np.asarray(edge / np.linalg.norm(edge, axis=1)[:, None])
 
 
 def link_normals_perpendicular_to_sight(link_ends: Array, camera: Array) -> Array:
-    """Unit vectors (K, 3) perpendicular to links (K, 2, 3) and to the camera's lines of sight."""
+    """Compute unit vectors (K, 3) perpendicular to links (K, 2, 3) and to the camera's lines of sight."""
     across = np.cross(link_ends[:, 1] - link_ends[:, 0], link_ends.mean(axis=1) - camera)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None])
 
@@ -85,7 +85,7 @@ def _faces_away_from_camera(normal: Array, sight: Array) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class ForeignCluster:
-    """Cluster of points that belong to no tube."""
+    """A cluster of points that belong to no tube."""
 
     centre: Array  # (3,), median of its points in the world [m]
     extent: Array  # (3,), extents along the world's axes [m]
@@ -94,7 +94,7 @@ class ForeignCluster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQuality:
-    """Fit quality of a shape in one frame: noise, distances, link coverage, end offsets, foreign clusters."""
+    """A measure of how well a shape fits a frame: noise, distances, link coverage, end offsets, foreign clusters."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of nearby points that are not foreign [m]
@@ -106,14 +106,14 @@ class ShapeFitQuality:
     foreign_clusters: tuple[ForeignCluster, ...]  # foreign clusters near the shape, the largest first
 
     def covered_fraction_of_visible_links(self, lengths: Array) -> float:
-        """Fraction of the links' visible length on which measured points lie; 0 if no link is visible."""
+        """Return the fraction of the links' visible length on which points were measured; 0 if no link is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQualityAndPointClasses(ShapeFitQuality):
-    """Fit quality of a shape, with the frame's own, contested and foreign points."""
+    """The fit quality of a shape, with the frame's own, contested and foreign points."""
 
     # (N,), own points of the shape; points on it that can be foreign; foreign points
     is_own: BoolArray
@@ -124,7 +124,7 @@ class ShapeFitQualityAndPointClasses(ShapeFitQuality):
 
 @dataclass(frozen=True, eq=False)
 class ProcessedFrameCloud:
-    """Filtered points and skeleton nodes of one frame, with camera position and occlusion map."""
+    """The filtered points and skeleton nodes of one frame, with camera position and occlusion map."""
 
     points: Array  # (N, 3), surface points in the world [m]
     point_weights: Array  # (N,)
@@ -206,7 +206,7 @@ def fit_quality_and_point_classes(
 
 
 def tube_like_node_and_point_masks(cloud: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
-    """Masks of skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube of radius r = `radius`.
+    """Find skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube of radius r = `radius`.
 
     Around a tube, points have a large spread in one direction and r/sqrt(3) across. On a table, wall or body they have
     a large spread in two directions.
@@ -322,7 +322,7 @@ class _SurfaceResiduals(NamedTuple):
 def nearest_surface_residuals(
     corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
 ) -> _SurfaceResiduals:
-    """Distances of points p (N, 3) from the surfaces of tubes: e = |p - c| - f r, with the nearest axis point c.
+    """Compute distances of points p (N, 3) from tube surfaces: e = |p - c| - f r, with the nearest axis point c.
 
     f = `share` scales the radius r. Axis ends `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest
     to a tube's far side is assigned to the near side.
@@ -337,7 +337,7 @@ def nearest_surface_residuals(
 
 
 def surface_distances_along_sight(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
-    """Errors of points from the tubes along the line of sight. Parameters are as in `nearest_surface_residuals`.
+    """Compute the errors of points from the tubes along the line of sight. Parameters: `nearest_surface_residuals`.
 
     At a distance u from the axis across the line of sight, the surface of a tube of radius r is sqrt(r^2 - u^2) nearer
     to the camera than the axis. Errors along the surface normal would give the same tube position, but a radius too
@@ -362,7 +362,7 @@ def surface_distances_along_sight(corners: Array, radius: Array, points: Array, 
 
 @dataclass(frozen=True, eq=False)
 class FrameTubeDimensionCost:
-    """Quadratic cost g'x + x'Sx/2 of tube dimensions x in one frame, minimised over the joint angles.
+    """The cost g'x + x'Sx/2 of tube dimensions x in one frame, minimised over the joint angles.
 
     x (2 s,) holds the logarithms of the lengths of all s segments, then of all radii, relative to the fit's dimensions.
     g is the gradient and S the Hessian.
@@ -375,7 +375,7 @@ class FrameTubeDimensionCost:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameShapeFit(ShapeFitQuality):
-    """Fitted shape of one frame with its uncertainty and quality."""
+    """The fitted shape of one frame with its uncertainty and quality."""
 
     q: Array  # (n,), configuration with zero twists
     point_positions: Array  # (np, 3), positions of the system's points [m]
@@ -388,6 +388,6 @@ class FrameShapeFit(ShapeFitQuality):
 
     @property
     def visible_length_coverage(self) -> float:
-        """Fraction of the shape's visible length with points."""
+        """The fraction of the shape's visible length that has points."""
         lengths = np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
         return self.covered_fraction_of_visible_links(lengths)

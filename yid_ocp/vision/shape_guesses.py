@@ -1,4 +1,4 @@
-"""Find initial shapes for the shape fit from the object's centerline in the cloud.
+"""Search for initial shapes of the shape fit, from the object's centerline in the cloud.
 
 The nearest-neighbour graph of a cloud is cut into slices of equal geodesic distance from one end. Touching parts of
 neighbouring slices form a Reeb graph, whose cycles are loops of the object. Its ends are assigned to the root and the
@@ -192,7 +192,7 @@ _WHOLE_OBJECT_TOLERANCE = 0.08  # relative length error of a centerline that sho
 
 @dataclass(frozen=True, eq=False)
 class ObservedObjectEnd:
-    """Observed position of one end of an object, along the object's axis there."""
+    """The observed position of one end of an object, measured along the object's axis there."""
 
     link_end_index: int  # among the links' starts and ends, in this order link by link
     direction: Array  # (3,), unit vector along the object
@@ -229,7 +229,7 @@ class _Link(NamedTuple):
 
 
 class ShapeGuessFinder:
-    """Finds object shapes along a centerline by bending joints from `rest` (n,); `lengths` are of links [m]."""
+    """A finder of object shapes that bends joints from `rest` (n,) along a centerline; `lengths` are of links [m]."""
 
     def __init__(
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]
@@ -265,7 +265,7 @@ class ShapeGuessFinder:
         np.fill_diagonal(self._end_distances, 0.0)
 
     def shape_guesses_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
-        """Find initial shapes that follow a centerline whose path lengths between ends match the lengths of the object.
+        """Find initial shapes that follow a centerline whose path lengths between ends match the object's lengths.
 
         Raises `DataError` if the number of ends or the lengths do not match, because a part of the object is hidden or
         something else is connected to it.

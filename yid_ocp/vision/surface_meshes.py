@@ -66,7 +66,7 @@ class ExtraMesh:
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """Contents of a camera's scene: system, robot URDF, parameter values and extra meshes."""
+    """The contents of a camera's scene: system, robot URDF, parameter values and extra meshes."""
 
     system: System
     robot_urdf: str | Path | None = None  # URDF with the robot's meshes (`package:baxter`); None for the object alone
@@ -82,13 +82,13 @@ class TriangleMesh:
     faces: IntArray
 
     def transformed(self, pose: ArrayLike) -> TriangleMesh:
-        """Mesh transformed by a pose (4, 4)."""
+        """Return the mesh transformed by a pose (4, 4)."""
         matrix = np.asarray(pose, float)
         return TriangleMesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
 
     @staticmethod
     def concatenate(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-        """Concatenate meshes into one."""
+        """Join several meshes into one."""
         shifts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         faces = [part.faces + shift for part, shift in zip(parts, shifts, strict=True)]
         return TriangleMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
@@ -106,7 +106,7 @@ class TriangleMesh:
 
     @staticmethod
     def cylinder(radius: float, low: float, high: float) -> TriangleMesh:
-        """Make a closed cylinder about z from `low` to `high` [m]."""
+        """Make a closed cylinder along the z axis from `low` to `high` [m]."""
         from trimesh import creation
 
         middle = homogeneous_transform(np.eye(3), (0.0, 0.0, 0.5 * (low + high)))
@@ -124,7 +124,7 @@ class TriangleMesh:
 
 
 class ArticulatedSurfaces:
-    """Surface meshes on the joints of a numeric mechanism, with ray and distance queries. Joint -1 is the world.
+    """The surface meshes on the joints of a numeric mechanism, with ray and distance queries. Joint -1 is the world.
 
     Each joint has a scene in its own frame. Rays and points are transformed to it, so motion needs no new scene.
     """
@@ -148,7 +148,7 @@ class ArticulatedSurfaces:
         self._poses = dense_function_evaluator(ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))]))
 
     def part_poses_at_configuration(self, q: ArrayLike) -> Array:
-        """World poses (parts, 4, 4) of all parts at a configuration."""
+        """Return the world poses (parts, 4, 4) of all parts at a configuration."""
         [stacked] = self._poses(np.asarray(q, float))
         return np.asarray(stacked.reshape(4, len(self.part_joints), 4).transpose(1, 0, 2))
 
@@ -164,7 +164,7 @@ class ArticulatedSurfaces:
     def within_surface_distance_mask(
         self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
     ) -> BoolArray:
-        """Whether world points (N, 3) are within `reach` [m] of any (or any moving) surface at a configuration."""
+        """Check which world points (N, 3) are within `reach` [m] of a surface, or a moving one, at a configuration."""
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
             asked = np.flatnonzero(~result)
@@ -175,7 +175,7 @@ class ArticulatedSurfaces:
         return result
 
     def distance_to_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
-        """Distance [m], normal towards the point and part of the nearest moving surface. inf, 0, -1 beyond `within`."""
+        """Find distance [m], normal towards the point and part of the nearest moving surface; inf, 0, -1 if none."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
@@ -199,7 +199,7 @@ class ArticulatedSurfaces:
     def render_depth_incidence_and_part(
         self, pinhole: frames.CameraIntrinsics, pose: ArrayLike, q: ArrayLike
     ) -> tuple[Array, Array, IntArray]:
-        """Render noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
+        """Render depth along the optical axis [m], cosine of incidence and surface part of each pixel, without noise.
 
         All have shape (height, width), with inf, 0 and -1 where there is no surface. `pose` (4, 4) is in the world.
         """
@@ -304,7 +304,7 @@ def load_robot_meshes_by_joint(
 
 
 def mesh_sources_sha256(urdf: str | Path, mechanism: Mechanism) -> str:
-    """Hash (SHA-256) of the files and link poses from which a robot's visual meshes are built."""
+    """Compute a SHA-256 hash of the files and link poses from which a robot's visual meshes are built."""
     path = urdf_path_from_robot_name(urdf)
     robot = ElementTree.fromstring(read_input_text(path))
     links = [name for entry in robot.iter("link") if (name := entry.get("name", "")) in mechanism.frames]
@@ -330,7 +330,7 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
 
 
 def extra_meshes_by_joint_index(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
-    """Load meshes missing from the URDF, by joint index (-1: the world).
+    """Load meshes that the URDF lacks, by joint index (-1: the world).
 
     Raises `ConfigError` if a link does not exist or an entry does not define exactly one shape, and `ModelError` if a
     file is unreadable.
@@ -392,7 +392,7 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
 def model_link_lengths_and_radius_by_segment(
     system: System, values: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Array, float]]:
-    """Link lengths and radius [m] of every tube, by segment name."""
+    """Return the link lengths and radius [m] of every tube, by segment name."""
     segments, theta = system.segment_layouts, system.parameters.vector(values)
     sizes = [ca.densify(ca.vertcat(*segment.link_lengths, segment.radius)) for segment in segments]
     found = ca.Function("sizes", [system.parameters.symbols], sizes).call([theta])
@@ -489,7 +489,7 @@ class DepthCameraModel:
 
 @dataclass(frozen=True)
 class VirtualCameraTiming:
-    """Timing of a virtual camera: frame rate, dropped frames and errors of time stamps."""
+    """The timing of a virtual camera: frame rate, dropped frames and errors of time stamps."""
 
     mean_rate: float = 3.0  # [Hz]
     dropped_frame_fraction: float = 0.0  # fraction of frames that never arrive
@@ -509,7 +509,7 @@ class VirtualCameraTiming:
 
 @dataclass(frozen=True, eq=False)
 class VirtualFramesWithTruth:
-    """Frame sequence of a virtual camera, with the true times and configurations."""
+    """The frame sequence of a virtual camera, with the true times and configurations."""
 
     sequence: frames.FrameSequence
     capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
@@ -518,7 +518,7 @@ class VirtualFramesWithTruth:
 
 @dataclass(frozen=True, eq=False)
 class VirtualCameraSetup:
-    """Virtual depth camera: sensor model, pose and frame timing."""
+    """A virtual depth camera, described by sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     sensor_model: DepthCameraModel = field(default_factory=DepthCameraModel)  # default: an Asus Xtion Pro Live
@@ -529,7 +529,7 @@ class VirtualCameraSetup:
 def render_virtual_frames(
     scene: SceneDescription, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
 ) -> VirtualFramesWithTruth:
-    """Render the frames that a virtual camera takes of a motion. A frame is rendered, reproducibly, on loading.
+    """Render the frames that a virtual camera takes of a motion. Each frame is rendered, reproducibly, on loading.
 
     The configurations `q` (N, n) at times `t` (N,) [s] can come from any simulator; a cubic spline interpolates them.
     In a scene with a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or

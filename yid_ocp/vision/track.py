@@ -1,4 +1,4 @@
-"""Track an object's points in a frame sequence, from filtering to shape fit and frame selection.
+"""Tracking of an object's points in a frame sequence, from filtering to shape fit and frame selection.
 
 A first pass over some frames estimates the calibration shared by the sequence. A second pass processes each frame and
 keeps no cloud. Each frame gets a fitted shape or a reason why it was dropped.
@@ -98,7 +98,7 @@ class _Look(NamedTuple):
 
 
 class FrameTracker:
-    """Processes the frames of a sequence one by one, in any process. Arguments are as in `track_object`.
+    """A tracker that processes frames one by one, in any process. Arguments are as in `track_object`.
 
     `frame_order` lists all frames by time stamp, `calibration_frames` the frames used to calibrate the camera.
     """
@@ -164,7 +164,7 @@ class FrameTracker:
         return q
 
     def estimate_shared_values(self) -> SequenceEstimates:
-        """Estimate what all frames share, from some of them: camera calibration, tube dimensions and background."""
+        """Estimate from some frames what all frames share: camera calibration, tube dimensions and background."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
         scene, to_world = self.empty_scene, calibration.camera_state.measured_to_world_points
@@ -312,13 +312,13 @@ class FrameTracker:
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
     def frame_report_before_processing(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
-        """Make a frame's report before processing, with a reason if the frame is dropped."""
+        """Make the report of a frame before it is processed, with a reason if the frame is dropped."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def align_root_ends_and_mark_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
-        """Drop outlying frames and choose the root end, with a note on how it was chosen."""
+        """Choose the object's root end and drop outlying frames. Returns the frames and a note on the choice."""
         rooted, note = frame_selection.align_root_ends(frames, self.options)
         return frame_selection.mark_outlying_frames_as_dropped(rooted, self.options), note
 

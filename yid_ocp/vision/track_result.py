@@ -25,7 +25,7 @@ _CAMERA_POINT_GROUP = "points_camera"
 
 @dataclass(frozen=True, eq=False)
 class FrameReport:
-    """Fitted shape of one frame, or the reason why the frame was dropped."""
+    """The fitted shape of one frame, or the reason why the frame was dropped."""
 
     index: int  # index in the sequence
     name: str
@@ -47,13 +47,13 @@ class FrameReport:
 
 
 def count_dropped_frames_by_reason(frames: Iterable[FrameReport]) -> dict[str, int]:
-    """Count dropped frames by reason, without the numbers in the reasons."""
+    """Count the dropped frames for each reason. Numbers in the reasons are ignored."""
     return dict(Counter(frame.drop_reason.partition(":")[0] for frame in frames if not frame.is_good).most_common())
 
 
 @dataclass(frozen=True, eq=False)
 class FrameProcessingStages:
-    """Processing stages of one frame, for figures. Stages that a dropped frame did not reach are None."""
+    """The processing stages of one frame, for figures. Stages that a dropped frame did not reach are None."""
 
     report: FrameReport
     camera_position: Array  # (3,) [m]
@@ -64,7 +64,7 @@ class FrameProcessingStages:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """Result of tracking: shapes and points of the good frames."""
+    """The result of tracking: shapes and points of the good frames."""
 
     point_names: tuple[str, ...]  # points written down
     t: Array  # (M,), times of the good frames on the joints' clock [s]
@@ -80,18 +80,18 @@ class TrackResult:
     _place: Callable[[Array], Array]  # function of the configuration: the points
 
     def configuration_at_time(self, t: float) -> Array:
-        """Configuration (n,) at any time, by a cubic spline through the good frames; constant beyond them."""
+        """Return the configuration (n,) at a time, by a cubic spline through the good frames; constant beyond them."""
         if len(self.t) < 2:
             return self.configurations[0].copy()
         return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
 
     def point_positions_at_time(self, t: float) -> Array:
-        """Positions (np, 3) [m] of the tracked points at any time, from `configuration_at_time`."""
+        """Return the positions (np, 3) [m] of the tracked points at any time, from `configuration_at_time`."""
         return self._place(self.configuration_at_time(t))
 
     @property
     def frame_drop_reason_counts(self) -> dict[str, int]:
-        """Number of frames dropped for each reason."""
+        """The number of frames that were dropped for each reason."""
         return count_dropped_frames_by_reason(self.frame_reports)
 
     def to_point_group(self) -> PointGroup:
@@ -102,7 +102,7 @@ class TrackResult:
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, "world", pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
-        """Copy of a recording (None: an empty one) with these points as `points_camera`, see `validated_recording`."""
+        """Return a copy of a recording (None: an empty one) with these points as `points_camera`."""
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
         count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
@@ -129,7 +129,7 @@ class _Picture(NamedTuple):
 
 
 def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit.
+    """Draw a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit.
 
     Files are `NAME_1_cloud.png` to `NAME_5_fit.png` in `folder`, which is created. The last title says why the frame
     was dropped. Raises `OutputError` if writing fails.

@@ -1,4 +1,4 @@
-"""The command `batch`: one run per configuration or recording, with a common table and report."""
+"""The command `batch`: one run for each configuration or recording, with a common table and report."""
 
 from __future__ import annotations
 

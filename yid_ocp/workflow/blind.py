@@ -1,4 +1,4 @@
-"""The command `blind`: diagnose synthetic cases without their labels, then open the labels and score.
+"""The command `blind`: diagnose synthetic cases without their labels, then open the labels and score the answers.
 
 Experiments are variations of configurations. The cases of an experiment are drawn from its ensemble.
 """
@@ -42,7 +42,7 @@ from yid_ocp.workflow.run_inputs import read_recordings_of_role
 _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
 """Standard deviations of the torques' white noise and constant offsets where an experiment has any [N m]."""
-_SIGN_SMOOTHING_SPEED = 0.005  # of the nominal friction; with 0.02, arms creep by mm before they break loose [rad/s]
+_PRESCRIBED_SIGN_SMOOTHING_SPEED = 0.005  # of nominal friction, for joints that stand still under a load [rad/s]
 _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": {"closure": None}}
 log = logging.getLogger(__name__)
 
@@ -343,7 +343,8 @@ class _ExperimentVariation:
         if arm.friction_law != "none":
             law = self.friction if arm.friction_law == "varied" else arm.friction_law
             # because these joints stand still at the start and at every reversal
-            own.append(f"model.friction={{law: {law}, sign_smoothing_speed: {_SIGN_SMOOTHING_SPEED}}}")
+            speed = _PRESCRIBED_SIGN_SMOOTHING_SPEED if self.has_prescribed_arms else "null"
+            own.append(f"model.friction={{law: {law}, sign_smoothing_speed: {speed}}}")
             own += ['parameters={"*.v_stribeck": {free: false}}'] if "stribeck" in law else []
         if self.is_without_object:
             free = {f"{name}.damping": {"free": True, "bounds": [0.0, 50.0]} for name in driven}

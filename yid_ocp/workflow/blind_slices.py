@@ -1,4 +1,4 @@
-"""Slices of a blind validation: written with hashes, joined if the hashes agree, scored and judged again."""
+"""The parts (slices) of a blind validation, which are written with hashes, joined, scored and judged again."""
 
 from __future__ import annotations
 

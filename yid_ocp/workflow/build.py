@@ -1,4 +1,4 @@
-"""Build the system of a run from its settings, and compile its step."""
+"""Functions that build the system of a run from its settings, and compile its time step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.effects.bodies import system_with_link_mass_factors
-from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW, effect_with_sign_smoothing_speed
+from yid_ocp.effects.friction import (
+    EFFECT_KINDS_BY_FRICTION_LAW,
+    TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED,
+    effect_with_sign_smoothing_speed,
+)
 from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
@@ -101,7 +105,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
 
 
 def read_urdf_arguments(run: RunSettings) -> dict[str, Any]:
-    """Options of `read_urdf` for the joints and links of the robot that a run uses."""
+    """Return the arguments of `read_urdf` that select the joints and links of the robot that a run uses."""
     arms = run.model.arms
     return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}
 
@@ -121,13 +125,13 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 
 
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
-    """Measured vertices and clamps of a run's cable. None for an object without its own clamps."""
+    """Return the measured vertices and clamps of a run's cable. None for an object without its own clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
         return run.model.object.branch_vertices() if isinstance(run.model.object, ObjectBetweenClamps) else None
 
 
 def arms_are_estimated_states(run: RunSettings) -> bool:
-    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
+    """Check whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
 
     Arms with sensors on links remain prescribed, because such sensors cannot be weighted under process noise.
     """
@@ -190,6 +194,8 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     for joint in friction_joint_names(run, system):
         assert run.model.friction is not None
         kinds, speed = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law], run.model.friction.sign_smoothing_speed
+        if speed is None and joint in system.driven and joint not in system.servos:
+            speed = TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED
         made = [make_effect(kind, joint, system) for kind in kinds if f"{kind}@{joint}" not in named]
         system = system.with_effects([effect_with_sign_smoothing_speed(effect, speed) for effect in made])
     for i, said in enumerate(run.model.effects):
@@ -255,7 +261,7 @@ def _matches(name: str, key: str) -> bool:
 
 
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
-    """Settings of every parameter that a name or pattern matches. Later keys override earlier ones.
+    """Return the settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
     Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.relative_link_mass_std` and the frames'
     `position_std` come first. Raises `ConfigError` if a name or pattern matches nothing.
@@ -274,7 +280,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
 
 
 def friction_joint_names(run: RunSettings, system: System) -> tuple[str, ...]:
-    """Joints with friction by `model.friction`: the named joints or all arm joints. Empty without that section."""
+    """Return the joints with friction: those in `model.friction`, or all arm joints. Empty without that section."""
     if run.model.friction is None:
         return ()
     known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
@@ -285,7 +291,7 @@ def friction_joint_names(run: RunSettings, system: System) -> tuple[str, ...]:
 
 
 def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
-    """Names of the parameters of a run's joint friction, joint damping included."""
+    """List the parameters of a run's joint friction, including joint damping."""
     if run.model.friction is None:
         return []
     wanted = run.model.friction.joints
@@ -332,18 +338,18 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
 
 
 def free_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
-    """Names of the parameters that the settings declare to be estimated."""
+    """Return the names of the parameters that the settings declare to be estimated."""
     return [name for name, said in settings_by_parameter_name(run, parameters).items() if said.free]
 
 
 def divided_joint_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
-    """Factor on an elastic joint's parameter that keeps the object's stiffness when links are divided."""
+    """Return the factor on an elastic joint's parameter that keeps the object's stiffness when links are divided."""
     item = run.model.object
     return 1 if item is None else item.link_division_parameter_factor(name, link_division)
 
 
 def system_with_second_arm_holding_object(run: RunSettings, system: System) -> System | None:
-    """Run's system with the second arm at a free end of the object. None if impossible."""
+    """Return the run's system with the second arm holding a free end of the object. None if impossible."""
     model, joints = run.model, run.model.arms.joints
     if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
         return None
@@ -410,7 +416,7 @@ def _with_estimable_position(tree: Mechanism, name: str, parent: str) -> Mechani
 def marker_positions_from_reference_pose(
     run: RunSettings, system: System, recordings: Iterable[Recording]
 ) -> dict[str, dict[str, float]]:
-    """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
+    """Compute marker positions on the object [m], as parameter values, from each recording's straight reference pose.
 
     Empty if no frame has `use_recorded_straight_position`. Raises `ConfigError` if the object is not fixed in the world
     or a marker is not a point of a recording, and `DataError` if a recording has no `straight` positions.

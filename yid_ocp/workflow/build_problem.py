@@ -1,4 +1,4 @@
-"""Build the estimation problem of a run from recordings, options and free parameters on a compiled step.
+"""Functions that build a run's estimation problem from recordings, options, free parameters and a compiled step.
 
 Recordings are checked first: duplicates count once, and gaps are cut out. Other issues are reported, not corrected.
 """
@@ -189,7 +189,7 @@ def build_problem(
 
 
 def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
+    """Return the smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
     system = problem.system
     if not system.grasps:
         return {}
@@ -269,7 +269,7 @@ def _check_recordings(
 
 
 def all_issues_of_one_recording(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
-    """Find all data quality issues of one uncut recording. Errors are as in `build_problem`."""
+    """Find all data quality issues of one whole recording. Errors are as in `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
     arm = RecordedJointsModel.from_system(system, free_parameter_names(run, system.parameters))
@@ -391,7 +391,7 @@ def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
 
 
 def issues_to_plain_data(issues: Sequence[Issue]) -> list[dict[str, Any]]:
-    """Convert data quality issues to JSON-ready dicts, gravest first, for the key `issues` of a result."""
+    """Convert data quality issues to JSON-ready dicts, most severe first, for the key `issues` of a result."""
     found = []
     for doubt in _gravest_first(issues):
         own = {"evidence" if key == "limit_violation_ratio" else key: value for key, value in asdict(doubt).items()}

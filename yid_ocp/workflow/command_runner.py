@@ -1,4 +1,4 @@
-"""Shared steps of all commands: progress display, printed summary, run folder and exit codes."""
+"""The steps that all commands share: progress display, printed summary, run folder and exit codes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _CommandOutput = TypeVar("_CommandOutput")
 
 @dataclass(frozen=True)
 class CommandOutcome(Generic[_CommandOutput]):
-    """Outcome of a command: run folder, contents of result.json, computed result and success."""
+    """The outcome of a command: run folder, contents of result.json, computed result and success."""
 
     folder: Path
     result: dict[str, Any]
@@ -83,7 +83,7 @@ def print_result(
 
 
 def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:
-    """Workers from `--workers` or `--scheduler`, or None without either. Errors are as in `WorkerConfig`."""
+    """Return the workers from `--workers` or `--scheduler`, or None without either. Errors are as in `WorkerConfig`."""
     if arguments.workers is None and not arguments.scheduler:
         return None
     workers = WorkerConfig(arguments.workers, arguments.scheduler)
@@ -92,7 +92,7 @@ def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig 
 
 
 def print_json(result: Mapping[str, Any]) -> None:
-    """Print a result on standard output, as the same JSON text as in a result file."""
+    """Print a result on standard output, with the same JSON text that a result file has."""
     print(json.dumps(to_json_types(result), indent=1, allow_nan=False))
 
 
@@ -170,7 +170,7 @@ def _format_iterate(entry: Iterate) -> str:
 
 
 class StderrLogLinesProgress(Progress):
-    """Progress as lines on standard error: per stage, iterate or tenth of a stage, and after some silence."""
+    """A progress display that prints lines on standard error for stages, iterates, tenths of a stage and long waits."""
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._tenths, self._last, self._left = 0, 0.0, _RemainingTime(import_time)

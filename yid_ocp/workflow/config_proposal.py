@@ -1,4 +1,4 @@
-"""Propose arms, mode, marker positions, noise and rates of a configuration from robot and recordings."""
+"""Proposal of a configuration's arms, mode, marker positions, noise and rates from robot and recordings."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class _GroupNoise:
 
 @dataclass(frozen=True)
 class ProposedConfigChoices:
-    """Proposed choices for a generated configuration, with reasons."""
+    """The proposed choices for a generated configuration, with reasons."""
 
     joints: tuple[str, ...]  # recorded joints that move the object, in the URDF's order
     unused_joints: tuple[str, ...]  # recorded joints that the model does not need or know
@@ -105,7 +105,7 @@ class ProposedConfigChoices:
 
     @property
     def is_identified_from_efforts_only(self) -> bool:
-        """Whether efforts alone identify the model, as arms are prescribed and no object is observed."""
+        """Whether efforts alone identify the model, because the arms are prescribed and no object is observed."""
         seen = any(not group.startswith("imu") for group in self.point_placements)
         return self.arm_mode == "prescribed" and not (self.has_object and seen)
 
@@ -119,7 +119,7 @@ def propose_config_choices(
     grasps: Mapping[str, str] | None = None,
     standing: bool = False,
 ) -> ProposedConfigChoices:
-    """Propose choices for a configuration from a robot and its recordings, all of which need joints.
+    """Propose choices for a configuration from a robot and its recordings. All recordings need joints.
 
     Raises `ConfigError` if no recorded joint is in the URDF, a later recording lacks a joint of the first, or a frame
     does not exist; other errors are as in `read_urdf`.
@@ -311,7 +311,7 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 
 
 def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
-    """Find a time [s] of standstill in the later part of a recording, at which the held-out part starts. None without.
+    """Find a time [s] of standstill, late in a recording, at which the held-out part starts. None without standstill.
 
     From standstill, the held-out part can be predicted from equilibrium, and so tests the model on held-out data.
     """

@@ -1,4 +1,4 @@
-"""The command `diagnose`: detect, locate and explain the gap. Finished refits survive an interruption."""
+"""The command `diagnose`: detect, locate and explain the gap between simulation and recordings."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[DiagnosisResult]:
-    """Diagnose and write the run folder. Finished refits of an interrupted, identical run are reused."""
+    """Run a diagnosis and write the run folder. Finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
         folder.record_run_start(run, "diagnose", _flags(run))
         made_from = folder.input_hashes, config_yaml_with_defaults(run), software_and_plugin_versions()

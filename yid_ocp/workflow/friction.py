@@ -1,4 +1,4 @@
-"""The command `friction`: judge every law of the friction ladder by motions that were not fitted."""
+"""The command `friction`: compare the laws of the friction ladder on motions that were not fitted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `identifiability`: Fisher information of recordings and of changed experiments."""
+"""The command `identifiability`: compute the Fisher information of recordings and of changed experiments."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from yid_ocp.workflow.solve import solve_and_decide_cable_memory
 
 @dataclass(frozen=True)
 class IdentifiabilityOptions:
-    """Options of an identifiability analysis beyond the run's settings.
+    """The options of an identifiability analysis beyond the run's settings.
 
     `evaluation_point` is the solution, or the initial values without solving. `start_knowledge`: initial states are
     `assumed` as in the settings, so that verdicts equal the verdicts of `solve`, or all `unknown` and estimated.
@@ -87,7 +87,7 @@ def run_identifiability(
     options: IdentifiabilityOptions | None = None,
     workers: WorkerConfig | Executor | None = None,
 ) -> CommandOutcome[IdentifiabilityResult | None]:
-    """Solve, analyse identifiability and write the run folder.
+    """Solve the problem, analyse identifiability and write the run folder.
 
     If the solver fails, the analysis is omitted and the run folder holds the reason. `workers` compute intervals, one
     parameter per task, and the changed experiments of `what_if` (default: this process).

@@ -128,7 +128,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
 
 
 def recording_issue_lines(recording: Recording) -> list[str]:
-    """Describe issues of a recording itself, such as units, clocks, few samples, no motion or channels."""
+    """Describe the issues of a recording itself, such as units, clocks, few samples, no motion or channels."""
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
@@ -182,7 +182,7 @@ def recording_contents_summary(recording: Recording) -> dict[str, Any]:
 
 
 def read_third_party_recording(file: str | Path, options: Mapping[str, Any], progress: Progress) -> Recording:
-    """Read a recording from another tool's file, with its hash in `source`. Options and errors: `read_any`."""
+    """Read a recording from another tool's file, with the file's hash in `source`. Options and errors: `read_any`."""
     progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)
     if recording.sha256 is None or has_native_recording_suffix(file):
@@ -191,7 +191,7 @@ def read_third_party_recording(file: str | Path, options: Mapping[str, Any], pro
 
 
 def has_native_recording_suffix(file: str | Path) -> bool:
-    """Whether a file has the suffix of this package's recordings."""
+    """Check whether a file has the suffix of this package's recordings."""
     return Path(file).suffix.lower() in (".h5", ".hdf5")
 
 

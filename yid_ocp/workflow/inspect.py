@@ -1,4 +1,4 @@
-"""The command `inspect`: equations, sparsity patterns and linearisation of a run's model."""
+"""The command `inspect`: show equations, sparsity patterns and linearisation of a run's model."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
 def identified_parameters_with_covariance(
     run: RunSettings, step: Step
 ) -> tuple[Array, ParameterCovarianceBeforePlan, dict[str, Any]]:
-    """Parameters, their covariance and their source: a run folder of `solve`, or the settings."""
+    """Return the parameters, their covariance and their source, which is a run folder of `solve` or the settings."""
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run_folder is None:
@@ -243,7 +243,7 @@ def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> 
 def discrimination_plan_settings(
     confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path
 ) -> dict[str, Any] | None:
-    """Settings of `plan` for a motion that discriminates confusable effects. None if there are none."""
+    """Make settings of `plan` for a motion that distinguishes confusable effects. None if there are none."""
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]

@@ -1,4 +1,4 @@
-"""Write trajectories, held-out errors with baselines, and estimated torque offsets of predictions."""
+"""Outputs of predictions: trajectories, held-out errors with baselines, and estimated torque offsets."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
-    """Estimated torque offset of every joint in every recording, held-out too: `value`, `std`, `prior_std` [N m].
+    """Return every joint's torque offset in every recording, also held-out ones: `value`, `std`, `prior_std` [N m].
 
     The problem's whitening filters are fixed near `x` (nx,). The result is empty without filters, or without offsets in
     the model.
@@ -60,7 +60,7 @@ def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[st
 
 
 def estimate_texts_by_format(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
-    """Make texts to copy, such as YAML lines, from estimates of identifiable parameters. Empty if there are none.
+    """Make texts to copy, such as YAML lines, from the estimates of identifiable parameters. Empty if there are none.
 
     The result holds `values` with total standard deviations, `joints` (number of links and range of joint stiffness [N
     m/rad], per segment and deformation), lines of `yaml` and `mjcf`, rows of `latex`, the command that exports the
@@ -114,7 +114,7 @@ def _has_torque_bias(episode: Episode) -> bool:
 def predicted_configuration_trajectory(
     name: str, problem: EstimationProblem, episode: Episode, prediction: EpisodePrediction, theta: Array
 ) -> ConfigurationTrajectory:
-    """Trajectory of a predicted recording for an animation. `theta` (ntheta,) holds all parameters."""
+    """Return the trajectory of a predicted recording for an animation. `theta` (ntheta,) holds all parameters."""
     system, q = problem.system, prediction.rollout.state[:, : problem.system.n_coordinates]
     own = problem.predictor.theta_with_episode_values(episode, theta)
     return ConfigurationTrajectory(name, system, own, episode.grid.node_times, q)

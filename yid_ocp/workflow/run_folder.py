@@ -1,4 +1,4 @@
-"""Create run folders under a temporary name, and rename complete ones."""
+"""Run folders, which are created under a temporary name and renamed when complete."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _FULL_HINT = "choose a folder on a disk with room, with --out"
 
 @dataclass
 class RunFolder:
-    """A run folder while it is written, with its paths, log and hashes of inputs."""
+    """A run folder that is being written, with its paths, log and hashes of inputs."""
 
     final_path: Path  # name of the complete folder
     path: Path  # present path
@@ -47,7 +47,7 @@ class RunFolder:
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
-        """Write config.yaml, hash the inputs, and log the start of a command. Errors: `input_files_by_name`."""
+        """Write config.yaml, hash the input files, and log the start of a command. Errors: `input_files_by_name`."""
         self.write_text_file("config.yaml", config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
@@ -75,7 +75,7 @@ class RunFolder:
     def write_result_and_report(
         self, run: RunSettings, shown: Progress, result: Mapping[str, Any], name: str = "result.json", /, **known: Any
     ) -> dict[str, Any]:
-        """Write result.json and, if set, report.html. `known` holds more attributes of `ReportData`."""
+        """Write result.json and, if the settings ask for it, report.html. `known`: more attributes of `ReportData`."""
         written = self.write_result(result, name)
         if run.output.write_report:
             shown.begin_stage("writing the report", 1.5)
@@ -313,10 +313,10 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
 
 
 def current_local_time_text() -> str:
-    """Local date and time with UTC offset, as text."""
+    """Return the local date and time with UTC offset, as text."""
     return datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
 
 
 def software_and_plugin_versions() -> dict[str, str]:
-    """Versions of Python, this package, its numerical dependencies, and packages whose plug-ins are in use."""
+    """Return versions of Python, this package, its numerical dependencies, and packages whose plug-ins are in use."""
     return installed_versions() | installed_plugin_versions()

@@ -1,4 +1,4 @@
-"""Read the estimates of earlier runs, as a baseline of a diagnosis and for the command `report`."""
+"""Readers of earlier runs' estimates, as a baseline of a diagnosis and for the command `report`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 
 
 def read_estimates(folder: str | Path) -> RunEstimates:
-    """Read estimates and covariance of free parameters from the run folder of a `solve` or `diagnose`.
+    """Read the estimates and covariance of free parameters from the run folder of a `solve` or `diagnose`.
 
     Raises `DataError` if the folder holds no finished run, if its result cannot be read, belongs to another command or
     has an old format, or if the solve failed.
@@ -78,7 +78,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
 
 
 def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Values of effect parameters, by effect label and parameter name without label."""
+    """Group the values of effect parameters by effect label and by parameter name without label."""
     found: dict[str, dict[str, float]] = {}
     for name, value in parameters.items():
         label, _, quantity = name.rpartition(".")
@@ -88,7 +88,7 @@ def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> d
 
 
 def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
-    """Settings with effects added to the model at their values, by label. Existing effects are kept."""
+    """Return settings with effects added to the model at their values, by label. Existing effects are kept."""
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
     added = [EffectSettings(kind=kind, location=location, values=values) for (kind, _, location), values in parts]
@@ -110,7 +110,7 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
 
 
 def read_result_file(file: Path) -> dict[str, Any]:
-    """Read any command's result.json. Raises `DataError` if it cannot be read or has an old format."""
+    """Read the result.json of any command. Raises `DataError` if it cannot be read or has an old format."""
     if not is_file(file):
         hint, allowed = "give the run folder that `solve` or `diagnose` printed", "a run folder with result.json"
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), allowed=allowed, hint=hint)
@@ -126,7 +126,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
 
 
 def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]:
-    """Estimates of `diagnosis.baseline_run_folders`. `ConfigError` if one has another model or is listed twice."""
+    """Read the estimates of the baseline runs. Raises `ConfigError` if one has another model or is listed twice."""
     found: list[RunEstimates] = []
     for i, folder in enumerate(run.diagnosis.baseline_run_folders):
         where = ("diagnosis", "baseline_run_folders", i)
@@ -161,7 +161,7 @@ def _dependent(folders: Sequence[str | Path]) -> str:
 
 
 def require_runs_of_one_model(folders: Sequence[Path]) -> None:
-    """Raise `ConfigError` unless all run folders have the same model and none is the baseline of another."""
+    """Check that all run folders have the same model and none is the baseline of another. Raises `ConfigError`."""
     dependent = _dependent(folders)
     if dependent:
         allowed, hint = "independent runs", "diagnose without --baseline for a history, or leave one run out"
@@ -198,7 +198,7 @@ def _settings(folder: str | Path) -> RunSettings | None:
 
 
 def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
-    """Add the effects of the baseline `runs` at their estimated values, with their estimated parameters free."""
+    """Return settings with the effects of the baseline `runs` at their estimated values, and these parameters free."""
     if not runs:
         return run
     known, _, _ = pool_estimates_and_chi2(runs)
@@ -211,7 +211,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 
 
 def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
-    """Load recordings without the sought effect, from settings or baseline, and the reason if there are none."""
+    """Load recordings that lack the sought effect, from settings or baseline. Returns a reason if reading fails."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):
         file = resolve_default_recording(path)
@@ -234,7 +234,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
 def require_recordings_not_in_baseline(
     run: RunSettings, problem: EstimationProblem, runs: Sequence[RunEstimates], without: Sequence[Recording]
 ) -> None:
-    """Raise `ConfigError` if a recording of the run is also a baseline or reference recording."""
+    """Check that no recording of the run is a baseline or reference recording as well. Raises `ConfigError`."""
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:

@@ -1,4 +1,4 @@
-"""Read a run's files, recordings and plug-ins, and locate its settings in messages."""
+"""Readers of a run's files, recordings and plug-ins, and error messages that say where a setting is."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _loaded: dict[str, str] = {}  # loaded files and entry points, with hash or dist
 
 
 def load_plugins(run: RunSettings) -> None:
-    """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once per process.
+    """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once in a process.
 
     Raises `ConfigError` if a plug-in is missing, raises an error, registers nothing, uses a registered name, or changed
     after this process ran it. Nothing of this plug-in is then registered.
@@ -124,12 +124,12 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
 
 
 def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
-    """Make (not raise) a `ConfigError` about an unknown name in the settings, with the nearest known name."""
+    """Make, but do not raise, a `ConfigError` about an unknown name in the settings, with the nearest known name."""
     return run.config_error(f"there is no {noun} '{name}'", *path, **unknown_name_error_arguments(name, known))
 
 
 def input_files_by_name(run: RunSettings) -> dict[str, Path]:
-    """All input files of a run (configuration, plug-ins, robot, recordings), by their name in the settings.
+    """Return all input files of a run (configuration, plug-ins, robot, recordings), by their name in the settings.
 
     Raises `ConfigError` if a file does not exist. The message has the setting and the most similar existing file.
     """
@@ -159,7 +159,7 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
 
 
 def resolve_default_recording(path: str) -> Path:
-    """Path of a recording, in which `default:NAME` becomes the file shipped with the package; others are unchanged."""
+    """Return the path of a recording. `default:NAME` becomes a file of the package; other paths are unchanged."""
     if not path.startswith("default:"):
         return Path(path)
     return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
@@ -180,7 +180,7 @@ def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: in
 
 
 def uniquely_named_recordings(recordings: Iterable[Recording], taken: Iterable[str] = ()) -> list[Recording]:
-    """Append a number to the names of recordings that are in `taken` or that an earlier recording has."""
+    """Make recording names unique: append a number to a name that is in `taken` or repeated."""
     names, found = [*taken], list[Recording]()
     for recording in recordings:
         name = f"{recording.name}_{len(names)}" if recording.name in names else recording.name

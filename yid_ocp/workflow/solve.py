@@ -1,4 +1,4 @@
-"""The command `solve`: estimate free parameters, predict held-out recordings, write the run folder."""
+"""The command `solve`: estimate free parameters, predict held-out recordings, and write the run folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _BARS, _SPARKLINE_WIDTH = "▁▂▃▄▅▆▇█", 24
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS, is_live: bool = False
 ) -> CommandOutcome[Solution]:
-    """Estimate, validate and write the run folder. The command is successful if the solver converged.
+    """Estimate and validate the parameters, and write the run folder. Successful if the solver converged.
 
     If the solver failed, the run folder holds the reason and the best point. With `is_live`, a table of cost and
     parameters is reported at every iterate, which a terminal updates.
@@ -70,7 +70,7 @@ run_and_return_exit_code = make_command_function(run_solve, "live")
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> estimation.CableMemoryChoice:
-    """Estimate with the run's solver, and choose between the fits with and without a cable's shape memory."""
+    """Fit the problem with the run's solver, and decide whether a cable's shape memory is part of the fit."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.solve(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
@@ -148,5 +148,5 @@ def solution_to_result_dict(
 def discretisation_shifts_to_dict(
     shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Convert discretisation shifts of estimates, with their `std` from noise, to a dictionary."""
+    """Convert the shifts that discretisation causes in estimates, with `std` from noise, to a dictionary."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}

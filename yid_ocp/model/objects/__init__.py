@@ -1,4 +1,4 @@
-"""Kinds of flexible objects, one file each: settings, geometry, refinement, clamps and `init` templates."""
+"""The kinds of flexible objects. Each file has one kind: settings, geometry, refinement, clamps, `init` templates."""
 
 from importlib import import_module
 from pkgutil import iter_modules

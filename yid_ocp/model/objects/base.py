@@ -1,4 +1,4 @@
-"""Interface of a kind of flexible object: settings, geometry, refinement, clamps and `init` templates."""
+"""The interface of a kind of flexible object: settings, geometry, refinement, clamps and `init` templates."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Mount of an object: the parent frame and the pose of the object's root in it."""
+    """The parent frame of an object, and the pose of the object's root in it."""
 
     parent_frame: Annotated[str | None, OptionInfo("frame in which xyz and rpy are given; default: world")] = None
     xyz: Annotated[_Vector3, OptionInfo("position in the parent frame", "m")] = (0.0, 0.0, 0.0)
@@ -39,13 +39,13 @@ class MountSettings:
 
     @property
     def pose(self) -> Array:
-        """Pose of the object's root in the parent frame, a homogeneous matrix (4, 4)."""
+        """The pose of the object's root in the parent frame, a homogeneous matrix (4, 4)."""
         return transform_from_xyz_rpy(self.xyz, self.rpy)
 
 
 @dataclass(frozen=True)
 class ClampPosePointNames:
-    """Definition of a clamp's pose by two measured points: the origin, and a second point on the z axis.
+    """The names of two measured points that define a clamp's pose: the origin, and a second point on the z axis.
 
     Two points do not determine the roll angle about z. It is zero at the start (x axis perpendicular to world y), and
     the clamp never rotates about its own z axis.
@@ -58,7 +58,7 @@ class ClampPosePointNames:
 
 @dataclass(frozen=True)
 class CableTopology:
-    """Vertices of a branched cable along the parent and child branches, and their undeformed positions."""
+    """The vertices of a branched cable, in order along each branch, and their undeformed positions."""
 
     # parent, from clamp to clamp; clamps hold the first and last two vertices
     main_branch_vertex_names: tuple[str, ...]
@@ -87,7 +87,7 @@ class CableTopology:
 
     @property
     def vertex_names(self) -> tuple[str, ...]:
-        """Names of all vertices, those of the parent branch first."""
+        """The names of all vertices, those of the parent branch first."""
         return (
             *self.main_branch_vertex_names,
             *(vertex for chain in self.child_branch_vertex_names.values() for vertex in chain[1:]),
@@ -95,32 +95,32 @@ class CableTopology:
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
-        """Names of the four clamped vertices: the first and last two of the parent branch."""
+        """The names of the four clamped vertices: the first two and last two of the parent branch."""
         return (*self.main_branch_vertex_names[:2], *self.main_branch_vertex_names[-2:])
 
     @property
     def unclamped_vertex_names(self) -> tuple[str, ...]:
-        """Names of the vertices that no clamp holds, at which predictions are evaluated."""
+        """The names of the vertices that no clamp holds, at which predictions are evaluated."""
         return tuple(vertex for vertex in self.vertex_names if vertex not in self.clamped_vertex_names)
 
     @property
     def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
-        """Vertex names of every branch, by segment name. The parent branch comes first."""
+        """The vertex names of every branch, by segment name. The parent branch comes first."""
         return {self.parent_segment: self.main_branch_vertex_names, **self.child_branch_vertex_names}
 
     @property
     def edge_vertex_names(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of vertex names, one for each edge, ordered by branch."""
+        """The two vertex names of every edge, ordered by branch."""
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
     def clamp_pose_point_names(self) -> tuple[ClampPosePointNames, ClampPosePointNames]:
-        """Pose definitions of the start clamp and the end clamp."""
+        """The names of the points that define the poses of the start clamp and the end clamp."""
         a, b, *_, y, z = self.main_branch_vertex_names
         return ClampPosePointNames(START_CLAMP, a, b), ClampPosePointNames(END_CLAMP, y, z)
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
-        """Undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
+        """Return the undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
         return np.array([self.undeformed_positions[vertex] for vertex in chain], float)
 
 
@@ -137,7 +137,7 @@ class InitialObjectSettings:
 
 @dataclass(frozen=True)
 class InitObjectFactory:
-    """Default link number and builder of an object that `init --object` can name.
+    """The default link number and the builder of an object that `init --object` can name.
 
     `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
     Raises `ConfigError` if an input is missing.
@@ -177,7 +177,7 @@ def parse_comma_separated_numbers(text: str, count: int, flag: str) -> list[floa
 def initial_parameters_with_comments(
     segments: Sequence[FlexibleSegment], rigidity_ratio: float
 ) -> dict[str, tuple[float, str]]:
-    """Initial bending rigidity (`rigidity_ratio` x weight x length^2) and damping of `segments`, with comments."""
+    """Return the initial bending rigidity, `rigidity_ratio` x weight x length^2, and damping of each segment."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
@@ -188,7 +188,7 @@ def initial_parameters_with_comments(
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectBuilder:
-    """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`. Its fields are the object's settings.
+    """The base class of all kinds of flexible objects in `OBJECT_KINDS`. Its fields are the object's settings.
 
     A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that is a whole system is also a
     `ObjectBetweenClamps`.
@@ -202,7 +202,7 @@ class ObjectBuilder:
     kind: Annotated[str, OptionInfo("kind of object")]
 
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
-        """Define the segments, parents first. `damping` is per joint; each link is split into `link_division` links."""
+        """Define the segments, parents first. Joints have `damping`; each link is split into `link_division` links."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
@@ -211,28 +211,28 @@ class ObjectBuilder:
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
-        """Frame to which the object's root is attached (None: world), and the root's pose (4, 4) in it (None: zero)."""
+        """The frame that holds the object's root (None: world), and the root's pose (4, 4) in it (None: zero)."""
         return None, None
 
     @property
     def is_root_fixed_in_world(self) -> bool:
-        """Whether the object's root is fixed in the world instead of to a robot frame or clamp."""
+        """Whether the object's root is fixed in the world and not to a robot frame or clamp."""
         return False
 
     @property
     def uniform_or_total_link_count(self) -> int | None:
-        """Number of links per segment, or the total if segments differ. None without such segments."""
+        """The number of links in each segment, or the total if the segments differ. None without such segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.segment_definitions()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
-        """Factor on a per-joint parameter that preserves segment stiffness if links are divided; else 1."""
+        """Return the factor on a parameter that keeps a segment's stiffness if its links are divided, else 1."""
         owner, _, quantity = parameter.rpartition(".")
         per_joint = {segment.name for segment in self.segment_definitions() if not segment.values_given_as_rigidities}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
-        """Paths of the input files in the object's settings, by settings key."""
+        """Return the paths of the input files in the object's settings, by settings key."""
         own: Any = type(self)
         return {
             key: getattr(self, option.field_name)
@@ -241,13 +241,13 @@ class ObjectBuilder:
         }
 
     def with_file_names_only(self) -> ObjectBuilder:
-        """Return a copy with file names instead of paths, to compare objects of different runs."""
+        """Return a copy with file names instead of full paths, so that objects of different runs can be compared."""
         return replace(self, **{key: Path(file).name for key, file in self.input_file_paths().items()})
 
 
 @runtime_checkable
 class ObjectBetweenClamps(Protocol):
-    """Interface of objects that form a whole system with clamps, such as a cable. The clamps follow measured points."""
+    """The interface of objects, such as a cable, that form a system together with clamps at measured points."""
 
     def branch_vertices(self) -> CableTopology:
         """Return the object's vertices and clamps. Raises `DataError` or `ModelError` if they are inconsistent."""
@@ -256,12 +256,12 @@ class ObjectBetweenClamps(Protocol):
         """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
 
     def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Parameter values from one recording's edge lengths [m]; empty if all recordings share the lengths."""
+        """Compute parameter values from one recording's edge lengths [m]; empty if all recordings share the lengths."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountedObjectBuilder(ObjectBuilder):
-    """Base class of objects whose root is fixed to a frame of a robot or clamp, or in the world."""
+    """The base class of objects whose root is fixed to a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("factor on the weight of the object, not on its inertia")
@@ -284,5 +284,5 @@ OBJECT_KINDS: Registry[type[ObjectBuilder]] = Registry("kind")
 
 
 def init_object_templates() -> dict[str, InitObjectFactory]:
-    """Templates of flexible objects by the value of `init --object` that selects them."""
+    """Return the templates of flexible objects, by the value of `init --object` that selects each."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

@@ -47,7 +47,7 @@ INITIAL_RMS_SPEED_PARAMETER = "start.speed"
 
 @dataclass(frozen=True)
 class CableBranchRigidityDampingAndDensity:
-    """Nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
+    """The nominal rigidities [N m^2], damping [N m^2 s] and mass per length [kg/m] of one cable branch."""
 
     bend_rigidity: float = 1.5e-3  # a configuration sets this and the next two under `parameters`
     twist_rigidity: float = 1.0e-3
@@ -58,7 +58,7 @@ class CableBranchRigidityDampingAndDensity:
 
 @dataclass(frozen=True)
 class CableOptions:
-    """Settings of a cable's model.
+    """The settings of a cable's model.
 
     `shape_memory_fraction` models a cable that partly keeps the shape in which it was held before the recording. The
     rest angle of each joint is then (1 - memory) x undeformed + memory x (start angle - load/stiffness), where the load
@@ -105,7 +105,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
 
 
 def length_parameters_from_edges(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-    """Values of a cable's length parameters from its edge lengths [m]."""
+    """Compute the values of a cable's length parameters from its edge lengths [m]."""
     values = {f"{START_CLAMP}.length": lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]]}
     for name, chain in cable.vertex_names_by_branch.items():
         first = 1 if name == cable.parent_segment else 0

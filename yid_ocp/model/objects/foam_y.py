@@ -19,7 +19,7 @@ _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trun
 
 
 def foam_y_segments() -> tuple[FlexibleSegment, ...]:
-    """Segments of the foam Y. Branches T2 and T3 leave the trunk T1 at 45 degrees, towards +y and -y."""
+    """Define the segments of the foam Y. Branches T2 and T3 leave the trunk T1 at 45 degrees, towards +y and -y."""
     lean = math.radians(45.0)
     return (
         FlexibleSegment("T1", 0.813, 0.064, 0.032),

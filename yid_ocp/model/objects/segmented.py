@@ -1,4 +1,4 @@
-"""Flexible objects that the settings describe segment by segment, such as cables, beams and trees."""
+"""Flexible objects, such as cables, beams and trees, that the settings describe segment by segment."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentGeometrySettings:
-    """Settings of one segment of rigid links. Stiffness and damping are set in `parameters`."""
+    """The settings of one segment of rigid links. Stiffness and damping are set in `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed with link_lengths", "m")] = None
     mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]

@@ -1,4 +1,4 @@
-"""A round rod with linearly changing radius, such as a fishing rod or a branch."""
+"""A round rod, such as a fishing rod or a branch, whose radius changes linearly along its length."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ parameters:
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
 
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
-        """Build the rod as one segment with the radius of its base. `build` then tapers the links."""
+        """Define the rod as one segment with the radius of its base. `build` then tapers the links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
         rod = FlexibleSegment(_SEGMENT, *sizes, damping=damping, values_given_as_rigidities=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Input data of a report: `result` (content of result.json) and, if available, problem, solution and other objects.
+    """The input data of a report: `result` (content of result.json) and, if available, problem, solution and others.
 
     `animations` replaces the animations made from `problem`, `solution` and `held_out`. `section_data` holds other data
     for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn.
@@ -55,7 +55,7 @@ REPORT_SECTIONS: Registry[_ReportSection] = Registry("report section")
 
 
 def register_report_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
-    """Decorator that registers a function as the report section `name`. Sections with lower `order` come first.
+    """Return a decorator that registers a function as the report section `name`. Lower values of `order` come first.
 
     The function returns the context of the template `NAME.html` or, for a section without a template, pairs (title,
     figure). It returns None or no pair if the section has no content.
@@ -71,7 +71,7 @@ def register_report_section(name: str, order: int, title: str) -> Callable[[_Pre
 def draw_figure_per_unit(
     rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any]
 ) -> list[tuple[str, Any]]:
-    """Draw one figure per unit from rows (name, unit, row). Returns pairs (empty title, figure)."""
+    """Draw one figure for each unit, from rows (name, unit, row). Returns pairs (empty title, figure)."""
     grouped: dict[str, dict[str, _Row]] = {}
     for name, unit, row in rows:
         grouped.setdefault(unit, {})[name] = row
@@ -79,7 +79,7 @@ def draw_figure_per_unit(
 
 
 def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
-    """Render all sections with content, in order: name, title and HTML."""
+    """Render all sections with content, in order. Each has a name, a title and HTML."""
     result = []
     sections = {name: REPORT_SECTIONS[name] for name in REPORT_SECTIONS}
     for name, section in sorted(sections.items(), key=lambda entry: entry[1].order):

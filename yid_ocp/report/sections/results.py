@@ -1,4 +1,4 @@
-"""Report sections common to all commands: conclusions, estimates, motion and measurements."""
+"""Report sections that all commands share: conclusions, estimates, motion and measurements."""
 
 from __future__ import annotations
 
