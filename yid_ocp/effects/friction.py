@@ -121,8 +121,8 @@ class _JointStribeck(_JointFriction):
 class _JointLoadFriction(_JointFriction):
     """Friction that grows with the torque through a gear: F = -share |motor torque - external torque| sgn(v).
 
-    The external torque is that of weights and grasps beyond the joint. The sign of the speed is smoothed below
-    `_LOAD_SIGN_SMOOTHING_SPEED`, the magnitude of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al. (2024),
+    The external torque is that of weights and grasps beyond the joint. The sign of the speed is smoothed below v_s,
+    at most `_LOAD_SIGN_SMOOTHING_SPEED`, the magnitude of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al. (2024),
     Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
     """
 
@@ -143,7 +143,7 @@ class _JointLoadFriction(_JointFriction):
         load = self._load(state)
         size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        friction = self["share"] * size * ca.tanh(v / _LOAD_SIGN_SMOOTHING_SPEED)
+        friction = self["share"] * size * ca.tanh(v / min(self.sign_smoothing_speed, _LOAD_SIGN_SMOOTHING_SPEED))
         # it dissipates energy, but is not a dissipative force of the speed alone: its size depends on weight and motor
         force = base.generalized_force_at_joint(state.system, self.location, -friction)
         return EffectStepTerms(generalized_force=force)
