@@ -105,9 +105,10 @@ def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
     with pytest.raises(OutputError, match="folder cannot be made"):
         export_recording_csv_files(tables, tmp_path / "file")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-    (tmp_path / "joints.csv").mkdir()
-    with pytest.raises(OutputError, match="this path is a folder"):
+    (tmp_path / "joints.csv").write_text("measured")
+    with pytest.raises(OutputError, match="joints.csv exists"):
         export_recording_csv_files(tables, tmp_path)
+    assert (tmp_path / "joints.csv").read_text() == "measured"
 
 
 def test_a_solve_says_what_it_measured_and_predicted(pendulum, cli, tmp_path):

@@ -130,20 +130,22 @@ def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[s
     """Write each group of a recording as a table `<group>.csv` with all digits, which `read_csv` can read.
 
     The tables omit standard deviations, the kind of effort, sensor, frame, pose and clock. The cells of an unseen point
-    are empty. Returns the files, joints first. Raises `OutputError` if the folder or a file cannot be written.
+    are empty. Returns the files, joints first. Raises `OutputError` if a file exists or cannot be written.
     """
-    folder = make_folder(folder)
-    written = []
-    for group in recording.joint_and_point_groups:
+    folder, groups = make_folder(folder), recording.joint_and_point_groups
+    written = [folder / f"{'joints' if isinstance(group, JointGroup) else group.name}.csv" for group in groups]
+    for file in written:
+        if file.exists():
+            what, allowed = f"{file.name} exists and is not overwritten", "a folder without the files to be written"
+            raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another --out, or remove the file")
+    for group, target in zip(groups, written, strict=True):
         if isinstance(group, JointGroup):
-            stem = "joints"
             columns = [f"{channel}_{name}" for channel in group.values_by_channel for name in group.names]
             table = np.column_stack([group.t, *group.values_by_channel.values()])
         else:
-            stem, columns = group.name, [f"{name}_{axis}" for name in group.names for axis in "xyz"]
+            columns = [f"{name}_{axis}" for name in group.names for axis in "xyz"]
             table = np.column_stack([group.t, group.position.reshape(len(group.t), -1)])
-        written.append(folder / f"{stem}.csv")
-        with atomic_write(written[-1]) as temporary, temporary.open("x", encoding="utf-8", newline="") as file:
+        with atomic_write(target) as temporary, temporary.open("x", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["t", *columns])
             writer.writerows([["" if math.isnan(value) else repr(value) for value in row] for row in table.tolist()])
