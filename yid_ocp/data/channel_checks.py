@@ -12,7 +12,7 @@ import numpy as np
 import scipy.special
 from scipy.integrate import cumulative_trapezoid
 
-from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.sensors import CHANNEL_KINDS, SensorOptions
@@ -48,9 +48,10 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         turned_by = np.zeros(len(t))
         if joints is not None and quantity == "position" and joints.velocity is not None:
             turned_by = cumulative_trapezoid(joints.velocity[:, joints.names.index(name)], t, initial=0)
-        runs = [
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+        runs = [  # stretches of equal samples: first and last index, and rotation meanwhile
             (begin, end, float(np.ptp(turned_by[begin : end + 1])))
-            for begin, end in _repeated_stretches(same)
+            for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
             if end - begin >= QUALITY_LIMITS.min_stuck_samples and t[end] - t[begin] >= QUALITY_LIMITS.min_stuck_time
         ]
         unseen = QUALITY_LIMITS.max_unseen_rotation
@@ -87,12 +88,6 @@ def _comes_to_rest(values: Array, begin: int, end: int) -> bool:
     near = np.concatenate([values[max(begin - 2, 0) : begin] - values[begin], values[end + 1 : end + 3] - values[end]])
     slow = max(_MAX_STEPS_AT_REST * np.min(moves), _MAX_FRACTION_AT_REST * np.median(moves))
     return bool(np.all(np.abs(near) < slow))
-
-
-def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
-    """First and last index of every stretch of equal samples."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def white_noise_std(t: Array, values: Array) -> float:

@@ -196,8 +196,7 @@ def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
         raise _broken(where, "MARKER_NAMES and three columns for each")
     columns = {name: range(first + 3 * i, first + 3 * i + 3) for i, name in enumerate(names)}
     for at in columns.values():
-        own = table[:, at]
-        table[np.ix_((own == 0).all(axis=1), list(at))] = math.nan
+        table[np.ix_((table[:, at] == 0).all(axis=1), list(at))] = math.nan
     t = table[:, 1] if head else np.arange(len(table)) / frequency
     return _made(t, columns, table, "mm", "Qualisys", [], where)
 

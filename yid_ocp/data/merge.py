@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import QUALITY_LIMITS, mean_sample_rate, median_sample_period
 from yid_ocp.data.readers.base import joints_on_fastest_clock
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
+from yid_ocp.data.recording import JointGroup, Recording, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 
 _MIN_SHARED_FRACTION = 0.5  # overlap over the shorter recording; clocks with less are unrelated
@@ -212,10 +211,6 @@ def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tupl
 
 def _with_unique_names(recordings: Sequence[Recording], groups: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
     """Groups of all recordings. Groups of equal names are suffixed with the recording's name."""
-    names = [group.name for group in chain.from_iterable(groups)]
-    made: list[PointGroup | SensorChannelGroup] = []
-    for recording, own in zip(recordings, groups, strict=True):
-        for group in own:
-            is_unique = names.count(group.name) == 1
-            made.append(group if is_unique else replace(group, name=f"{group.name}_{recording.name}"))
-    return tuple(made)
+    pairs = [(group, recording) for recording, own in zip(recordings, groups, strict=True) for group in own]
+    names = [group.name for group, _ in pairs]
+    return tuple(g if names.count(g.name) == 1 else replace(g, name=f"{g.name}_{r.name}") for g, r in pairs)

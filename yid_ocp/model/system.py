@@ -14,17 +14,11 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, require_known_names
+from yid_ocp.model import servos_and_springs
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.servos_and_springs import (
-    PositionServo,
-    RobotJointSpring,
-    ServoModelOptions,
-    build_joint_servos,
-    stiffness_and_rest_parameters,
-)
 
 if TYPE_CHECKING:
     from typing import Unpack  # Python 3.11
@@ -245,9 +239,9 @@ class SystemBuildArguments(TypedDict, total=False):
     """Shape (3,) [m/s^2]; default: 9.81 along -z."""
     point_frames: Sequence[str] | None
     """Frames that sensors may measure, or points of a segment such as `T1:40%`; default: the segment tips `w_*`."""
-    springs: Mapping[str, RobotJointSpring]
+    springs: Mapping[str, servos_and_springs.RobotJointSpring]
     """Springs by robot joint; they become the parameters `JOINT.stiffness` and `JOINT.rest`."""
-    servos: ServoModelOptions | None
+    servos: servos_and_springs.ServoModelOptions | None
     """Servos whose commands are the inputs of driven joints; adds `JOINT.servo_gain`, `JOINT.servo_damping`, ..."""
 
 
@@ -264,7 +258,7 @@ class System(ReprMixin):
     grasps: tuple[Grasp, ...] = ()
     driven: tuple[str, ...] = ()
     """Joints with an input, in the order of u (motor torques or servo commands)."""
-    servos: Mapping[str, PositionServo] = field(default_factory=dict)
+    servos: Mapping[str, servos_and_springs.PositionServo] = field(default_factory=dict)
     """Servos by joint: for all driven joints, or empty."""
     prescribed: tuple[str, ...] = ()
     """Joints with a prescribed coordinate, in the order of the prescribed coordinates."""
@@ -306,10 +300,10 @@ class System(ReprMixin):
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in options.get("springs", {}).items():
-            stiffness, rest = stiffness_and_rest_parameters(tree, joint, spring)
+            stiffness, rest = servos_and_springs.stiffness_and_rest_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
-        moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos)
+        moved, own = ({}, []) if servos is None else servos_and_springs.build_joint_servos(tree, driven, servos)
         if servos is not None and servos.has_gravity_compensation:
             tree = tree.with_gravity_fraction(ca.SX(0))
         segments: list[SegmentLayout] = []

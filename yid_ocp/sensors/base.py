@@ -136,13 +136,9 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
     def clock_offset_std(self) -> float | None: ...
 
 
-class RecordedJointsInterface(Protocol):
+class RecordedJointsInterface(_RecordedGroup, Protocol):
     """The interface of recorded joints, with names, times and channels. `data.recording.JointGroup` implements it."""
 
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def t(self) -> Array: ...
     @property
     def position(self) -> Array: ...
     @property

@@ -103,8 +103,7 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
         allowed, hint = "one of the two", f"set sensors.{arm[0]}.use: false, or leave the encoders out"
         raise ConfigError(what, where="sensors.joints.position.use", allowed=allowed, hint=hint)
     where = around.recording.name
-    later = joints.t > around.node_times[0] + 1e-9
-    later &= joints.t <= around.node_times[-1] + 1e-9
+    later = (joints.t > around.node_times[0] + 1e-9) & (joints.t <= around.node_times[-1] + 1e-9)
     value = joints.position[later][:, recorded_joint_column_indices(joints, names, where)]
     std = np.broadcast_to(joint_angle_noise_std(joints, names, choice, where), value.shape)
     return [SensorData(PositionSensor(names), joints.t[later], value, std)]

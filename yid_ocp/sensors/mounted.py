@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, TypeVar
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
@@ -27,7 +27,6 @@ _Kind = TypeVar("_Kind", bound="MountedSensor")
 class MountedSensor(base.Sensor):
     """The base class of sensors mounted on frames. Each sensor has three components along its frame's axes."""
 
-    naive_prediction: ClassVar = "stays"
     has_paper_weight = False
     point_names = ()
     names: tuple[str, ...]  # recorded names of the sensors
@@ -71,9 +70,8 @@ def _measured(
     frames = tuple(choice.frame_by_recorded_name.get(name, name) for name in names)
     for name, frame in zip(names, frames, strict=True):
         if not tree.has_frame(frame) or tree.frame(frame).joint_index < 0:
-            is_known = tree.has_frame(frame)
             moving = [known for known, entry in tree.frames.items() if entry.joint_index >= 0]
-            why = "does not move" if is_known else "does not exist"
+            why = "does not move" if tree.has_frame(frame) else "does not exist"
             what = f"sensor '{name}' is on the frame '{frame}', which {why}"
             hint = f"set sensors.{key}.frame_by_recorded_name: {{{name}: FRAME}}, or sensors.{key}.use: false"
             raise DataError(what, where=where, **(unknown_name_error_arguments(frame, moving) | {"hint": hint}))
@@ -92,8 +90,7 @@ def _measured(
         raise DataError(what, where=f"sensors.{key}.constants.sign", allowed="1 or -1")
     sensor = kind(names, tuple(signs.tolist()), frames, key)
     values = group.values_by_quantity[channel.quantity].reshape(len(group.t), -1)
-    steps = len(around.node_times) - 1
-    inner = (1, steps - 1)  # forces at both ends depend on the motion beyond the recording
+    inner = (1, len(around.node_times) - 2)  # forces at both ends depend on the motion beyond the recording
     if not around.system.prescribed:
         last = around.node_times[list(inner)]
         kept = (group.t >= last[0] - 1e-9) & (group.t <= last[1] + 1e-9)
@@ -130,10 +127,8 @@ def _with_encoder_noise(
     symbols = [ca.SX.sym(name, function.size1_in(name)) for name in ("q", "theta")]
     slopes = function(q=symbols[0], theta=symbols[1])
     gains = around.path_filter.noise_gains_of_value_and_rates(float(np.median(np.diff(joints.t))))
-    parts = []
-    for name, gain in zip(("by_q", "by_v", "by_a"), gains, strict=True):
-        if slopes[name].shape[1] == n:
-            parts.append(ca.densify(slopes[name][:, at]) @ ca.diag(ca.DM(angle * gain)))
+    pairs = ((slopes[name], gain) for name, gain in zip(("by_q", "by_v", "by_a"), gains, strict=True))
+    parts = [ca.densify(slope[:, at]) @ ca.diag(ca.DM(angle * gain)) for slope, gain in pairs if slope.shape[1] == n]
     errors = ca.Function("errors", symbols, [ca.horzcat(*parts)]).map(len(times))
     theta = np.repeat(system.parameters.vector()[:, None], len(times), axis=1)
     spread = np.array(errors(q.T, theta)).reshape(len(own), len(times), -1).transpose(1, 0, 2)
@@ -143,19 +138,15 @@ def _with_encoder_noise(
 
 
 _XYZ = ("x", "y", "z")
-_ANGULAR_VELOCITY = base.CHANNEL_KINDS.register("imu.angular_velocity")(
-    base.RecordedChannelSpec("imu", "angular_velocity", "rad/s", _XYZ)
-)
-_SPECIFIC_FORCE = base.CHANNEL_KINDS.register("imu.specific_force")(
-    base.RecordedChannelSpec("imu", "specific_force", "m/s^2", _XYZ)
-)
 
 
 @register_mounted_sensor
 class _Gyroscope(MountedSensor):
     """Angular velocity of a frame relative to the world."""
 
-    channel = _ANGULAR_VELOCITY
+    channel = base.CHANNEL_KINDS.register("imu.angular_velocity")(
+        base.RecordedChannelSpec("imu", "angular_velocity", "rad/s", _XYZ)
+    )
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         kinematics = state.kinematics
@@ -166,7 +157,9 @@ class _Gyroscope(MountedSensor):
 class _Accelerometer(MountedSensor):
     """Acceleration of a frame's origin minus gravity: 9.81 m/s^2 upwards at rest."""
 
-    channel = _SPECIFIC_FORCE
+    channel = base.CHANNEL_KINDS.register("imu.specific_force")(
+        base.RecordedChannelSpec("imu", "specific_force", "m/s^2", _XYZ)
+    )
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         kinematics = state.kinematics

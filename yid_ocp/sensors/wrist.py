@@ -21,8 +21,6 @@ from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelSpec
 from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
 _XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
-_FORCE = CHANNEL_KINDS.register("wrist.force")(RecordedChannelSpec("wrist", "force", "N", _XYZ, _SIGN))
-_TORQUE = CHANNEL_KINDS.register("wrist.torque")(RecordedChannelSpec("wrist", "torque", "N m", _XYZ, _SIGN))
 _N_LOCKED_JOINTS = 6
 
 
@@ -30,7 +28,7 @@ _N_LOCKED_JOINTS = 6
 class _WristForceSensor(MountedSensor):
     """Force on the sensor."""
 
-    channel = _FORCE
+    channel = CHANNEL_KINDS.register("wrist.force")(RecordedChannelSpec("wrist", "force", "N", _XYZ, _SIGN))
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[:3]
@@ -40,7 +38,7 @@ class _WristForceSensor(MountedSensor):
 class _WristTorqueSensor(MountedSensor):
     """Torque on the sensor about its frame's origin."""
 
-    channel = _TORQUE
+    channel = CHANNEL_KINDS.register("wrist.torque")(RecordedChannelSpec("wrist", "torque", "N m", _XYZ, _SIGN))
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[3:]

@@ -326,9 +326,8 @@ def _plain(content: Any, kind: str) -> SimpleNamespace:
         return joint_values_of_message(content, kind)
     frame = str(content.header.frame_id)
     if kind == JOINT_STATE_MESSAGE_TYPE:
-        names = [str(name) for name in content.name]
         values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
-        return SimpleNamespace(frame=frame, name=names, **values)
+        return SimpleNamespace(frame=frame, name=[str(name) for name in content.name], **values)
     if kind in _MOUNTED:
         return SimpleNamespace(frame=frame, **_vectors(content, kind))
     if kind == _POINT_STAMPED:
@@ -393,10 +392,9 @@ class _States(NamedTuple):
 
 
 def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
-    known, command = bag.file.topic_names_of_types(*_JOINT_TYPES), options.command_topic
-    topics = options.joint_topics
+    topics, command = options.joint_topics, options.command_topic
     default = [bag.topic_of_fields] if bag.topic_of_fields else _default_joint_topics(bag.file)
-    known = list(dict.fromkeys([*known, *default]))
+    known = list(dict.fromkeys([*bag.file.topic_names_of_types(*_JOINT_TYPES), *default]))
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_one_of(topic, known, "joint states")
     chosen = [topic for topic in (default if topics is None else topics) if topic != command]
@@ -455,12 +453,11 @@ def _on_one_clock(
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
     together, notes = base.joints_on_fastest_clock(made, where, "choose topics: --joint-topic TOPIC, once for each")
-    for entry in groups:
-        if entry.command:
-            group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
-            # each command is held until the next; before the first command, the first one is used
-            held = group.position[np.maximum(np.searchsorted(group.t, together.t + 1e-9, side="right") - 1, 0)]
-            together = replace(together, position_command=held)
+    for entry in (entry for entry in groups if entry.command):
+        group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
+        # each command is held until the next; before the first command, the first one is used
+        held = group.position[np.maximum(np.searchsorted(group.t, together.t + 1e-9, side="right") - 1, 0)]
+        together = replace(together, position_command=held)
     return together, notes
 
 

@@ -17,8 +17,6 @@ from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, 
 from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
 from yid_ocp.registry import Registry
 
-_RecordingReader = Callable[..., Recording]
-
 
 @dataclass(frozen=True)
 class TopicOrColumnSummary:
@@ -42,7 +40,7 @@ class FilePreview:
     notes: tuple[str, ...] = ()  # remarks for the user, such as guesses of units
 
 
-READERS: Registry[_RecordingReader] = Registry("recording format")
+READERS: Registry[Callable[..., Recording]] = Registry("recording format")
 """Readers by file suffix, or by a word for formats stored as a folder. Each takes a path, then named options."""
 
 FILE_PREVIEWERS: Registry[Callable[..., FilePreview]] = Registry("recording format with a preview")

@@ -172,10 +172,9 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
     if episode < 0 or (last >= 0 and episode > last):
         hint = "choose a recorded episode with --episode NUMBER"
         raise DataError(f"there is no episode {episode}", where=str(dataset.folder), allowed=allowed, hint=hint)
-    files = _files(dataset, episode)
     wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.info.features]
     columns = [*wanted, "frame_index", "episode_index"]
-    for file in files:
+    for file in _files(dataset, episode):
         try:
             held = parquet.ParquetFile(check_input_file(file))
             _check_size(held.metadata, columns, str(file))

@@ -15,9 +15,10 @@ bending rigidity of B means B/rho [N m^2 per kg/m].
 from __future__ import annotations
 
 import csv
+import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -194,9 +195,8 @@ def _with_vertices(
             frames[f"junction_{name}"] = frames[chain[0]]
     last = tree.joint_index(item.segment_layouts[0].link_joints[-1][-1])
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
-    parent = tree.link_chains[cable.parent_segment]
     edges = np.array([lengths[edge] for edge in pairwise(cable.main_branch_vertex_names)])
-    frames_along = (cable.main_branch_vertex_names[1], *parent.tip_frames)
+    frames_along = (cable.main_branch_vertex_names[1], *tree.link_chains[cable.parent_segment].tip_frames)
     whole = ArcLengthChain(frames_along, tuple(map(float, edges / edges.sum())))
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
@@ -220,9 +220,7 @@ def _segments(
     parent = cable.main_branch_vertex_names
     turns = flexible.edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
-    carried = [turns[0]]
-    for turn in turns[1:]:
-        carried.append(carried[-1] @ turn)
+    carried = list(accumulate(turns, operator.matmul))
     segments = []
     for name, chain in cable.vertex_names_by_branch.items():
         branch = options.branch_properties_by_name.get(name, options.default_branch)

@@ -69,6 +69,5 @@ model:
         return [replace(s, links=links, bend=s.bend * n, twist=s.twist * n, damping=damping) for s in foam_y_segments()]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        root = _FOOT_POSE if self.mount is None else None
         segments = self.segment_definitions(damping, link_division)
-        return flexible_object(segments, root, "y_object", self.gravity_fraction)
+        return flexible_object(segments, _FOOT_POSE if self.mount is None else None, "y_object", self.gravity_fraction)
