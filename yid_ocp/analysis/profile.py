@@ -12,20 +12,10 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, PartsDoneCounter, Progress
+from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
     residual_and_jacobian_without_weak_priors,
-)
-from yid_ocp.inference.uncertainty import (
-    CHI2_95_TWO_SIDED,
-    ConfidenceInterval,
-    ParameterEstimate,
-    apply_profile_interval,
-    cost_without_weak_priors,
-    needs_no_profile_likelihood,
-    parameter_unknown_names,
-    typical_parameter_magnitudes,
-    unknowns_covariance_and_reduced_chi2,
 )
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
@@ -40,7 +30,7 @@ _SMALL_VALUE_FRACTION = 0.3  # a value below this part of its typical size is sm
 _MAX_LOG_DISTANCE = math.log(1e3)  # range of a positive unknown beyond which its interval is open
 _LOG_PRIOR_STD = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
 _REFIT_CHI2_ATOL = 1e-3  # chi2 that a refit may leave on the table
-_TARGET_HEIGHT = math.sqrt(CHI2_95_TWO_SIDED)  # root of delta chi2 at the ends of an interval
+_TARGET_HEIGHT = math.sqrt(uncertainty.CHI2_95_TWO_SIDED)  # root of delta chi2 at the ends of an interval
 _ROOT_RTOL = 0.01  # relative tolerance on the root of delta chi2
 _MAX_REFIT_ITERATIONS, _MAX_REJECTED_STEPS, _MAX_PROFILE_POINTS = 30, 8, 12
 _MAX_AUTOMATIC_INTERVALS, _MAX_UNKNOWNS = 12, 300  # larger problems need an explicit request
@@ -63,7 +53,7 @@ class ParameterProfileLikelihood:
     notes: tuple[str, ...] = ()  # other reasons for an open end; a better fit found
 
     @property
-    def interval(self) -> ConfidenceInterval:
+    def interval(self) -> uncertainty.ConfidenceInterval:
         """The lower and upper end of the 95 % interval. None is an open end."""
         return self.lower, self.upper
 
@@ -86,7 +76,7 @@ def compute_profile_likelihood_interval(
     lower, upper = walk.end(-1, size), walk.end(1, size)
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
-    if walk.base < -0.1 * CHI2_95_TWO_SIDED:
+    if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
         walk.notes.append(f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one")
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
@@ -104,22 +94,22 @@ def solution_with_profile_intervals(
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
         return solution
-    sizes = typical_parameter_magnitudes(problem, solution.x)
+    sizes = uncertainty.typical_parameter_magnitudes(problem, solution.x)
     asked = {}
     for name, entry in solution.parameters.items():
         size = sizes.get(name.split("[")[0], math.nan)
         small = entry.value < _SMALL_VALUE_FRACTION * size
-        if entry.verdict in ("identifiable", "weak") and (small or not needs_no_profile_likelihood(entry)):
+        if entry.verdict in ("identifiable", "weak") and (small or not uncertainty.needs_no_profile_likelihood(entry)):
             asked[name] = size
     if not asked:
         return solution
 
-    def judged(name: str, best: Array, there: Evaluation) -> ParameterEstimate:
+    def judged(name: str, best: Array, there: Evaluation) -> uncertainty.ParameterEstimate:
         index, size = problem.unknown_names.index(name), asked[name]
         entry = mark_near_zero_estimate_unidentifiable(problem, best, index, solution.parameters[name], size, there)
-        if entry.verdict != "not_identifiable" and not needs_no_profile_likelihood(entry):
+        if entry.verdict != "not_identifiable" and not uncertainty.needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
-            entry = apply_profile_interval(entry, profile.interval, size)
+            entry = uncertainty.apply_profile_interval(entry, profile.interval, size)
         return entry
 
     # each parameter takes about one and a half times as long as the solution
@@ -148,8 +138,13 @@ def evaluate_for_each_parameter_at_optimum(
 
 
 def mark_near_zero_estimate_unidentifiable(
-    problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
-) -> ParameterEstimate:
+    problem: EstimationProblem,
+    x: Array,
+    index: int,
+    entry: uncertainty.ParameterEstimate,
+    size: float,
+    evaluation: Evaluation,
+) -> uncertainty.ParameterEstimate:
     """Mark a stiffness estimate near zero as `not_identifiable` if the data also allow a stiffness of typical size.
 
     An unobserved twist of a branch can move, and thus fit the noise, only if its stiffness is near zero. The cost
@@ -167,7 +162,7 @@ def mark_near_zero_estimate_unidentifiable(
 
 def is_small_enough_for_profiles(problem: EstimationProblem) -> bool:
     """Check whether a problem is small enough to compute profile-likelihood intervals by default."""
-    few = len(parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
+    few = len(uncertainty.parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
     return few and len(problem.unknown_names) <= _MAX_UNKNOWNS
 
 
@@ -196,8 +191,8 @@ class _Walk:
         self.others = np.setdiff1d(np.arange(len(x)), index)
         self.anchored = self.others[self.positive[self.others]]
         self.centre = np.where(self.positive, np.log(np.where(self.positive, x, 1.0)), x)
-        self.scale = max(1.0, unknowns_covariance_and_reduced_chi2(problem, best)[1])
-        self.first = cost_without_weak_priors(problem, best)
+        self.scale = max(1.0, uncertainty.unknowns_covariance_and_reduced_chi2(problem, best)[1])
+        self.first = uncertainty.cost_without_weak_priors(problem, best)
         self.base = 0.0
         self.notes: list[str] = []
         self.points = [_Point(float(x[index]), self.centre, 0.0, *self._rows(best, self.centre))]
@@ -327,7 +322,7 @@ class _Walk:
         evaluation = self.problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             return None
-        chi2 = 2.0 * (cost_without_weak_priors(self.problem, evaluation) - self.first) / self.scale
+        chi2 = 2.0 * (uncertainty.cost_without_weak_priors(self.problem, evaluation) - self.first) / self.scale
         return _Point(float(x[self.index]), s.copy(), chi2, *self._rows(evaluation, s))
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:

@@ -38,15 +38,7 @@ from yid_ocp.problem.recorded_inputs import (
 )
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
-from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_SENSOR_KEY,
-    JOINT_POSITION_GROUP_NAME,
-    PositionSensor,
-    is_noise_std_stated,
-    joint_angle_noise_std,
-    joint_torque_bias_std,
-    joint_torque_noise_std,
-)
+from yid_ocp.sensors import joints as joint_sensors
 
 
 @dataclass(frozen=True)
@@ -152,16 +144,19 @@ def _recorded_input_errors(
     joints, driven = recording.joints, system.driven
     if joints is None or joints.effort is None or not driven or system.servos:
         return None
-    effort = sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
-    position = sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
-    std = joint_torque_noise_std(joints, driven, effort, recording.name)
-    bias = joint_torque_bias_std(joints, driven, effort)
-    encoders = any(isinstance(entry.sensor, PositionSensor) for entry in samples)
+    effort = sensors.get(joint_sensors.JOINT_EFFORT_SENSOR_KEY, SensorOptions())
+    position = sensors.get(joint_sensors.JOINT_POSITION_GROUP_NAME, SensorOptions())
+    std = joint_sensors.joint_torque_noise_std(joints, driven, effort, recording.name)
+    bias = joint_sensors.joint_torque_bias_std(joints, driven, effort)
+    encoders = any(isinstance(entry.sensor, joint_sensors.PositionSensor) for entry in samples)
     if not encoders and not np.any(std > 0) and not np.any(bias > 0):
         return None
-    angle = joint_angle_noise_std(joints, driven, position, recording.name)
-    for group, choice, level in ((JOINT_EFFORT_SENSOR_KEY, effort, std), (JOINT_POSITION_GROUP_NAME, position, angle)):
-        if not is_noise_std_stated(joints, group, choice):
+    angle = joint_sensors.joint_angle_noise_std(joints, driven, position, recording.name)
+    for group, choice, level in (
+        (joint_sensors.JOINT_EFFORT_SENSOR_KEY, effort, std),
+        (joint_sensors.JOINT_POSITION_GROUP_NAME, position, angle),
+    ):
+        if not joint_sensors.is_noise_std_stated(joints, group, choice):
             words = "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest"
             log.warning(words + " changes", recording.name, group, level.min(), level.max(), CHANNEL_KINDS[group].unit)
     if encoders:
@@ -226,7 +221,7 @@ def prepare_episode(
     gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level.
     """
     step, system = functions.step, functions.step.system
-    efforts = options.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
+    efforts = options.sensors.get(joint_sensors.JOINT_EFFORT_SENSOR_KEY, SensorOptions())
     recording = recording.with_effort_sampling_kind(efforts.effort_sampling_kind)
     grid = rollout_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:

@@ -18,17 +18,8 @@ from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import FirstOrderLag
+from yid_ocp.sensors import joints as joint_sensors
 from yid_ocp.sensors.base import EffortSamplingKind, expand_to_joint_values
-from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_SENSOR_KEY,
-    JOINT_POSITION_GROUP_NAME,
-    PositionSensor,
-    PrescribedJointEffortSensor,
-    is_noise_std_stated,
-    joint_angle_noise_std,
-    joint_torque_bias_std,
-    joint_torque_noise_std,
-)
 
 
 def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGroup:
@@ -69,11 +60,10 @@ def naive_cable_predictions(
         "linear_carry": (ends, np.stack([np.interp(places, between, row) for row in np.eye(len(ends))], axis=1)),
     }
     found = {"stays": np.array(measured_point_positions(recording, points))}
-    found |= {name: found["stays"].copy() for name in shares}
-    for predicted in found.values():
-        predicted[_GIVEN_FRAMES:] = start
+    found["stays"][_GIVEN_FRAMES:] = start
     for name, (known, share) in shares.items():
         moved = measured_point_positions(recording, known) - _start_frame(recording, known)
+        found[name] = found["stays"].copy()
         found[name][_GIVEN_FRAMES:] += np.einsum("pk,mkx->mpx", share, moved)[_GIVEN_FRAMES:]
     return found
 
@@ -313,7 +303,7 @@ def _joint_readings(
         # the applied torque lags behind the recorded one
         rollout = replace(rollout, torque=FirstOrderLag(-lag[0], lag[1], h).lagged_node_values(rollout.torque, None)[0])
     values, found = predictor.rollout_node_values(rollout), []
-    for sensor in (PositionSensor(names), PrescribedJointEffortSensor(names)):
+    for sensor in (joint_sensors.PositionSensor(names), joint_sensors.PrescribedJointEffortSensor(names)):
         read = functions.compiled_sensor_function(sensor)(values, theta).output
         shift, _ = corrections.sensor_delays_with_derivatives(sensor, theta, ()) or (np.zeros(len(names)), None)
         found.append(np.stack([np.interp(times - s, times, x) for x, s in zip(read.T, shift, strict=True)], axis=1))
@@ -335,8 +325,8 @@ def _commanded(
     rows = np.clip(np.searchsorted(source.t, times + 1e-9) - 1, 0, len(source.t) - 1)
     between = np.stack([np.interp(times, source.t, column) for column in commands.T], axis=1)
     held = [predictor.system.servos[name].command_interpolation == "held" for name in names]
-    choice = predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
-    std = joint_angle_noise_std(source, names, choice, episode.name)
+    choice = predictor.options.sensors.get(joint_sensors.JOINT_POSITION_GROUP_NAME, SensorOptions())
+    std = joint_sensors.joint_angle_noise_std(source, names, choice, episode.name)
     noisy = _noisy(position, np.broadcast_to(std, position.shape), rng)
     given = np.where(held, commands[rows], between)
     off = np.stack([episode.torque[:, predictor.system.driven.index(name)] >= MOTOR_OFF_COMMAND / 2 for name in names])
@@ -353,20 +343,20 @@ def _levels(
     """Standard deviations (nj,) of angle, torque and torque offset assumed by the estimation; None if not stated."""
     joints, driven = episode.recording.joints, predictor.system.driven
     assert joints is not None
-    effort = predictor.options.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
-    position = predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
+    effort = predictor.options.sensors.get(joint_sensors.JOINT_EFFORT_SENSOR_KEY, SensorOptions())
+    position = predictor.options.sensors.get(joint_sensors.JOINT_POSITION_GROUP_NAME, SensorOptions())
     kinds = (
-        (JOINT_POSITION_GROUP_NAME, position, joint_angle_noise_std),
-        (JOINT_EFFORT_SENSOR_KEY, effort, joint_torque_noise_std),
+        (joint_sensors.JOINT_POSITION_GROUP_NAME, position, joint_sensors.joint_angle_noise_std),
+        (joint_sensors.JOINT_EFFORT_SENSOR_KEY, effort, joint_sensors.joint_torque_noise_std),
     )
     noisy, levels = () if episode.input_errors is None else driven, np.zeros((3, len(names)))
     at, found = [names.index(name) for name in noisy], list[Array | None]()
     for level, (group, choice, noise_std) in zip(levels[:2], kinds, strict=True):
-        stated = is_noise_std_stated(joints, group, choice)
+        stated = joint_sensors.is_noise_std_stated(joints, group, choice)
         if stated or noisy:  # of joints that drive the model it is estimated if it is not stated
             level[slice(None) if stated else at] = noise_std(joints, names if stated else noisy, choice, episode.name)
         found.append(level if stated or noisy else None)
-    levels[2, at] = joint_torque_bias_std(joints, noisy, effort)
+    levels[2, at] = joint_sensors.joint_torque_bias_std(joints, noisy, effort)
     return found[0], found[1], levels[2] if noisy else None
 
 

@@ -17,12 +17,7 @@ import threadpoolctl
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, YidError, import_optional
-from yid_ocp.inference.linearized_residual import (
-    is_stationary_point,
-    projected_gradient_norm,
-    size_limited_damped_step,
-    step_norm_in_stds,
-)
+from yid_ocp.inference import linearized_residual
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
@@ -155,8 +150,7 @@ class Solution(ReprMixin):
         if found.ok:
             return found.episode_predictions
         predict, pairs = problem.predictor.predict_episode, enumerate(problem.episodes)
-        parts = problem.unpack_episode_unknowns
-        return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
+        return tuple(predict(episode, *problem.unpack_episode_unknowns(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
         """The measured and predicted samples of all recorded channels at the estimate. Empty if not evaluated."""
@@ -277,7 +271,6 @@ _MAX_LINEARIZATIONS, _SHORT_STEP_STDS, _LAST_STEP_STDS, _LEAST_FACTOR, _MIN_STEP
 # Another start leads to the best fit's minimum if it comes this near [stds] without this gain of the cost and with less
 # than twice the rise of the linear model, and to a worse minimum above this multiple of the best fit's cost.
 _SAME_MINIMUM_STDS, _MIN_COST_GAIN_OF_START, _MAX_COST_RATIO_OF_START = 2.0, 0.005, 1.15
-_STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
 def solve(
@@ -409,7 +402,7 @@ class _MultiStartSearch:
 
         def watched(entry: Iterate) -> None:
             noted(entry)
-            distance = step_norm_in_stds(best.evaluation, entry.x - best.result.x)
+            distance = linearized_residual.step_norm_in_stds(best.evaluation, entry.x - best.result.x)
             gain = best.evaluation.cost - entry.cost
             if distance < _SAME_MINIMUM_STDS and -(distance**2) - least < gain < least:
                 reached.append(True)
@@ -443,10 +436,12 @@ class _MultiStartSearch:
             message += "; weighted without the constant errors that sensors and clocks may have"
         if not finish.ok:
             return Status.FAILED, finish.message
-        ended = result.stopped_at_noise_level or is_stationary_point(self._best.weighted, result.x, finish)
+        ended = result.stopped_at_noise_level or linearized_residual.is_stationary_point(
+            self._best.weighted, result.x, finish
+        )
         if status == Status.CONVERGED and not ended:
             stopped = f"the search stopped where a further step would lower the cost ({message})"
-            return Status.STALLED, f"{stopped}; {_STALLED_REMEDY}"
+            return Status.STALLED, f"{stopped}; start nearer, widen the bounds, or use gauss_newton"
         return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
 
 
@@ -541,10 +536,10 @@ class _RelinearizingSearch:
             if now.jacobian is None:
                 return ended(Status.FAILED, now.message)
             (lower, upper), size = problem.bounds, np.maximum(np.abs(x), problem.unknown_scales)
-            slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
+            slope = linearized_residual.projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
             recorder.record_iterate(now.cost, x, slope, f"weights {number + 2} of at most {_MAX_LINEARIZATIONS + 1}")
-            step = size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
-            length = step_norm_in_stds(now, step)
+            step = linearized_residual.size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
+            length = linearized_residual.step_norm_in_stds(now, step)
             if length < _LAST_STEP_STDS:
                 return ended(Status.CONVERGED, "a step is less than a hundredth of a standard deviation")
             least = np.where(problem.positive_unknowns_mask, np.maximum(lower, _LEAST_FACTOR * x), lower)
@@ -562,7 +557,7 @@ class _RelinearizingSearch:
             found = self.solver.minimize_cost(problem, x, callback)
             recorder.n_evaluations += found.n_evaluations
             recorder.history += found.history
-            length, moved = step_norm_in_stds(now, found.x - x), np.zeros(len(x))
+            length, moved = linearized_residual.step_norm_in_stds(now, found.x - x), np.zeros(len(x))
             x, self.evaluation = found.x, found.evaluation or now
         self.evaluation = self.weighted.evaluate(x, equilibrium_guesses=guesses)
         status = Status.CONVERGED if length < 10 * _LAST_STEP_STDS else Status.ITERATION_LIMIT
