@@ -475,7 +475,6 @@ def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, A
 
     points = _frame_positions(system, values, system.point_frames, np.zeros((1, system.n_coordinates)))[0]
     middle, held = points.mean(0), dict(zip(system.point_frames, points, strict=True))
-    away = np.array([middle[0], middle[1], 0.0])
-    forward = _FORWARD_GRIPPER_OFFSET * direction(away)
+    forward = _FORWARD_GRIPPER_OFFSET * direction(np.array([middle[0], middle[1], 0.0]))
     inward = {grasp.name: middle - held[grasp.held_frame] for grasp in system.grasps if grasp.held_frame in held}
     return {name: _INWARD_GRIPPER_OFFSET * direction(x) + forward for name, x in inward.items()}

@@ -416,8 +416,7 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
     """Change of the data for other parameter values, after elimination of nuisances [standard deviations]."""
     problem, x = view.problem, view.x.copy()
-    for name, value in changes.items():
-        x[problem.unknown_names.index(name)] = value
+    x[[problem.unknown_names.index(name) for name in changes]] = list(changes.values())
     evaluation = problem.evaluate(x, False, view.evaluation.equilibrium_guesses)
     if not evaluation.ok:
         return math.inf

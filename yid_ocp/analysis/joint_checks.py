@@ -134,8 +134,7 @@ class RecordedJointsModel:
 
     def _placed(self, known: ca.SX) -> ca.SX:
         full = ca.SX.zeros(self.system.n_coordinates)
-        for row, i in enumerate(self.system_configuration_indices):
-            full[i] = known[row]
+        full[list(self.system_configuration_indices)] = known
         return full
 
     def _numbers(self, expression: ca.SX) -> ca.SX:

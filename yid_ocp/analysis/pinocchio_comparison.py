@@ -118,8 +118,7 @@ def _link(joint: ElementTree.Element, end: str) -> str:
 
 def _place(configuration: Array, joint: Any, value: float) -> None:
     """Set a joint in Pinocchio's configuration, in which a continuous joint is a cosine and a sine."""
-    values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-    configuration[joint.idx_q : joint.idx_q + joint.nq] = values
+    configuration[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
 
 
 def _with_numeric_parameters(system: System, theta: Array) -> System:

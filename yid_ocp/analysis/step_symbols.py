@@ -19,10 +19,7 @@ _COMPARISON, _SUM, _PRODUCT, _POWER, _ATOM = range(5)
 _LEAF_OPERATIONS = (ca.OP_INPUT, ca.OP_CONST)
 
 # operation: template, binding strength, required strength of its operands
-_OperationTemplate = tuple[str, int, tuple[int, ...]]
-
-
-_TEXT_TEMPLATES: dict[int, _OperationTemplate] = {
+_TEXT_TEMPLATES: dict[int, tuple[str, int, tuple[int, ...]]] = {
     ca.OP_ADD: ("{0} + {1}", _SUM, (_SUM, _SUM)),
     ca.OP_SUB: ("{0} - {1}", _SUM, (_SUM, _PRODUCT)),
     ca.OP_NEG: ("-{0}", _SUM, (_PRODUCT,)),
@@ -255,9 +252,8 @@ class NamedStepEquations(ReprMixin):
     def row_or_column_block_slice(self, block: str) -> slice:
         """Return the index range of a named block among all rows or columns."""
         blocks = self.row_blocks if any(entry.name == block for entry in self.row_blocks) else self.column_blocks
-        names = [entry.name for entry in blocks]
         ends = list(itertools.accumulate((len(entry.labels) for entry in blocks), initial=0))
-        at = names.index(block)
+        at = [entry.name for entry in blocks].index(block)
         return slice(ends[at], ends[at + 1])
 
     def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:

@@ -99,8 +99,7 @@ class EpisodePredictor:
 
     def _with(self, theta: Array, values: Mapping[str, float]) -> Array:
         own = theta.copy()
-        for name, value in values.items():
-            own[self.system.parameters.index(name)] = value
+        own[[self.system.parameters.index(name) for name in values]] = list(values.values())
         return own
 
     def initial_state_and_derivative(
@@ -127,9 +126,8 @@ class EpisodePredictor:
         else:
             inputs = inputs or self.corrected_inputs(episode, theta, names)
             first = inputs.first_torque if self.system.driven else None
-            near = episode.equilibrium_guess if guess is None else guess
             known, statics = inputs.initial_known_coordinates, self.model_functions.equilibrium_solver
-            rest = statics.solve(known, theta, first, near, names)
+            rest = statics.solve(known, theta, first, episode.equilibrium_guess if guess is None else guess, names)
             if not rest.is_converged:
                 none = np.zeros((nx, len(names) + len(rows)))
                 return InitialStateWithSensitivity(rest.state, none, rest, f"{episode.name}: {rest.message}")
@@ -301,9 +299,8 @@ class EpisodePredictor:
                 by_correction[:, :, : len(wanted)] -= inputs.torque_sensitivity
         # the derivatives of the states are the largest arrays, and samples no longer need them
         rollout = replace(rollout, state_sensitivity=None, multipliers_sensitivity=None, effort_sensitivity=None)
-        slopes = tuple(sensitivities) if prepared.derivatives else None
         guess = None if start.equilibrium is None else start.equilibrium.state[: self.system.n_coordinates]
-        said = (rollout, start.equilibrium, tuple(predicted), slopes)
+        said = (rollout, start.equilibrium, tuple(predicted), tuple(sensitivities) if prepared.derivatives else None)
         return EpisodePrediction(*said, guess, correction, by_correction)
 
     def readings_and_sensitivities(
@@ -370,8 +367,7 @@ class EpisodePredictor:
         if late is not None:
             samples = samples.shifted_earlier_by_delays(late[0])
         slopes_of = (rollout.state_sensitivity, rollout.effort_sensitivity, by_applied, rollout.multipliers_sensitivity)
-        along = _Trajectory(self.rollout_node_values(rollout), *slopes_of)
-        y, total = self._read(samples, along, theta, wanted)
+        y, total = self._read(samples, _Trajectory(self.rollout_node_values(rollout), *slopes_of), theta, wanted)
         predicted, slopes = samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
         if late is not None and rollout.state_sensitivity is not None:
             slopes[:, :, : len(wanted)] -= samples.prediction_change_per_step(y, unmoved, late[0])[:, :, None] * late[1]

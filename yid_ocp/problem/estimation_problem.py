@@ -103,8 +103,7 @@ class EstimationProblem(ReprMixin):
     ) -> None:
         options = options or ProblemOptions()
         if not options.path_cutoff:
-            cutoff = select_path_cutoff([*recordings, *held_out], step.system.prescribed)
-            options = replace(options, path_cutoff=cutoff)
+            options = replace(options, path_cutoff=select_path_cutoff([*recordings, *held_out], step.system.prescribed))
         check_free_parameter_names(step.system, free, options)
         if not recordings:
             what, hint = "there is no recording to estimate on", "add one under recordings.estimate"
@@ -169,8 +168,7 @@ class EstimationProblem(ReprMixin):
         rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
         table = zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
         rows += [(name, *(f"{value:.4g}" for value in own)) for name, *own in table]
-        line = f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out"
-        return ReprTexts(line, rows)
+        return ReprTexts(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
 
     @property
     def initial_unknowns(self) -> Array:
@@ -391,8 +389,7 @@ class EstimationProblem(ReprMixin):
     def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
         """Return a problem with other fixed values and other initial values of free parameters. Filters are kept."""
         theta = self.theta.copy()
-        for name, value in values.items():
-            theta[self.system.parameters.index(name)] = value
+        theta[[self.system.parameters.index(name) for name in values]] = list(values.values())
         return self._changed(theta=theta)
 
     def with_model_functions(self, functions: ModelFunctions) -> EstimationProblem:

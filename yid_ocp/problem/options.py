@@ -18,7 +18,6 @@ from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeightingName
 from yid_ocp.sensors import SensorOptions as SensorOptions
 
-_InitialStateKind = Literal["equilibrium", "estimated", "fitted_to_points"]
 RefinementKind = Literal["links", "time_step"]
 
 
@@ -98,7 +97,7 @@ class ProblemOptions:
     """
 
     initial_state: Annotated[
-        _InitialStateKind,
+        Literal["equilibrium", "estimated", "fitted_to_points"],
         OptionInfo(
             "equilibrium at the first posture; estimated: the equilibrium plus a free offset with a prior; "
             "fitted_to_points: fitted to the first measured points"

@@ -251,11 +251,9 @@ def _filtered_both_ways(sections: Array, values: Array, pad: int) -> Array:
 
 @lru_cache(maxsize=16)
 def _rates(count: int, time_step: float) -> scipy.sparse.csr_array:
-    before, after = np.arange(count) - 1, np.arange(count) + 1
-    before, after = np.clip(before, 1, count - 1), np.clip(after, 1, count - 1)
+    before, after = (np.clip(np.arange(count) + shift, 1, count - 1) for shift in (-1, 1))
     width = np.maximum(after - before, 1) * time_step
     width[0] = np.inf
-    node = np.arange(count)
     entries = np.concatenate([-1 / width, 1 / width])
-    at = (np.tile(node, 2), np.concatenate([before, after]))
+    at = (np.tile(np.arange(count), 2), np.concatenate([before, after]))
     return scipy.sparse.coo_array((entries, at), shape=(count, count)).tocsr()

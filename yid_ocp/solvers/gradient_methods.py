@@ -284,8 +284,7 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                 trial = np.clip(x - length * gradient, lower, upper)
                 attempt = problem.evaluate(trial, False, evaluation.equilibrium_guesses)
                 recorder.n_evaluations += 1
-                needed = self.armijo_constant * float(gradient @ (x - trial))
-                if attempt.ok and attempt.cost <= reference - needed:
+                if attempt.ok and attempt.cost <= reference - self.armijo_constant * float(gradient @ (x - trial)):
                     break
                 length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:

@@ -199,11 +199,10 @@ def _driven_stage(
         torque -= ca.mtimes(matrix, before[index] - reference)
         by_before[:, index] = -matrix
     symbols = [stage.x0, stage.x1, stage.lam, stage.u, stage.theta]
-    values = (stage.residual, stage.prescribed_effort)
     by_free = stage.residual_and_effort_jacobians_by_parameters(freed.names)
     slopes = (stage.residual_jacobians, stage.effort_jacobians)
     made = []
-    for value, own, by in zip(values, by_free, slopes, strict=True):
+    for value, own, by in zip((stage.residual, stage.prescribed_effort), by_free, slopes, strict=True):
         parts = [value, own, *(by[name] for name in ("x0", "x1", "lam", "u"))]
         value, own, first, second, pull, by_u = ca.substitute(parts, symbols, [before, after, lam, torque, freed.theta])
         driven = ca.mtimes(by_u, by_before), ca.mtimes(by_u, by_errors)
@@ -286,8 +285,7 @@ class _Maker:
         table = np.zeros((3, len(state), nx + m))
         table[0, :, :nx], table[0, :-1, nx:] = state, pull
         table[1], table[2] = -np.inf, np.inf
-        for column, joint in enumerate(system.prescribed_coordinate_indices):
-            table[:, :, joint] = episode.prescribed_path[:, column]
+        table[:, :, list(system.prescribed_coordinate_indices)] = episode.prescribed_path
         # the last node has no multipliers
         at = self._w.append_values(*(part.ravel()[: part.size - m] for part in table))
         index = np.append(at, np.zeros(m, np.int64)).reshape(len(state), nx + m)
