@@ -42,7 +42,6 @@ _Vector4 = tuple[float, float, float, float]
 _FilePath = Annotated[str, OptionInfo("a file, relative to the configuration", is_path=True)]
 _Recording = Annotated[str, OptionInfo("a recording, relative to the configuration, or default:NAME.h5", is_path=True)]
 _Recordings = tuple[_Recording, ...]
-_ArmMode = Literal["driven", "prescribed", "servo", "passive"]
 _GraspKind = Literal["point", "axis", "weld"]
 
 
@@ -100,7 +99,7 @@ class _JointActuationSettings:
 
     joints: Annotated[_Names | None, OptionInfo("moving joints, in order; default: all movable")] = None
     mode: Annotated[
-        _ArmMode,
+        Literal["driven", "prescribed", "servo", "passive"],
         OptionInfo(
             "driven: measured efforts move the joints; prescribed: they move as measured; servo: position servos "
             "follow recorded commands; passive: no drive. A prescribed arm with a grasp and recorded efforts is "

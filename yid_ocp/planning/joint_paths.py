@@ -25,7 +25,6 @@ from yid_ocp.parallel import CASADI_LOCK
 
 _Value = TypeVar("_Value")
 _Vector3 = tuple[float, float, float]
-_PlanGoal = Literal["place", "path", "box", "information"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +44,7 @@ class PlanOptions:
     """The goal, duration and numerical settings of a planned motion of the arms."""
 
     goal: Annotated[
-        _PlanGoal,
+        Literal["place", "path", "box", "information"],
         OptionInfo(
             "place: bring a point to a target; path: along a path; box: with points kept inside a box; information: "
             "the most informative recordings"

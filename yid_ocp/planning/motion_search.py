@@ -254,10 +254,9 @@ class MotionToTargetSearch:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
         residual, by_x, limited, limits_by_x = self._residual_and_limit_values(x)
         root = np.sqrt(penalty)
-        sides = ((1.0, limited - self._upper, pull[0]), (-1.0, self._lower - limited, pull[1]))
         # cost plus one: the search ends if the cost falls by little compared with a reached target
         values, slopes = [np.ones(1), residual], [np.zeros((1, len(x))), by_x]
-        for sign, over, raised in sides:
+        for sign, over, raised in ((1.0, limited - self._upper, pull[0]), (-1.0, self._lower - limited, pull[1])):
             shifted = np.maximum(over + raised / penalty, 0.0)
             values.append(root * shifted)
             slopes.append(sign * root * np.where(shifted > 0, 1.0, 0.0)[:, None] * limits_by_x)
@@ -438,9 +437,8 @@ class InformativeMotionSearch:
         for _ in range(1 + _MAX_LIMIT_CORRECTIONS):
             high, low = self._high - _LIMIT_SLACK - value - shift, value + shift - self._low - _LIMIT_SLACK
             near_high, near_low = np.flatnonzero(reach > high), np.flatnonzero(reach > low)
-            normal = np.vstack([-slope[near_high], slope[near_low]])
             room = np.maximum(np.concatenate([high[near_high], low[near_low]]), 0.0)
-            step = self._inner(rows, slopes, w, normal, room, radius)
+            step = self._inner(rows, slopes, w, np.vstack([-slope[near_high], slope[near_low]]), room, radius)
             there = w + step.reshape(w.shape)
             true, is_within = self._limited_values(there)
             if is_within:

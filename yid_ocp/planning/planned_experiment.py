@@ -148,10 +148,8 @@ class SplineMotionExperiment:
     def _options(self, **changes: object) -> ProblemOptions:
         """The problem's options for the planned recording alone, which holds the noise of its points."""
         options, base = self.configured_problem.options, self.configured_problem.episodes[0]
-        own = dict(options.sensors)
-        for name in (samples.sensor.group_name for samples, _ in self._points):
-            if name in own:
-                own[name] = replace(own[name], std=None)
+        seen = {samples.sensor.group_name for samples, _ in self._points}
+        own = {name: replace(said, std=None) if name in seen else said for name, said in options.sensors.items()}
         given = options.parameters_by_recording
         named = {_PLANNED_RECORDING_NAME: dict(given[base.name])} if base.name in given else {}
         same = {"sensors": own, "duration": None, "known_initial_states": {}, "parameters_by_recording": named}
@@ -255,9 +253,7 @@ class SplineMotionExperiment:
             return None
         jacobian = self._relative(moved, evaluation)
         offsets = self._offsets
-        whole = np.zeros((len(offsets), jacobian.shape[1] + offsets.shape[1]))
-        whole[: len(jacobian), : jacobian.shape[1]] = jacobian
-        whole[:, jacobian.shape[1] :] = offsets
+        whole = np.hstack([np.pad(jacobian, ((0, len(offsets) - len(jacobian)), (0, 0))), offsets])
         vectors, taken = self._blur
         data = len(vectors)
         whole[:data] -= vectors @ (taken[:, None] * (vectors.T @ whole[:data]))

@@ -512,8 +512,7 @@ def run_experiment_with_effects(
     for effect in (*effects, *(ordinary_friction or ())):
         if effect.kind not in known:
             what = f"the effect {effect.kind} cannot be simulated in MuJoCo"
-            details = unknown_name_error_arguments(effect.kind, known)
-            raise ConfigError(what, where=effect.label, **details)
+            raise ConfigError(what, where=effect.label, **unknown_name_error_arguments(effect.kind, known))
     described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in _DESCRIPTION_KINDS]
     changed = system.with_effects(described) if described else system
     # a servo acts on its encoder reading: gears with play are part of the mechanics

@@ -338,8 +338,7 @@ class _Calibrator:
         few = []
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
-            drawn = self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)
-            few.append(StampedCloud(stamp, drawn))
+            few.append(StampedCloud(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)))
         tried = candidate_calibration_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")

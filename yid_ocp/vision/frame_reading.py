@@ -224,12 +224,11 @@ def read_frames(
     time stamps, pose or intrinsics.
     """
     place = Path(path)
-    ending = place.suffix.lower()
     if place.is_dir():
         files = () if (place / STAMP_FILE).exists() else place.iterdir()
         if not any(file.name == "metadata.yaml" or file.suffix in _BAG_SUFFIXES for file in files):
             return read_frame_folder(place, pose=pose, unit=unit)
-    if place.is_dir() or (place.is_file() and ending in _BAG_SUFFIXES):
+    if place.is_dir() or (place.is_file() and place.suffix.lower() in _BAG_SUFFIXES):
         return _read_bag_frames(place, pose, unit or "m", topic)
     if place.exists():
         allowed = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})"

@@ -28,8 +28,6 @@ from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import UrdfMeshKind
 from yid_ocp.vision.track_result import FrameReport
 
-_RootPlacement = Literal["model", "fixed", "free"]
-
 
 @dataclass(frozen=True)
 class TrackOptions:
@@ -82,7 +80,7 @@ class TrackOptions:
         OptionInfo("points to record; default: those that no arm holds, because arms measure held points better"),
     ] = None
     root_placement: Annotated[
-        _RootPlacement,
+        Literal["model", "fixed", "free"],
         OptionInfo(
             "position of the object's root: model: from the model; fixed: one position found from the frames; free: "
             "any position in every frame, as for a rope in a hand or on a table"

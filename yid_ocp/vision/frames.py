@@ -193,8 +193,7 @@ class FrameSequence:
         """Make a frame sequence from clouds (N, 3) [m] in the camera's frame, with stamps `t` (M,) [s]."""
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
-        camera = validated_camera_pose(pose, "sequence")
-        return FrameSequence(np.asarray(t, float), names, camera, arrays.__getitem__)
+        return FrameSequence(np.asarray(t, float), names, validated_camera_pose(pose, "sequence"), arrays.__getitem__)
 
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
@@ -290,8 +289,7 @@ class OcclusionMap:
                 for end, value in enumerate((low[axis], high[axis])):
                     strip = np.abs(seen[axis] - value) <= _EDGE_STRIP_WIDTH * (high[axis] - low[axis])
                     along = (seen[other, strip] - low[other]) / max(high[other] - low[other], 1e-12)
-                    piece = np.floor(along * _EDGE_STRIP_PIECES)
-                    pieces = np.unique(np.minimum(piece, _EDGE_STRIP_PIECES - 1))
+                    pieces = np.unique(np.minimum(np.floor(along * _EDGE_STRIP_PIECES), _EDGE_STRIP_PIECES - 1))
                     if len(pieces) / _EDGE_STRIP_PIECES > _DECIDING_FRACTION:
                         borders[end, axis] = value
         return borders

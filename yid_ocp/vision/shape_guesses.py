@@ -58,8 +58,7 @@ class _Centerline:
         """Unit vector (3,) along the object at one of its ends, away from it."""
         far, _ = self.path_lengths_from(end)
         most = max(_END_DIRECTION_SLICES * self.slice_width, float(far[far > 0].min()))
-        near = np.flatnonzero((far > 0) & (far <= most))
-        way = self.nodes[end] - self.nodes[near].mean(axis=0)
+        way = self.nodes[end] - self.nodes[(far > 0) & (far <= most)].mean(axis=0)
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 
     def path_lengths_from(self, start: int) -> tuple[Array, IntArray]:
@@ -340,8 +339,7 @@ class _Course:
     """A path through a cloud as a polyline, parameterised by length and scaled to the object's length."""
 
     def __init__(self, nodes: Array, length: float) -> None:
-        steps = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
-        along = np.concatenate([[0.0], np.cumsum(steps)])
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
         self.nodes, self.along = nodes, along * (length / max(float(along[-1]), 1e-9))
 
     def at(self, length: float) -> Array:

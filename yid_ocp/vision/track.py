@@ -275,8 +275,7 @@ class FrameTracker:
             colours = self.sequence.load_colours(index)
             if colours is None:
                 raise DataError("the cloud has no colours")
-            wanted = filters.object_colours
-            inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], wanted)
+            inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], filters.object_colours)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
