@@ -65,14 +65,13 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
         shifted = [_with_times_shifted(recording, -begin) for recording in shifted]
         notes.append(f"times count from the first sample, at {begin:.9g} s")
     joints, more = _merged_joints([(r.name, r.joints) for r in shifted if r.joints is not None], where)
-    own = [note for recording in recordings for note in recording.notes]
     merged = Recording(
         joints,
         _with_unique_names(shifted, [r.points for r in shifted]),
         next((r.description for r in recordings if r.description), ""),
         "; ".join(r.source for r in recordings if r.source),
         recordings[0].name,
-        notes=(*own, *notes, *more),
+        notes=(*(note for recording in recordings for note in recording.notes), *notes, *more),
         channel_groups=_with_unique_names(shifted, [r.channel_groups for r in shifted]),
     )
     return validated_recording(merged, where=where)
@@ -190,13 +189,11 @@ def _speed(t: Array, values: Array, period: float) -> tuple[Array, float]:
 
 
 def _with_times_shifted(recording: Recording, shift: float) -> Recording:
-    def moved(group: Any) -> Any:
-        return replace(group, t=group.t + shift)
-
     if not shift:
         return recording
-    joints = None if recording.joints is None else moved(recording.joints)
-    points, channels = (tuple(map(moved, groups)) for groups in (recording.points, recording.channel_groups))
+    joints = recording.joints and replace(recording.joints, t=recording.joints.t + shift)
+    points = tuple(replace(group, t=group.t + shift) for group in recording.points)
+    channels = tuple(replace(group, t=group.t + shift) for group in recording.channel_groups)
     return replace(recording, joints=joints, points=points, channel_groups=channels)
 
 

@@ -98,8 +98,7 @@ def _write_group(
         if content.get(name) is not None:
             target.create_dataset(name, data=content[name]).attrs["unit"] = unit
     for name in attributes:
-        if content[name] is not None:
-            own = content[name]
+        if (own := content[name]) is not None:
             target.attrs[name] = np.array(own, dtype=h5py.string_dtype()) if name == "names" else own
 
 

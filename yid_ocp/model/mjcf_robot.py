@@ -32,7 +32,7 @@ def mjcf_robot_description(file: Path) -> SimpleNamespace:
     to another body is fixed to that body. Raises `ModelError` if `mujoco` is not installed, if it cannot compile the
     file, or if the file has a free or ball joint.
     """
-    model = _compiled_file(file)
+    model = _compiled(file, file.stat().st_mtime_ns)
     links = [SimpleNamespace(name=_WORLD, inertial=None)]
     joints: list[SimpleNamespace] = []
     follows, welds = _followed_joints(model), _welded_free_bodies(model)
@@ -57,7 +57,7 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     """
     if file.suffix.lower() == ".urdf" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}
-    model = _compiled_file(file)
+    model = _compiled(file, file.stat().st_mtime_ns)
     found: dict[str, dict[str, float]] = {_joint_name(model, j): {} for j in range(model.njnt)}
     for j in range(model.njnt):
         dof, own = int(model.jnt_dofadr[j]), found[_joint_name(model, j)]
@@ -82,10 +82,6 @@ def _is_position_actuator(model: Any, i: int) -> bool:
 def _is_motor(model: Any, i: int) -> bool:
     constant = int(model.actuator_gaintype[i]) == int(model.actuator_biastype[i]) == int(model.actuator_dyntype[i]) == 0
     return constant and int(model.actuator_trntype[i]) == 0
-
-
-def _compiled_file(file: Path) -> Any:
-    return _compiled(file, file.stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=4)

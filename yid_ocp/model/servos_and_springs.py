@@ -252,10 +252,9 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
     limit = joint.effort_limit if known else UNLIMITED_EFFORT_THRESHOLD
     gain = limit / _DEFAULT_FULL_TORQUE_ERROR if known else _DEFAULT_GAIN
     torque, per = ("N m", "N m/rad") if joint.coordinate_unit == "rad" else ("N", "N/m")
-    rate = per.replace("/", " s/")
     rows: tuple[tuple[str, float, str, float, float, str], ...] = (
         ("gain", gain, per, 0.0, math.inf, "torque per error of the angle"),
-        ("damping", _DEFAULT_DAMPING_TIME * gain, rate, 0.0, math.inf, "torque against the rate"),
+        ("damping", _DEFAULT_DAMPING_TIME * gain, per.replace("/", " s/"), 0.0, math.inf, "torque against the rate"),
         ("delay", 0.0, "s", 0.0, _MAX_COMMAND_DELAY, "from a command to its torque"),
         ("torque_limit", limit, torque, 1e-3, math.inf, "largest torque"),
     )

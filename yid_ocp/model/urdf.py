@@ -390,7 +390,10 @@ def _walk(
                 joints[joint.name] = (carrier, at @ joint.origin, joint)
                 stack.append((joint.child, joint.name, np.eye(4), ""))
             else:
-                stack.append((joint.child, carrier, at @ joint.origin @ _locked_motion(joint, locked), link))
+                motion = np.eye(4)
+                if joint.type != "fixed":
+                    motion = joint_motion_pose(_unit_axis(joint), _locked_value(joint, locked), joint.type)
+                stack.append((joint.child, carrier, at @ joint.origin @ motion, link))
     loose = sorted(set(links) - set(frames) - dropped)
     if loose:
         what = f"link '{loose[0]}' is not connected to the root link '{root}'"
@@ -410,12 +413,6 @@ def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia
     kind: Literal["revolute", "prismatic"] = "prismatic" if source.type == "prismatic" else "revolute"
     efforts = bound("effort", math.inf), bound("velocity", math.inf)
     return Joint(source.name, kind, parent, placement, (x, y, z), bodies, *limits, *efforts)
-
-
-def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Array:
-    if joint.type == "fixed":
-        return np.eye(4)
-    return joint_motion_pose(_unit_axis(joint), _locked_value(joint, locked), joint.type)
 
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:

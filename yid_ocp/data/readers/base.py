@@ -164,8 +164,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
 
 
 def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:
-    known = [name for group in groups for name in group.names]
-    require_known_names(chosen, known, "point", where, DataError)
+    require_known_names(chosen, [name for group in groups for name in group.names], "point", where, DataError)
     check_unique_point_names(chosen, where)
     kept = []
     for group in groups:
