@@ -105,8 +105,7 @@ def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: mjcf.JointD
 
 def _sdf_pose(element: Element, placement: Placement, attributes: Mapping[str, str] | None = None) -> None:
     turn, at = np.array(ca.DM(placement.rotation)), np.array(ca.DM(placement.translation)).ravel()
-    text = mjcf.format_xml_numbers([*at, *rpy_from_rotation(turn)])
-    SubElement(element, "pose", dict(attributes or {})).text = text
+    SubElement(element, "pose", dict(attributes or {})).text = mjcf.format_xml_numbers([*at, *rpy_from_rotation(turn)])
 
 
 def _add_numbers(element: Element, values: Mapping[str, float]) -> None:

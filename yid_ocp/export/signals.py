@@ -166,5 +166,4 @@ def joint_trajectory_message(
         since = {"sec": second, "nanosec": min(round(1e9 * (time - second)), 999_999_999)}
         rows = {"positions": position, "velocities": velocity, "accelerations": acceleration, "effort": effort}
         points.append({**{key: values[i].tolist() for key, values in rows.items()}, "time_from_start": since})
-    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    return {"header": header, "joint_names": list(names), "points": points}
+    return {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}, "joint_names": list(names), "points": points}

@@ -103,8 +103,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
 
     A sentence is given if the model does not explain the fitted data, or noise the prediction error.
     """
-    groups = dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"])
-    for group in groups:
+    for group in dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"]):
         channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]
         unit = result["residuals"][channels[0]]["unit"]
         fitted = _rms([result["residuals"][c]["rmse"] for c in channels])
@@ -214,9 +213,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         spread = (_relative(entry[key]) for key in ("std_relative", "std_relative_unknown", "std_alone"))
         relative = entry["std_relative"]
         interval = _interval_cell(entry, None if relative is None else relative * abs(entry["value"]))
-        verdict = VERDICT_TABLE_TEXTS[entry["verdict"]]
         value = "–" if entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}"
-        rows.append((name, value, *spread, interval, entry["unit"], verdict))
+        rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
@@ -254,9 +252,8 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
-        sizes = (f"{entry[key]:.3g}" for key in keys)
         note = ("warranted" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
-        rows.append((law, *sizes, unit, note))
+        rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     fitted = result["laws"][best]["parameters"].items()
     own = [(name, value_and_uncertainty_text(e["value"], e["std"], None), e["unit"]) for name, e in fitted]

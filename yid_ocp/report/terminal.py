@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from yid_ocp.data.readers import FilePreview
 
 TableRows = list[Sequence[str]]
-_StatementKind = Literal["note", "verdict", "conclusion"]
 _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings side by side
 _MAX_NUMBERS_BEYOND_MODEL = 6  # numbers that a sentence lists; the table has all
@@ -40,7 +39,7 @@ class SummaryStatement:
     """
 
     text: str
-    kind: _StatementKind = "note"
+    kind: Literal["note", "verdict", "conclusion"] = "note"
 
 
 @dataclass(frozen=True)

@@ -138,9 +138,8 @@ def rescore_blind(
     """
     made, target = Path(folder), make_folder(out)
     commitment = read_input_json(made / "commitment.json")
-    labels = {}
-    for label in blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"]):
-        labels[label.case] = label
+    opened = blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"])
+    labels = {label.case: label for label in opened}
     wanted = load_config(None, overrides, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
     names = [text.partition("=")[0].removeprefix("diagnosis.") for text in overrides]
     changes = {name: getattr(wanted, name) for name in names if hasattr(wanted, name)}

@@ -119,8 +119,7 @@ def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel 
     if run.model.object is None or run.model.object.uniform_or_total_link_count is None:
         return None
 
-    names = system.parameters.names
-    factors = {name: float(build.divided_joint_parameter_scale(run, name, 2)) for name in names}
+    factors = {name: float(build.divided_joint_parameter_scale(run, name, 2)) for name in system.parameters.names}
     return DividedLinksModel(partial(_divided_links_step, run), factors)
 
 
@@ -166,9 +165,8 @@ def build_problem(
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
     _check_sensors(run, [*estimate, *held_out])
     estimate, held_out, issues = _check_recordings(run, system, free, estimate, held_out)
-    options = problem_options(run, system, [*estimate, *held_out, *reference_recordings])
+    said = replace(problem_options(run, system, [*estimate, *held_out, *reference_recordings]), data_issues=issues)
     step = build_step(run, system) if step is None else step
-    said = replace(options, data_issues=issues)
     problem = EstimationProblem(step, estimate, free, said, None, held_out)
     if run.problem.time_step == "auto":
         step = step_with_time_step(step, longest_accurate_time_step(problem))

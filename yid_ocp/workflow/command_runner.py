@@ -259,8 +259,7 @@ def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]
             def get_renderables(self) -> Iterator[RenderableType]:
                 yield from (*map(Text, table), *super().get_renderables())
 
-        columns = (BarColumn(_BAR_WIDTH), TimesAndStage())
-        with BarsBelowTable(*columns, console=console, transient=True) as bars:
+        with BarsBelowTable(BarColumn(_BAR_WIDTH), TimesAndStage(), console=console, transient=True) as bars:
             progress = _BarProgress(bars, left, table, arguments.verbose)
             yield progress
             progress.finish_stage()

@@ -348,8 +348,7 @@ def _places(
                 seen = group.t, group.position[:, i], math.nan if parts is None else float(parts[i])
                 frame, reason = _near(tree, recording, *seen, branches, holder)
                 if frame and len(branches) == 1:
-                    part_std = _ROUNDED_PLACE_STD if parts is None else _PLACE_STD
-                    std = part_std * branches[0].length
+                    std = (_ROUNDED_PLACE_STD if parts is None else _PLACE_STD) * branches[0].length
             placed.append(_PointPlacement(point, frame, reason, std))
         found[name] = tuple(placed)
     return found
@@ -476,19 +475,19 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
     for channel, unit, least in (("position", "rad", 1e-6), ("effort", "N m", 1e-3)):
         values = recorded.values_by_channel.get(channel)
         if values is not None:
-            noise = _GroupNoise(None, unit, _STATED_NOISE)
-            if not is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions()):
-                sizes = [seen_noise_std(recorded.t, values[:, j]) for j in at]
-                noise = _GroupNoise(max(least, *sizes), unit, _SEEN_NOISE)
-            found[f"joints.{channel}"] = noise
+            is_stated = is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions())
+            found[f"joints.{channel}"] = _channel_noise(recorded.t, values[:, at], least, unit, is_stated)
     for key, group, kind in _mounted_channels(recording):
-        noise = _GroupNoise(None, kind.unit, _STATED_NOISE)
-        if kind.std_attribute_names[0] not in group.noise_and_bias_stds_by_attribute:
-            values = group.values_by_quantity[kind.quantity]
-            sizes = [seen_noise_std(group.t, column) for column in values.reshape(len(values), -1).T]
-            noise = _GroupNoise(max(1e-3, *sizes), kind.unit, _SEEN_NOISE)
-        found[key] = noise
+        values, stated = group.values_by_quantity[kind.quantity], group.noise_and_bias_stds_by_attribute
+        columns = values.reshape(len(values), -1)
+        found[key] = _channel_noise(group.t, columns, 1e-3, kind.unit, kind.std_attribute_names[0] in stated)
     return found | {group.name: _point_noise(group) for group in recording.points}
+
+
+def _channel_noise(t: Array, values: Array, least: float, unit: str, is_stated: bool) -> _GroupNoise:
+    if is_stated:
+        return _GroupNoise(None, unit, _STATED_NOISE)
+    return _GroupNoise(max(least, *(seen_noise_std(t, column) for column in values.T)), unit, _SEEN_NOISE)
 
 
 def _point_noise(group: PointGroup) -> _GroupNoise:

@@ -101,8 +101,7 @@ def run_diagnose(
             files.write_text(folder.path / "law.csv", torque_law_tables_csv(finding.law.tables))
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
-        follows_points = bool(last.problem.options.clamp_pose_point_names)
-        moving = not follows_points and bool(system.driven or system.prescribed)
+        moving = not last.problem.options.clamp_pose_point_names and bool(system.driven or system.prescribed)
         x = last.problem.unknown_vector(last.values)
         recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
         own = {
@@ -204,14 +203,13 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     compared = any(s.sensor.effort_joints or s.noise_correlation is not None for s in samples_of_all)
     if (compared and noisy) or (encoders is not None and encoders.std is not None):
         levels.add((JOINT_POSITION_GROUP_NAME, "std"))  # encoder noise is part of the effort noise
-    for errors in (episode.input_errors for episode in problem.episodes):
-        if errors is not None:
-            given = {
-                (JOINT_EFFORT_SENSOR_KEY, "std"): errors.torque_std,
-                (JOINT_EFFORT_SENSOR_KEY, "bias_std"): errors.torque_bias_std,
-                (JOINT_POSITION_GROUP_NAME, "std"): errors.angle_std,
-            }
-            levels |= {level for level, std in given.items() if np.any(std > 0)}
+    for errors in (episode.input_errors for episode in problem.episodes if episode.input_errors is not None):
+        given = {
+            (JOINT_EFFORT_SENSOR_KEY, "std"): errors.torque_std,
+            (JOINT_EFFORT_SENSOR_KEY, "bias_std"): errors.torque_bias_std,
+            (JOINT_POSITION_GROUP_NAME, "std"): errors.angle_std,
+        }
+        levels |= {level for level, std in given.items() if np.any(std > 0)}
     return levels
 
 

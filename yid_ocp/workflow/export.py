@@ -215,10 +215,8 @@ def _refuse_losses(
 ) -> None:
     """Refuse a file that lacks effects, estimates or grasps of the model, unless losses are accepted."""
     lost = [label for label, entry in effects.items() if entry.loses_motion_or_force]
-    for name, entry in parameters.items():
-        is_own = name.rpartition(".")[0] not in effects
-        is_lost = entry["estimated"] and is_own and entry["status"] == "not representable"
-        lost += [name] if is_lost else []
+    absent = [name for name, own in parameters.items() if own["estimated"] and own["status"] == "not representable"]
+    lost += [name for name in absent if name.rpartition(".")[0] not in effects]
     lost += [f"grasp {name}" for name in grasps]
     if lost and not is_lossy:
         what = f"{form.upper()} cannot hold {', '.join(lost)}"
@@ -366,9 +364,7 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
                 values = np.array(group[key])
                 told = _texts(group.attrs[names])
                 yield RosTopicTimeSeries(f"/predicted/{topic}", "joints", t[: len(values)], {quantity: values}, told)
-    for sensor in group.values():
-        if not isinstance(sensor, h5py.Group):
-            continue
+    for sensor in (entry for entry in group.values() if isinstance(entry, h5py.Group)):
         measured = np.array(sensor["measured"])
         yield from _of_sensor(sensor, "measured", measured)
         for key, words in predictions.items():

@@ -59,7 +59,6 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         settings, problem, solution = solved[best.law]
         names = friction_parameter_names(settings, problem.system.parameters)
         clouds = friction_law_comparison.measured_and_predicted_friction_torques(problem, solution, names)
-        more = {"friction_clouds": clouds}
         result: dict[str, Any] = {
             "format": "yid-friction/1",
             "kinds": {kind: list(own) for kind, own in kinds.items()},
@@ -69,7 +68,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             "warranted": best.law,
         }
         folder.log_event("end", warranted=best.law)
-        known = {"problem": problem, "solution": solution, "section_data": more}
+        known = {"problem": problem, "solution": solution, "section_data": {"friction_clouds": clouds}}
         written = folder.write_result_and_report(run, progress, result, **known)
     return CommandOutcome(folder.path, written, None, best.is_converged)
 

@@ -122,9 +122,8 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
     except DataError as error:
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
-    doubts = recording_issue_lines(recording)
     what = "it" if len(files) == 1 else "them as one recording"
-    return [*doubts, "", f"to import {what}:", f"  {_import_command_line(files, options)}"]
+    return [*recording_issue_lines(recording), "", f"to import {what}:", f"  {_import_command_line(files, options)}"]
 
 
 def recording_issue_lines(recording: Recording) -> list[str]:

@@ -60,8 +60,7 @@ def _run_inspect(
         seconds = time.perf_counter() - begun
         symbols, parameters = NamedStepEquations.from_equations(step.equations), step.system.parameters
         # check names before anything slow; parameter names have no brackets
-        asked = [text.strip() for text in entries]
-        named = [text for text in asked if text and not set(text) & set("[,")]
+        named = [text for text in map(str.strip, entries) if text and not set(text) & set("[,")]
         for name in named:
             parameters.index(name)
         chosen = [symbols.equation_or_derivative(text) for text in entries if text.strip() not in named]
@@ -82,7 +81,6 @@ def _run_inspect(
         dependences = _dependence(step, symbols, problem, point, rows)
         driven, prescribed = step.system.driven, step.system.prescribed
         roles = dict.fromkeys(driven, "driven") | dict.fromkeys(prescribed, "prescribed")
-        blocks = {"rows": symbols.row_blocks, "columns": symbols.column_blocks}
         at = _columns_at(step, point) if chosen else np.zeros(0)
         result = {
             "format": "yid-inspect/1",
@@ -99,7 +97,7 @@ def _run_inspect(
             "equations": step_diagnostics.step_complexity_summary(step),
             "blocks": {
                 kind: [attributes_to_dict(block, "name meaning names=full_names") for block in own if block.labels]
-                for kind, own in blocks.items()
+                for kind, own in (("rows", symbols.row_blocks), ("columns", symbols.column_blocks))
             },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "dependence": {entry.parameter: attributes_to_dict(entry, _DEPENDENCE_KEYS) for entry in dependences},

@@ -68,9 +68,8 @@ def run_plan(
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]
         planned = ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)
         scene = animation_of_trajectories("planned", [planned])
-        result = _motion_result(run, found, source) | told
         shown: dict[str, Any] = {"animations": [scene], "section_data": {"plan": found}}
-        written = folder.write_result_and_report(run, progress, result, **shown)
+        written = folder.write_result_and_report(run, progress, _motion_result(run, found, source) | told, **shown)
     return CommandOutcome(folder.path, written, found, found.is_successful)
 
 

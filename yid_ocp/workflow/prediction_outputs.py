@@ -37,11 +37,10 @@ def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[st
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
     known = list(zip(problem.episodes, whitening.torque_biases_and_stds_per_recording(problem, x), strict=True))
-    apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
-    if apart:
-        is_whitened = any(problem.held_out_whitening_filters)
-        weigh = whitening.problem_with_held_out_kalman_whitening
-        held = problem if is_whitened else weigh(problem, x, keep_weights=True)
+    if any(e.initial_state_shared_with is None and _has_torque_bias(e) for e in problem.held_out):
+        held = problem
+        if not any(problem.held_out_whitening_filters):
+            held = whitening.problem_with_held_out_kalman_whitening(problem, x, keep_weights=True)
         for (episode, result), own in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
             is_apart = episode.initial_state_shared_with is None
             if is_apart and isinstance(own, whitening.WhiteningFilter) and not isinstance(result, str):

@@ -55,9 +55,8 @@ def run_simulate(
         if recording is not None:
             write_recording(recording, folder.path / "recording.h5")
             groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
-            truth = dict(recording.true_parameters)
             result |= {"status": "done", "message": "", "duration": recording.duration}
-            result |= {"groups": groups, "truth": truth}
+            result |= {"groups": groups, "truth": dict(recording.true_parameters)}
         more = {"recordings": [] if recording is None else [recording], "system": system}
         written = folder.write_result_and_report(run, progress, result, animations=scenes, section_data=more)
     return CommandOutcome(folder.path, written, recording, recording is not None)

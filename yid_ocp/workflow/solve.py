@@ -24,7 +24,6 @@ from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
-_RESULT_FORMAT = "yid-solve/1"
 _BARS, _SPARKLINE_WIDTH = "▁▂▃▄▅▆▇█", 24
 
 
@@ -131,7 +130,7 @@ def solution_to_result_dict(
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
     worse = estimation.channels_worse_than_naive_prediction(errors, units)
     return {
-        "format": _RESULT_FORMAT,
+        "format": "yid-solve/1",
         "status": solution.status.value,
         "message": solution.message,
         "parameters": {name: asdict(entry) for name, entry in solution.parameters.items()},

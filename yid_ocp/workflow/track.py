@@ -140,8 +140,7 @@ def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, An
     names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
     names += " nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds"
     known = {"distance": "mean_distance", "covered": "visible_length_coverage", "contested": "contested_fraction"}
-    found = {key: fit and getattr(fit, name) for key, name in known.items()}
-    return found | files.attributes_to_dict(frame, names)
+    return {key: fit and getattr(fit, name) for key, name in known.items()} | files.attributes_to_dict(frame, names)
 
 
 def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:

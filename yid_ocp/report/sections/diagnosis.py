@@ -80,10 +80,8 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
-        sentences.append(
-            f"No effect is named, so no error is shown after it; chi² per degree of freedom is {first:.3g} (one is "
-            "noise alone)."
-        )
+        level = f"chi² per degree of freedom is {first:.3g} (one is noise alone)"
+        sentences.append(f"No effect is named, so no error is shown after it; {level}.")
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
@@ -110,17 +108,14 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can show",
     }
     evidence = smoothed.log_evidence
-    side = (
-        f"By evidence the gap lies in {verdicts[smoothed.plant_or_sensor_origin]}: the log evidence rises by "
-        f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
-        f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
-        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap where it was fitted."
-    )
     left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
     sentences = [
         "Every coordinate was given an unknown force, every grasp an unknown offset and every measured point an "
         "unknown bias, free to change in time; the fewest groups of them that explain the residual were kept.",
-        side,
+        f"By evidence the gap lies in {verdicts[smoothed.plant_or_sensor_origin]}: the log evidence rises by "
+        f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
+        f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
+        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap where it was fitted.",
         f"A gap at {noticed} would have been detected." if noticed else "",
         f"A gap at {silent} would not have been detected by these motions and sensors." if silent else "",
         f"The residual gap lies in {', '.join(left)}." if finding.accepted_effects and left else "",

@@ -239,8 +239,7 @@ def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
     found = []
     whitened: dict[str, list[Array]] = {}
     for own in _predicted_episodes(findings):
-        where = f"{own.episode.name} ({own.role})"
-        found += [(f"{name} in {where}", curves) for name, curves in _fitted_curves(own)]
+        found += [(f"{name} in {own.episode.name} ({own.role})", curves) for name, curves in _fitted_curves(own)]
         for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
             if own.role == _ESTIMATED:
                 ratio = (predicted - samples.value) / samples.std
