@@ -106,7 +106,7 @@ def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
         export_recording_csv_files(tables, tmp_path / "file")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     (tmp_path / "joints.csv").write_text("measured")
-    with pytest.raises(OutputError, match="joints.csv exists"):
+    with pytest.raises(OutputError, match=r"joints\.csv exists"):
         export_recording_csv_files(tables, tmp_path)
     assert (tmp_path / "joints.csv").read_text() == "measured"
 

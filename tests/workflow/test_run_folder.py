@@ -17,6 +17,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.effects import EFFECTS
 from yid_ocp.errors import ConfigError, OutputError, ParallelWorkError
 from yid_ocp.files import file_sha256, write_text
+from yid_ocp.report.sections import REPORT_SECTIONS
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.run_folder import atomic_run_folder, software_and_plugin_versions
@@ -232,6 +233,14 @@ def test_a_file_is_run_once_and_its_kind_is_there(kinds, pendulum) -> None:
     build_system(run)
     assert set(EFFECTS) - kinds == {"constant"}
     build_system(run)
+
+
+def test_a_file_may_register_a_report_section_alone(kinds, pendulum, monkeypatch) -> None:
+    monkeypatch.setattr(REPORT_SECTIONS, "_entries", {})
+    text = "from yid_ocp.report.sections import register_report_section as made\nmade('weather', 15, 'Weather')(dict)\n"
+    (pendulum.parent / "own.py").write_text(text)
+    build_system(configured(pendulum, "own.py"))
+    assert "weather" in REPORT_SECTIONS
 
 
 @pytest.mark.parametrize(

@@ -122,8 +122,8 @@ class _JointLoadFriction(_JointFriction):
     """Friction that grows with the torque through a gear: F = -share |motor torque - external torque| sgn(v).
 
     The external torque is that of weights and grasps beyond the joint. The sign of the speed is smoothed below v_s,
-    at most `_LOAD_SIGN_SMOOTHING_SPEED`, the magnitude of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al. (2024),
-    Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
+    at most `_LOAD_SIGN_SMOOTHING_SPEED`, the magnitude of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al.
+    (2024), Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
     """
 
     equation = "F = -share |tau_motor - tau_outside| tanh(v/v_s)"

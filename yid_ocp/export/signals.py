@@ -134,9 +134,9 @@ def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[s
     """
     folder, groups = make_folder(folder), recording.joint_and_point_groups
     written = [folder / f"{'joints' if isinstance(group, JointGroup) else group.name}.csv" for group in groups]
-    for file in written:
-        if file.exists():
-            what, allowed = f"{file.name} exists and is not overwritten", "a folder without the files to be written"
+    for target in written:
+        if target.exists():
+            what, allowed = f"{target.name} exists and is not overwritten", "a folder without the files to be written"
             raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another --out, or remove the file")
     for group, target in zip(groups, written, strict=True):
         if isinstance(group, JointGroup):

@@ -23,8 +23,7 @@ from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.registry import Registry
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS
 
-_ENTRY_POINT_GROUP = "yid_ocp.effects"  # entry points of modules that register effects or sensors on import
-_REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNEL_KINDS)
+_ENTRY_POINT_GROUP = "yid_ocp.effects"  # entry points of modules that register effects, sensors or report sections
 _loaded: dict[str, str] = {}  # loaded files and entry points, with hash or distribution
 
 
@@ -86,15 +85,18 @@ def _run(path: Path, digest: str) -> None:
 @contextlib.contextmanager
 def _registering(name: str, where: str, hint: str, path: Path | None = None, known: bool = False) -> Iterator[None]:
     """Convert errors of a plug-in that the block runs, and remove its registrations after an error."""
-    before = [set(registry) for registry in _REGISTRIES]
+    from yid_ocp.report.sections import REPORT_SECTIONS  # which few runs with plug-ins need before their report
+
+    registries: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNEL_KINDS, REPORT_SECTIONS)
+    before = [set(registry) for registry in registries]
     try:
         yield
-        unchanged = all(set(registry) == names for registry, names in zip(_REGISTRIES, before, strict=True))
+        unchanged = all(set(registry) == names for registry, names in zip(registries, before, strict=True))
         if unchanged and not known:
             allowed = "a class or function under @EFFECTS.register(NAME) or @SENSOR_READERS.register(NAME)"
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
     except (Exception, SystemExit) as error:
-        for registry, names in zip(_REGISTRIES, before, strict=True):
+        for registry, names in zip(registries, before, strict=True):
             registry.unregister_names(set(registry) - names)
         if isinstance(error, YidError):
             what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
