@@ -6,6 +6,7 @@ It shares only the `DiscreteEquations` with `kernel.c`, so that each kernel is a
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -32,7 +33,7 @@ from yid_ocp.integrator.step_model import (
 )
 from yid_ocp.parallel import CasadiLockedCache
 
-_PointEvaluator = Callable[[Array], Array]
+_PointEvaluator = Callable[[Array], list[Array]]
 
 
 class InterpretedKernel:
@@ -45,31 +46,31 @@ class InterpretedKernel:
     def __init__(self, model: StepEquationsAndFunctions) -> None:
         self._model = model
         self._functions: CasadiLockedCache[None, list[ca.Function]] = CasadiLockedCache(self._made)
+        self._own = threading.local()
         system, sizes = model.system, model.sizes
         names = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
         ends = np.cumsum([0, *(argument.numel() for argument in model.equations.arguments)])
         self._at = {name: np.arange(*ends[i : i + 2]) for i, name in enumerate(names)}
-        free = np.array(system.unprescribed_coordinate_indices, int)
-        fixed = np.array(system.prescribed_coordinate_indices, int)
+        indices = system.unprescribed_coordinate_indices, system.prescribed_coordinate_indices
+        free, fixed = (np.array(entries, int) for entries in indices)
         self._fixed, self._coordinates = self._at["q1"][fixed], len(free) + sizes["nz"]
         self._unknown = np.concatenate([self._at["q1"][free], self._at["z1"], self._at["lam"]])
         self._rows = sizes["n"] + sizes["nz"] + sizes["m"]
         self._residual = np.concatenate([free, np.arange(sizes["n"], self._rows)])
+        self._square = np.ix_(self._residual, self._unknown)
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
     def make_kernel_sharing_code(self, model: StepEquationsAndFunctions) -> InterpretedKernel:
         """Create a kernel that reuses this kernel's functions for a `model` with the same equations."""
         other = InterpretedKernel(model)
-        other._functions = self._functions
+        other._functions, other._own = self._functions, self._own
         return other
 
-    def _evaluators(self) -> list[_PointEvaluator]:
-        """Outputs at a point, Jacobian of the residual by the unknowns, and Jacobian of the outputs by the point."""
-
-        def only(evaluate: Callable[[Array], list[Array]]) -> _PointEvaluator:
-            return lambda point: evaluate(point)[0]
-
-        return [only(dense_function_evaluator(function)) for function in self._functions(None)]
+    def _evaluators(self) -> Sequence[_PointEvaluator]:
+        """Outputs at a point and their Jacobians, by the unknowns (of the residual) and the point, for this thread."""
+        if not hasattr(self._own, "evaluators"):
+            self._own.evaluators = [dense_function_evaluator(f, kept=False) for f in self._functions(None)]
+        return tuple(self._own.evaluators)
 
     def _made(self, _: None) -> list[ca.Function]:
         e, point = self._model.equations, ca.vertcat(*self._model.equations.arguments)
@@ -93,16 +94,16 @@ class InterpretedKernel:
         """Solve for the unknowns in the point, by Newton's method with the line searches of kernel.c."""
 
         def largest(change: Array) -> float:
-            return float(np.abs(change[: self._coordinates]).max(initial=0.0))
+            return float(np.maximum.reduce(np.abs(change[: self._coordinates]), initial=0.0))
 
         tolerance, error, balance = self._model.tolerance, math.inf, slice(self._coordinates - self._model.sizes["nz"])
         if not len(self._unknown):  # all coordinates are prescribed
             return NewtonStatusCode.OK, 0.0, 1
         for iteration in range(1, NEWTON_ITERATION_LIMIT + 1):
-            residual, previous = value(point)[self._residual, 0], error
+            residual, previous = value(point)[0][self._residual, 0], error
             if not np.isfinite(residual).all():
                 return NewtonStatusCode.NOT_FINITE, error, iteration
-            factors = _factorised(slope(point))
+            factors = _factorised(slope(point)[0])
             if factors is None:
                 return NewtonStatusCode.SINGULAR, error, iteration
             change = -_solved(factors, residual)
@@ -118,7 +119,7 @@ class InterpretedKernel:
             low, low_left, high, part = 0.0, 1.0, 1.0, 1.0
             while True:
                 point[self._unknown] = start + longest * part * change
-                residual, left = value(point)[self._residual, 0], math.nan
+                residual, left = value(point)[0][self._residual, 0], math.nan
                 if by_work:
                     left = float(residual[balance] @ change[balance] / work)
                     is_good = abs(left) <= 0.5 or (left > 0 and part == 1.0)
@@ -162,13 +163,13 @@ class InterpretedKernel:
                 total += spent
                 if code == NewtonStatusCode.OK:
                     break
-            outputs, lam = value(point)[:, 0], point[self._at["lam"]]
+            outputs, lam = value(point)[0][:, 0], point[self._at["lam"]]
             state[k + 1] = np.concatenate([point[self._at["q1"]], outputs[self._p1], point[self._at["z1"]]])
             if code != NewtonStatusCode.OK:
                 break
             out.torque[k], out.multipliers[k], out.effort[k] = u, lam, outputs[self._effort]
             if wanted is not None:
-                moved = self._moved(slopes(point), wanted, feedback, by[0][k], k)
+                moved = self._moved(slopes(point)[0], wanted, feedback, by[0][k], k)
                 if moved is None:
                     code = NewtonStatusCode.SINGULAR
                     break
@@ -203,11 +204,10 @@ class InterpretedKernel:
             change[self._p1, last] += loads[1]
             # in the balance they add to the momentum
             change[self._effort, last] += slopes[self._effort, at["p0"][fixed]] @ loads[0][fixed]
-        try:
-            solution = np.linalg.solve(slopes[np.ix_(self._residual, self._unknown)], change[self._residual])
-        except np.linalg.LinAlgError:
+        factors = _factorised(slopes[self._square])
+        if factors is None:
             return None
-        moved[self._unknown] = -solution
+        moved[self._unknown] = -_solved(factors, change[self._residual])
         change += slopes[:, self._unknown] @ moved[self._unknown]
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
@@ -222,7 +222,7 @@ class InterpretedKernel:
         found = []
         for k, u in enumerate(along.torque):
             point = self._point(theta, along.state[k], along.state[k + 1], along.multipliers[k], u)
-            moved = self._moved(slopes(point), wanted, feedback, before, k, loads)
+            moved = self._moved(slopes(point)[0], wanted, feedback, before, k, loads)
             if moved is None:
                 raise np.linalg.LinAlgError("the equations of a step are singular")
             found.append((moved[0], np.vstack([moved[2], moved[1] / self._model.time_step])))
@@ -251,7 +251,7 @@ class InterpretedKernel:
         by_path, costate = np.zeros((steps + 1, sizes["nc"])), by_state[steps].copy()
         for k in reversed(range(steps)):
             x, after = rollout.state[k], rollout.state[k + 1]
-            jacobian = slopes(self._point(theta, x, after, rollout.multipliers[k], rollout.torque[k]))
+            jacobian = slopes(self._point(theta, x, after, rollout.multipliers[k], rollout.torque[k]))[0]
             weight = np.zeros(len(jacobian))
             weight[self._p1] = costate[n : 2 * n]
             weight[self._effort] = 0.0 if by_effort is None else by_effort[k]
@@ -259,11 +259,10 @@ class InterpretedKernel:
             by_point[at["q1"]] += costate[:n]
             by_point[at["z1"]] += costate[2 * n :]
             by_point[at["lam"]] += 0.0 if by_multipliers is None else by_multipliers[k]
-            square = jacobian[np.ix_(self._residual, self._unknown)]
-            try:
-                by_point -= jacobian[self._residual].T @ np.linalg.solve(square.T, by_point[self._unknown])
-            except np.linalg.LinAlgError:
+            factors = _factorised(jacobian[self._square].T)
+            if factors is None:
                 return RolloutCostGradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
+            by_point -= jacobian[self._residual].T @ _solved(factors, by_point[self._unknown])
             by_theta += by_point[self._columns(names)]
             by_torque[k], by_path[k + 1] = by_point[at["u"]], by_point[self._fixed]
             costate = np.concatenate([by_point[at[name]] for name in ("q0", "p0", "z0")]) + by_state[k]
@@ -282,35 +281,42 @@ class InterpretedKernel:
         columns = {"new": new, "old": old, "input": at["u"], "theta": self._columns(names)}
         for k, u in enumerate(torque):
             point = self._point(theta, state[k], state[k + 1], multipliers[k], u)
-            outputs = value(point)[:, 0]
+            outputs = value(point)[0][:, 0]
             out.residual[k], out.p1[k] = outputs[: self._rows], outputs[self._p1]
             if derivatives:
-                jacobian = slopes(point)
+                jacobian = slopes(point)[0]
                 for key, index in columns.items():
                     getattr(out, f"residual_by_{key}")[k] = jacobian[: self._rows, index]
                     getattr(out, f"p1_by_{key}")[k] = jacobian[self._p1, index]
         return out
 
 
-def dense_function_evaluator(function: Any) -> Callable[[Array], list[Array]]:
-    """Create a fast evaluator for a CasADi function of one vector with dense outputs, for use in one thread.
-
-    It reuses fixed buffers and takes a third of the time of a call, which converts CasADi matrices to arrays.
-    """
-    buffer, run = function.buffer()
+def dense_function_evaluator(function: Any, kept: bool = True) -> Callable[[Array], list[Array]]:
+    """Create a fast evaluator of a CasADi function of one vector, for one thread. Outputs stay valid if `kept`."""
     point = np.zeros(function.numel_in(0))
     results = [np.zeros(function.size_out(i)[::-1]) for i in range(function.n_out())]
-    buffer.set_arg(0, point.data)
-    for i, result in enumerate(results):
-        if result.size:
-            buffer.set_res(i, result.data)
+    run, views = bound_function(function, [point], results), [result.T for result in results]
 
     def evaluate(values: Array) -> list[Array]:
         point[:] = values
         run()
+        return [view.copy() for view in views] if kept else views
+
+    return evaluate
+
+
+def bound_function(function: Any, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
+    """Bind a CasADi function to contiguous arrays of nonzeros, column by column; return a call that evaluates it."""
+    buffer, run = function.buffer()
+    for bind, arrays in ((buffer.set_arg, inputs), (buffer.set_res, outputs)):
+        for i, array in enumerate(arrays):
+            if array.size:
+                bind(i, array.data)
+
+    def evaluate() -> None:
+        run()
         if buffer.ret():  # which also keeps the buffer alive
             raise RuntimeError(f"CasADi could not evaluate {function}")
-        return [result.T.copy() for result in results]
 
     return evaluate
 
@@ -324,5 +330,5 @@ def _factorised(matrix: Array) -> tuple[Array, NDArray[np.int32]] | None:
 
 
 def _solved(factors: tuple[Array, NDArray[np.int32]], right: Array) -> Array:
-    solution: Array = scipy.linalg.lapack.dgetrs(*factors, right)[0] if len(right) else right
+    solution: Array = scipy.linalg.lapack.dgetrs(*factors, right)[0] if right.size else right
     return solution
