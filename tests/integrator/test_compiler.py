@@ -277,7 +277,8 @@ def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, choose, monkeypa
 
 
 @pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])
-def test_values_at_every_point(use_compiler):
+def test_values_at_every_point(use_compiler, monkeypatch):
+    monkeypatch.setattr(compiler, "_MIN_COMPILED_INSTRUCTION_COUNT", 0)
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     sparse = ca.SX(3, 4)
     sparse[0, 1], sparse[2, 3] = x[0] * y[1], 7
@@ -303,6 +304,7 @@ def test_no_memory_for_a_mapped_function(poor, monkeypatch):
         return libraries[-1]
 
     monkeypatch.setattr(compiler, "compile_and_load_library", poor_library)
+    monkeypatch.setattr(compiler, "_MIN_COMPILED_INSTRUCTION_COUNT", 0)
     x = ca.SX.sym("x", 2)
     double = MappedFunction(ca.Function("double_it", [x], [2 * x]))
     poor.watch(libraries[0])

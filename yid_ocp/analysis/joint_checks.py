@@ -16,6 +16,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period, white_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects.base import EffectBase, joint_names_by_arm
+from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
@@ -90,32 +91,26 @@ class RecordedJointsModel:
 
         `q` (N, k) holds recorded angles. Every frame must satisfy `is_frame_determined_by_angles`.
         """
-        place, slope = (np.array(ca.densify(x)) for x in self._places(frames).map(len(q)).call([q.T]))
-        count, width = len(frames), len(self.joint_names)
-        by_angle = slope.reshape(3 * count, len(q), width).transpose(1, 0, 2)
-        return place.T.reshape(len(q), count, 3), by_angle.reshape(len(q), count, 3, width)
+        place, slope = self._places(frames)(q)
+        return place.reshape(len(q), len(frames), 3), slope.reshape(len(q), len(frames), 3, len(self.joint_names))
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         """Joint efforts (N, k) [N m] by rigid-body inverse dynamics, without dampers, springs and grasps."""
-        return np.array(self._effort.map(len(q)).call([q.T, v.T, a.T])[0]).T
-
-    def _effort_change_by_loads(self, motion: _SmoothedMotion) -> Array:
-        """Derivatives (nl, N, k) of the efforts of a motion by the unknown load parameters."""
-        slope = self._effort.map(len(motion.q)).call([motion.q.T, motion.v.T, motion.a.T])[1]
-        return np.array(slope).reshape(len(self.joint_names), len(motion.q), len(self.unknown_load_parameters)).T
+        return self._effort(q, v, a)[0][:, :, 0]
 
     @cached_property
-    def _places(self) -> CasadiLockedCache[tuple[str, ...], ca.Function]:
-        return CasadiLockedCache(self._place_function)
+    def _places(self) -> CasadiLockedCache[tuple[str, ...], MappedFunction]:
+        def made(frames: tuple[str, ...]) -> MappedFunction:
+            known = ca.SX.sym("q", len(self.joint_names))
+            kinematics = forward_kinematics(self.system.mechanism, self._placed(known))
+            at = self._numbers(ca.vertcat(*(kinematics.frame_position(frame) for frame in frames)))
+            outputs = [ca.densify(at), ca.densify(ca.jacobian(at, known))]
+            return MappedFunction(ca.Function("places", [known], outputs), use_compiler=False)
 
-    def _place_function(self, frames: tuple[str, ...]) -> ca.Function:
-        known = ca.SX.sym("q", len(self.joint_names))
-        kinematics = forward_kinematics(self.system.mechanism, self._placed(known))
-        at = self._numbers(ca.vertcat(*(kinematics.frame_position(frame) for frame in frames)))
-        return ca.Function("places", [known], [ca.densify(at), ca.densify(ca.jacobian(at, known))])
+        return CasadiLockedCache(made)
 
     @cached_property
-    def _effort(self) -> ca.Function:
+    def _effort(self) -> MappedFunction:
         (q, kinematics), tree, count = self.system.symbols_and_kinematics, self.system.mechanism, len(self.joint_names)
         if self._has_no_unknown_descendants and self.system_configuration_indices == tuple(range(count)):
             frames = {name: frame for name, frame in tree.frames.items() if frame.joint_index < count}
@@ -129,8 +124,8 @@ class RecordedJointsModel:
         placed = ca.vertcat(*(self._placed(x) for x in known))
         effort = ca.substitute(effort[list(self.system_configuration_indices)], ca.vertcat(*full), placed)
         by = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self.unknown_load_parameters))
-        parts = effort, ca.jacobian(effort, by)
-        return ca.Function("effort", known, [ca.densify(self._numbers(part)) for part in parts])
+        outputs = [ca.densify(self._numbers(part)) for part in (effort, ca.jacobian(effort, by))]
+        return MappedFunction(ca.Function("effort", known, outputs), use_compiler=False)
 
     def _placed(self, known: ca.SX) -> ca.SX:
         full = ca.SX.zeros(self.system.n_coordinates)
@@ -547,7 +542,7 @@ def _loads(data: _Data) -> tuple[Array, Array]:
     """Columns (N, k, c) of what the arm holds, and their typical sizes: unknown load parameters, 33 per grasp."""
     motion, arm = data.motion, data.arm
     unknown = [arm.system.parameters[name] for name in arm.unknown_load_parameters]
-    columns = [*arm._effort_change_by_loads(motion)] if unknown else []
+    columns = [*arm._effort(motion.q, motion.v, motion.a)[1].transpose(2, 0, 1)] if unknown else []
     sizes = [_LOAD_RANGE_FRACTION * (entry.upper - entry.lower) for entry in unknown]
     if data.holders:
         place, by_angle = arm.frame_positions_and_jacobians(data.holders, motion.q)

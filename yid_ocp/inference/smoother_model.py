@@ -29,6 +29,7 @@ from yid_ocp.inference.linearized_residual import (
     ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
+from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import (
     input_or_servo_torques_of_rollout,
     iterate_step_derivatives,
@@ -200,8 +201,7 @@ def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segme
     moved = forward_kinematics(system.mechanism, symbol)
     jacobian = ca.vertcat(*(moved.position_jacobian(f"{segment}:{_FORCE_POINT}") for segment in segments))
     function = ca.Function("pushed", [symbol, system.parameters.symbols], [ca.densify(jacobian.T)])
-    found = np.array(function.map(len(q))(q.T, np.tile(theta[:, None], len(q))))
-    return found.reshape(system.n_coordinates, len(q), 3 * len(segments)).transpose(1, 0, 2)
+    return MappedFunction(function, shared_inputs=(1,), use_compiler=False)(q, theta)[0]
 
 
 @dataclass(frozen=True)

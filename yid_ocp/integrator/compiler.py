@@ -28,6 +28,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.codegen import casadi_c_source, nonzero_indices
+from yid_ocp.integrator.interpreted import bound_function
 from yid_ocp.integrator.step_model import NewtonStatusCode, out_of_memory_error
 from yid_ocp.parallel import CasadiLockedCache
 
@@ -43,6 +44,7 @@ _OPTIMIZATION_FLAG = "-O1"  # -O2 takes 1.7 times as long on a step of 43 variab
 # For code that runs for seconds in all and is new for every model: 70 000 lines compile in three seconds instead of a
 # minute (-O1), and run two or three times as fast as CasADi's interpreter.
 _NO_OPTIMIZATION_FLAG = "-O0"
+_MIN_COMPILED_INSTRUCTION_COUNT = 100  # of a `MappedFunction`: compiling takes as long as hundreds of calls
 
 # Ten times the compile time of the longest function; a compiler that hangs would hang the run.
 _COMPILE_TIMEOUT, _VERSION_TIMEOUT = 900.0, 30.0  # [s]
@@ -252,7 +254,7 @@ def _is_ours(built: Path) -> bool:
 
 
 class MappedFunction:
-    """A CasADi function that is evaluated at many points in one call, in compiled code if possible.
+    """A CasADi function of dense columns, evaluated at many points in one call, compiled if possible and if it is long.
 
     Inputs and outputs are dense columns. `shared_inputs` are the indices of inputs that have one value for all points.
     """
@@ -262,8 +264,10 @@ class MappedFunction:
         self.shared_inputs = frozenset(shared_inputs)
         self._inputs = [function.numel_in(i) for i in range(function.n_in())]
         self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
-        self._library = compile_and_load_library(self._source()) if use_compiler else None
-        self._mapped = CasadiLockedCache[int, ca.Function](function.map)
+        is_long = not function.is_a("SXFunction") or function.n_instructions() >= _MIN_COMPILED_INSTRUCTION_COUNT
+        self._library = compile_and_load_library(self._source()) if use_compiler and is_long else None
+        shared = sorted(shared_inputs)
+        self._mapped = CasadiLockedCache[int, ca.Function](lambda n: function.map("mapped", "serial", n, shared, []))
 
     def _source(self) -> str:
         name, f = self.function.name(), self.function
@@ -310,9 +314,7 @@ int yid_map(int count, const double **in, double **out) {{
             if code != NewtonStatusCode.OK:
                 raise RuntimeError(f"CasADi could not evaluate {self.function}")
         elif count:
-            columns = [np.tile(a, (count, 1)).T if i in self.shared_inputs else a.T for i, a in enumerate(arrays)]
-            results = self._mapped(count).call(columns)
-            values = [np.array(r.nonzeros()).reshape(v.shape) for r, v in zip(results, values, strict=True)]
+            bound_function(self._mapped(count), arrays, values)()
         dense = []
         for o, value in enumerate(values):
             sparsity = self.function.sparsity_out(o)

@@ -18,7 +18,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, json_sha256, read_input_text, write_text
-from yid_ocp.integrator.compiler import private_cache_folder
+from yid_ocp.integrator.compiler import MappedFunction, private_cache_folder
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint, mesh_sources_sha256
@@ -156,8 +156,8 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
     (symbols, moved), index = system.symbols_and_kinematics, system.mechanism.joint_index
     parts = [ca.horzcat(moved.joint_rotations[index(name)], moved.joint_origins[index(name)]) for name in names]
     function = ca.Function("poses", [symbols, system.parameters.symbols], [ca.densify(ca.horzcat(*parts))])
-    found = np.array(function.map(len(q))(q.T, np.tile(theta[:, None], (1, len(q)))))
-    poses = found.reshape(3, len(q), len(names), 4).transpose(1, 2, 0, 3)
+    found = MappedFunction(function, shared_inputs=(1,), use_compiler=False)(q, theta)[0]
+    poses = found.reshape(len(q), 3, len(names), 4).transpose(0, 2, 1, 3)
     turned = Rotation.from_matrix(poses[..., :3].reshape(-1, 3, 3)).as_quat().reshape(*poses.shape[:2], 4)
     rows = np.concatenate([_POSITION_SCALE * poses[..., 3], _QUATERNION_SCALE * turned], axis=2)
     return np.rint(rows).astype(int).reshape(len(q), -1).tolist()
@@ -202,11 +202,11 @@ def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _Animate
         if frame.joint_index >= 0 and (name not in acting or name in shown):
             pairs.append((frame.joint_index, len(origins) - 1, names[frame.joint_index] in owned))
     base = len(origins)
-    places = ca.Function("places", [symbols, system.parameters.symbols], [ca.horzcat(*origins, ca.SX(3, 1))])
+    inputs = [symbols, system.parameters.symbols]
+    places = MappedFunction(ca.Function("places", inputs, [ca.horzcat(*origins, ca.SX(3, 1))]), (1,), False)
 
     def positions(q: Array) -> Array:
-        stacked = np.array(places.map(len(q))(q.T, np.tile(told.theta[:, None], (1, len(q)))))
-        return stacked.T.reshape(len(q), -1, 3)
+        return places(q, told.theta)[0].transpose(0, 2, 1)
 
     # joints of one link share a position: those that coincide at two configurations
     both = positions(np.stack([np.zeros(system.n_coordinates), np.linspace(0.3, 1.1, system.n_coordinates)]))
