@@ -52,11 +52,6 @@ class StepFunctions:
         return self._function("linear")
 
     @property
-    def row_scale_and_true_time_step_function(self) -> ca.Function:
-        """The function that returns the row scale of the momentum balance and the clock-corrected time step [s]."""
-        return self._function("scales")
-
-    @property
     def internal_residual_at_rest_function(self) -> ca.Function:
         """The function of the internal equations at rest (nodes equal) and their derivatives by (q, z, lam, u)."""
         return self._function("resting")

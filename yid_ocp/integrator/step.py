@@ -61,8 +61,12 @@ class Step(ReprMixin):
 
     def clock_scaled_time_step(self, theta: Array) -> float:
         """Return the time step [s] corrected for the recording's clock: h times `System.recorded_time_scale`."""
-        none = [np.zeros(self.sizes[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
-        return float(self.functions.row_scale_and_true_time_step_function(*none, theta, self.time_step)[1])
+        return float(self._clock(theta, self.time_step))
+
+    @functools.cached_property
+    def _clock(self) -> ca.Function:
+        with CASADI_LOCK:
+            return ca.Function("clock", [self.equations.theta, self.equations.time_step], [self.equations.h])
 
     @property
     def force_split(self) -> ForceSplit:
@@ -305,8 +309,7 @@ def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rol
     system, h = step.system, step.clock_scaled_time_step(np.asarray(theta, float))
     if not system.servos:
         return rollout.torque
-    e, driven = step.equations, list(system.actuated_coordinate_indices)
-    n = system.n_coordinates
+    e, n, driven = step.equations, system.n_coordinates, list(system.actuated_coordinate_indices)
     with CASADI_LOCK:
         force = ca.densify(system.input_force(e.u, e.q0, e.q1)[driven])
         internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
@@ -319,8 +322,7 @@ def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rol
 def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
     """Compute the momentum dL/dv at (q, v), each (n,) or (K, n) [N m s], times compliance at compliant coordinates."""
     e, s = step.equations, step.sizes
-    half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
-    middle = np.atleast_2d(np.asarray(q, float))
+    middle, half = (np.atleast_2d(np.asarray(x, float)) * by for x, by in ((q, 1.0), (v, step.time_step / 2)))
     none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
     with CASADI_LOCK:
         momentum = e.row_scale * e.rigid_body_terms.lagrangian_by_v
