@@ -309,6 +309,8 @@ def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
         what = "the weight of a body is not its mass times gravity, so the body cannot be merged or written to a file"
         hint = "leave out the effects that change weights without masses"
         raise ModelError(what, where="effects of the model", allowed="bodies with weight = mass * gravity", hint=hint)
+    if len(entries) == 1:
+        return Inertia(mass, entries[0].center_of_mass, ca.densify(entries[0].inertia_about_com))
     com = sum((b.mass * b.center_of_mass for b in entries), ca.SX(ca.DM.zeros(3))) / mass
     inertia = ca.SX(ca.DM.zeros(3, 3))
     for body in entries:

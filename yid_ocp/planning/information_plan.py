@@ -339,10 +339,7 @@ def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str,
 
 
 def _distances(
-    experiment: SplineMotionExperiment,
-    criterion: MotionSearchCriterion,
-    rivals: Sequence[EffectBase],
-    w: Array,
+    experiment: SplineMotionExperiment, criterion: MotionSearchCriterion, rivals: Sequence[EffectBase], w: Array
 ) -> dict[tuple[str, str], tuple[float, float]]:
     assert isinstance(criterion, EffectDiscriminationCriterion)
     recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_sensitivities_to_unknowns(w)

@@ -110,7 +110,7 @@ class SensorMeasurements:
         """The name of the channel to which each of the k outputs belongs."""
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
-    @property
+    @cached_property
     def evaluation_nodes(self) -> IntArray:
         """The sorted indices of the nodes at which the sensor is predicted, for interpolation to the samples."""
         if self.node.ndim > 1:
