@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import importlib.util
 import json
@@ -46,6 +47,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "YID_OCP_THREADS"):
         os.environ.setdefault(name, "1")
     threadpoolctl.threadpool_limits(1)
+    # looking for libraries again would take milliseconds
+    threadpoolctl.threadpool_limits = lambda limits: contextlib.nullcontext()
 
 
 def pytest_configure(config):

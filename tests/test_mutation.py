@@ -1,6 +1,7 @@
 """The mutation run: named breaks fit the sources, and mutants are drawn where something depends on them."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from ruamel.yaml import YAML
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "benchmarks" / "mutation"
+tree_of = cache(lambda source: ast.dump(ast.parse(source)))
 BREAKS = YAML(typ="safe").load((FOLDER / "breaks.yaml").read_text(encoding="utf-8"))
 
 
@@ -16,7 +18,7 @@ def test_every_named_break_fits_one_place_and_is_python(entry):
     source = (REPOSITORY / "yid_ocp" / entry["file"]).read_text(encoding="utf-8")
     assert source.count(entry["old"]) == 1, f"write benchmarks/mutation/breaks.yaml anew for {entry['file']}"
     broken = source.replace(entry["old"], entry["new"])
-    assert ast.dump(ast.parse(broken)) != ast.dump(ast.parse(source))
+    assert ast.dump(ast.parse(broken)) != tree_of(source)
     assert (REPOSITORY / entry["tests"]).is_file()
 
 
