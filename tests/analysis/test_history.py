@@ -236,7 +236,7 @@ def test_the_command_says_which_law_a_real_servo_warrants(cli, repository, share
     if not folder.is_dir():
         pytest.skip("the real recordings are not here (shared/recordings beside the project)")
     files = ", ".join(str(folder / f"{kind}_400.h5") for kind in ("sines", "sweep", "lift", "drop"))
-    settings = ("problem.duration=1.0", "problem.time_step=0.02", "recordings={held_out: []}")
+    settings = ("problem.duration=0.6", "problem.time_step=0.02", "recordings={held_out: []}")
     settings = (*settings, f"recordings.estimate=[{files}]")
     more = [part for setting in settings for part in ("--set", setting)]
     done = cli("friction", repository / "configs" / "servo_pendulum.yaml", "--out", tmp_path / "run", *more)

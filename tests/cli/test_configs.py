@@ -23,28 +23,18 @@ UNREFINED = ("output.discretisation_check=none",)
 FEW = ("solver.max_iterations=2", "problem.use_compiler=false")
 DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
-    **dict.fromkeys(PAPER, (*COARSE, *UNREFINED)),
+    **dict.fromkeys(PAPER, (*COARSE, *FEW, *UNREFINED)),
     "single_arm_vision": COARSE,
     "baxter_arm": ("problem.duration=1.6", *UNREFINED),
     "double_pendulum": ("problem.duration=3.0",),
-    "servo_arm": ("problem.duration=0.2", "model.object.named_segments.rod.links=1", FEW[0], *UNREFINED),
+    "servo_arm": ("problem.duration=0.2", "model.object.named_segments.rod.links=1", *FEW, *UNREFINED),
     "servo_pendulum": ("problem.duration=0.5", FEW[0], *UNREFINED),
     "so101_servo": UNREFINED,
-    "panda_beam": (
-        "problem.duration=0.8",
-        "model.object.named_segments.beam.links=1",
-        "solver.max_iterations=2",
-        *UNREFINED,
-    ),
+    "panda_beam": ("problem.duration=0.8", "model.object.named_segments.beam.links=1", FEW[0], *UNREFINED),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "soft_beam": (
-        *(
-            "problem.duration=0.3",
-            "model.object.named_segments.beam.links=2",
-            *FEW,
-            "model.effects=[]",
-            "parameters={}",
-        ),
+        *("problem.duration=0.3", "model.object.named_segments.beam.links=2", *FEW, "model.effects=[]"),
+        "parameters={}",
         "parameters={beam.bend: {free: true, initial: 0.018}, beam.damping: {free: true, initial: 4.0e-5}}",
         *UNREFINED,
     ),

@@ -16,7 +16,7 @@ from yid_ocp.workflow.run_inputs import resolve_default_recording
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {
     "plan_place": ("model.object.links=2", "plan.point_target_offset_from_start=[-0.01, 0.02, 0.015]"),
-    "plan_cable": ("model.object.named_segments.cable.links=4",),
+    "plan_cable": ("model.object.named_segments.cable.links=3",),
 }
 
 

@@ -253,7 +253,7 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, 
         PERIOD,
         use_compiler=False,
     )
-    settings = replace(real.cable_options(cable, [recording], options), duration=1.0)
+    settings = replace(real.cable_options(cable, [recording], options), duration=0.5)
     problem = EstimationProblem(step, [recording], ("parent.bend", "a.bend"), settings)
     error = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)[
         recording.name
