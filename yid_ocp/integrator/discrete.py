@@ -177,25 +177,24 @@ def discrete_equations(
     if closed is not None:
         balance += share * h * scale * closed.force
         p1 += (1 - share) * h * scale * closed.force
-        closed = ForceWithFactoredDerivatives(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
     symbols = {name: getattr(at, name) for name in ("q0", "q1", "z0", "z1", "p0", "lam", "u", "time_step", "h")}
-    rigid_at_midpoint = {name: at.placed(value) for name, value in vars(rigid).items()}
+    wanted = {"momentum_balance": balance, "internal_residual": internal[0], "internal_residual_at_rest": internal[1]}
+    wanted |= {"p1": p1, "balance_remainder": balance_rest, "p1_remainder": p1_rest}
+    parts = () if closed is None else (closed.force, closed.A, closed.T)
+    # together, so that all of them share what they have in common
+    placed = at.placed([*wanted.values(), *vars(rigid).values(), *parts])
+    first, last = len(wanted), len(wanted) + len(vars(rigid))
     return DiscreteEquations(
         system=system,
         force_split=force_split,
         constraint_force_at=constraint_force_at,
         **symbols,
         theta=system.parameters.symbols,
-        momentum_balance=at.placed(balance),
-        internal_residual=at.placed(internal[0]),
-        internal_residual_at_rest=at.placed(internal[1]),
+        **dict(zip(wanted, placed[:first], strict=True)),
         constraint_residual=constraint,
         constraint_relaxation_gain=gain,
-        p1=at.placed(p1),
-        rigid_body_terms=LagrangianFirstDerivatives(**rigid_at_midpoint),
-        balance_remainder=at.placed(balance_rest),
-        p1_remainder=at.placed(p1_rest),
-        force_with_derivatives=closed,
+        rigid_body_terms=LagrangianFirstDerivatives(*placed[first:last]),
+        force_with_derivatives=ForceWithFactoredDerivatives(*placed[last:]) if parts else None,
         force_with_derivatives_shares=(share, 1 - share),
         constraint_impulses=pulls,
         row_scale=ca.densify(scale),
@@ -232,12 +231,13 @@ class _Symbols:
         own = ca.vertcat(*internal.values()) if internal else ca.SX(0, 1)
         return _Symbols(**symbols, h=symbols["time_step"] * system.recorded_time_scale, internal=own)
 
-    def placed(self, expression: ca.SX, dense: bool = True) -> ca.SX:
-        """Expression of the midpoint in terms of the two nodes."""
+    def placed(self, expressions: Sequence[ca.SX], dense: bool = True) -> list[ca.SX]:
+        """Expressions of the midpoint in terms of the two nodes."""
         midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
         (q, v), (z, z_rate) = (((a + b) / 2, (b - a) / self.h) for a, b in ((self.q0, self.q1), (self.z0, self.z1)))
-        placed = ca.substitute(expression, midpoint, ca.vertcat(q, v, z, z_rate, self.lam / self.h, z))
-        return ca.densify(placed) if dense else placed
+        nodes = ca.vertcat(q, v, z, z_rate, self.lam / self.h, z)
+        placed = ca.substitute(list(expressions), [midpoint], [nodes])
+        return [ca.densify(x) for x in placed] if dense else placed
 
 
 def _summed_terms(
@@ -302,7 +302,7 @@ def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m:
     for name, q, z in (("before", at.q0, at.z0), ("after", at.q1, at.z1)):
         jacobian, by_q = ca.substitute(found, [at.qm, at.internal], [q, z])
         parts |= {f"{name}_jacobian": jacobian, f"{name}_force_by_q": by_q}
-    parts["middle_jacobian"], parts["middle_force_by_q"] = (at.placed(expression, dense=False) for expression in found)
+    parts["middle_jacobian"], parts["middle_force_by_q"] = at.placed(found, dense=False)
     jacobians = ("before_jacobian", "middle_jacobian", "after_jacobian")
     before, middle_sparsity, after = (parts[name].sparsity() for name in jacobians)
     parts |= {name: ca.project(parts[name], before + middle_sparsity + after) for name in jacobians}
