@@ -229,10 +229,7 @@ def violation():
 
 @pytest.fixture(scope="session")
 def benchmark_module(repository):
-    """benchmark_module(name, **neighbours): a module of benchmarks/, which imports those that stand beside it.
-
-    A package of the same name may be loaded already (`coverage`); it stays so.
-    """
+    """benchmark_module(name, **neighbours): a module of benchmarks/, beside a loaded package of the same name."""
 
     def load(name: str, **neighbours: ModuleType) -> ModuleType:
         spec = importlib.util.spec_from_file_location(name, repository / "benchmarks" / f"{name}.py")

@@ -24,17 +24,8 @@ def linear(matrix, residual=None):
 class MadeUp:
     """A problem of shared parameters, whose residual and Jacobian are functions of them.
 
-    Parameters
-    ----------
-    rows : callable
-        From x and the horizon [s] to residual and Jacobian, or to None where the rollout fails.
-    start : sequence of float
-    stated, weak : int
-        How many rows at the end are stated and weak priors.
-    count : int, optional
-        Of all rows; needed where the start fails.
-    priors : mapping, optional
-        Stated standard deviations by name, for what is said of a parameter's size.
+    `rows` gives both from x and the horizon [s], or None where the rollout fails; `stated` and `weak` of them are
+    priors, at the end. `count` of all rows is needed where the start fails. `priors` are standard deviations by name.
     """
 
     guess: str | None = "warm"

@@ -1,7 +1,4 @@
-"""Small made-up inputs of the rules of a diagnosis: nothing is rolled out for them.
-
-Every constructor of the package that the tests of rules need is called here, so that a changed one is one edit.
-"""
+"""Small made-up inputs of the rules of a diagnosis. Nothing is rolled out, and every constructor is called here."""
 
 from __future__ import annotations
 

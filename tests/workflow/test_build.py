@@ -12,6 +12,7 @@ import yid_ocp as yid
 from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import config_yaml_with_defaults
+from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
 from yid_ocp.problem import EstimationProblem
@@ -290,6 +291,16 @@ def test_what_is_said_of_a_parameter_or_an_effect_goes_before_a_section() -> Non
     system = build_system(run)
     assert system.parameters["joint.damping"].value == 0.01
     assert not settings_by_parameter_name(run, system.parameters)["joint.damping"].free
+
+
+@pytest.mark.parametrize(
+    ("config", "said", "speed"), [(None, "", 1e-3), (None, ", sign_smoothing_speed: 3e-3", 3e-3), (CONFIG, "", 0.02)]
+)
+def test_joints_driven_by_torques_have_sharp_friction_and_candidates_are_as_sharp(config, said, speed) -> None:
+    run = load_config(config, ["recordings={}", f"model.friction={{law: coulomb{said}}}"])
+    candidates = make_candidate_effects(system := build_system(run), [], ["joint_stribeck"])
+    known = [effect for effect in system.effects if effect.kind == "joint_coulomb"]
+    assert {effect.sign_smoothing_speed for effect in (*known, *candidates)} == {speed}
 
 
 def test_friction_of_a_joint_that_is_not_there_is_refused() -> None:

@@ -1,7 +1,4 @@
-"""A new user: a bag of an arm with something flexible in its hand, commands in order, no edit of what they write.
-
-The bag comes from MuJoCo, its chain finer than any model's.
-"""
+"""A new user: a bag from MuJoCo of an arm that holds a flexible object, and commands whose files are not edited."""
 
 from __future__ import annotations
 
