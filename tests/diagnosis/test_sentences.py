@@ -43,9 +43,9 @@ from yid_ocp.diagnosis.baseline import (
     _ParameterShift,
     _PredictionErrors,
 )
-from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
+from yid_ocp.diagnosis.sentences import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 FILE = Path(__file__).with_name("sentences.json")

@@ -11,8 +11,8 @@ import pytest
 from pendulum_bench import Bench
 
 from yid_ocp.diagnosis.diagnose import diagnose
-from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
+from yid_ocp.diagnosis.sentences import diagnosis_summary_text
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
 from yid_ocp.errors import SolverError, YidError

@@ -19,12 +19,7 @@ from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
-from yid_ocp.diagnosis.diagnosis_result import (
-    DiagnosisResult,
-    diagnosis_summary_text,
-    held_out_truncation_message,
-    recommended_experiment_text,
-)
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
     KEPT_FRACTIONS_BEFORE_FAILURE,
@@ -46,6 +41,11 @@ from yid_ocp.diagnosis.refit import (
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import screen_candidates
+from yid_ocp.diagnosis.sentences import (
+    diagnosis_summary_text,
+    held_out_truncation_message,
+    recommended_experiment_text,
+)
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress

@@ -174,7 +174,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
 
 def _events(finding: DiagnosisResult) -> _Chapter | None:
-    from yid_ocp.diagnosis.diagnosis_result import ignored_after_overspeed_messages  # other commands need none of it
+    from yid_ocp.diagnosis.sentences import ignored_after_overspeed_messages  # other commands need none of it
 
     events = finding.events
     if not events:

@@ -1,0 +1,245 @@
+"""The result of a diagnosis in sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+from yid_ocp.diagnosis.events import EventSet
+from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
+from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
+from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
+from yid_ocp.display import abbreviated_names_text
+from yid_ocp.effects import EffectBase
+from yid_ocp.inference import null_test
+from yid_ocp.inference.smoother import select_largest_gap_locations
+from yid_ocp.inference.uncertainty import priors_that_determine_unknown
+
+_MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
+_RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
+_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that cannot be moved by themselves
+_GAP_ORIGIN_PHRASES = {
+    "plant": ", in the mechanics rather than in what sensors read",
+    "sensor": ", in what sensors read",
+    "either": ", in the mechanics or in what the effort sensor reads (efforts alone cannot distinguish them)",
+}
+
+
+def recommended_experiment_text(result: DiagnosisResult) -> str:
+    """Recommend the next recording in one sentence, based on verdict, gap location and confusable effects."""
+    for rivals in (entry.equivalent_effects for entry in result.accepted_selected_effects):
+        aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
+        places = list(dict.fromkeys(effect.location for effect in rivals))
+        varied = f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording."
+        advice = (
+            (aspects, varied),
+            (places, f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."),
+            (rivals, f"Vary {aspects[0]} over a wider range."),
+        )
+        if told := [text for several, text in advice if len(several) > 1]:
+            return told[0]
+    place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
+    alone = _listed("Move ", place, " alone, slowly and fast, and hold it still in several configurations.")
+    unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
+    texts = {
+        "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
+        "unknown": alone or "Record other motions, faster and larger.",
+        "no_gap": f"None needed: no relevant gap was found.{_listed(' These motions cannot reveal ', unseen)}",
+        "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
+    }
+    return texts[result.verdict]
+
+
+def diagnosis_summary_text(result: DiagnosisResult) -> str:
+    """Summarise a diagnosis as text about the gap, locations, effects, events and the next experiment."""
+    text = [_gap(result)]
+    if result.verdict not in ("insufficient_data", "no_gap"):
+        text += [_places(result), *_causes(result), *_remains(result)]
+    if result.law is not None:
+        text.append(result.law.sentence)
+    stopped = f"The search stopped after {result.search_seconds:.3g} s; it would go on with "
+    text += [_listed(stopped, result.untried), *map(held_out_truncation_message, result.truncated_recordings)]
+    text += [*_bound_by_priors(result), *_earlier_runs(result)]
+    stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
+    step = f"Steps of {stated} s are too long here, so this result is for {used} s"
+    links = "The error of few links looks like a gap. It was removed here; other commands need more links."
+    blocks = "No other recording could be held out, so alternate blocks of the recordings were."
+    notes = (
+        (stated != used, f"{step} (set problem.time_step: {used} for other commands)."),
+        (result.is_corrected_for_links, links),
+        (result.is_split_in_blocks, blocks),
+    )
+    text += [note for applies, note in notes if applies]
+    events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
+    text += [_listed("Excluded as brief disturbances: ", events), *ignored_after_overspeed_messages(result.events)]
+    return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
+
+
+def held_out_truncation_message(cut: HeldOutTruncation) -> str:
+    """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
+    used, whole = cut.kept_duration, cut.full_duration
+    return f"The nominal model follows {cut.recording} for {used:.3g} of {whole:.3g} s only; the rest is ignored."
+
+
+def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
+    """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
+    said, why = "s are ignored in", "moves too fast for the model."
+    return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
+
+
+def _listed(beginning: str, names: Iterable[str], end: str = ".") -> str:
+    """Sentence on names, similar ones merged. Empty if there are none."""
+    text = abbreviated_names_text([*names])
+    return f"{beginning}{text}{end}" if text else ""
+
+
+def _p_value_relation(p_value: float) -> str:
+    return f"= {p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
+
+
+def _gap(result: DiagnosisResult) -> str:
+    """Sentence on whether there is a gap."""
+    tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
+    fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
+    sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
+    unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
+    detectable, samples = f"{sum(seen)} of {len(seen)}", tests[0].degrees_of_freedom
+    needed = result.thresholds.min_samples_per_unknown * unknowns
+    said = f"{samples:.0f} effective samples for {unknowns} unknowns (at least {needed:.0f} are needed)"
+    texts = {
+        "insufficient_data": f"The data are insufficient: {said}; {detectable} candidates are detectable.",
+        "no_gap": f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).",
+    }
+    if result.verdict in texts:
+        return texts[result.verdict]
+    if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
+        return f"The gap is real ({sizes}; p {_p_value_relation(p_value)})."
+    best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
+    small = f"not along what {best.effect.label} would do (p {_p_value_relation(p_value)})"
+    return f"As a whole the recordings are explained to within their noise ({sizes}), but {small}."
+
+
+def _places(result: DiagnosisResult) -> str:
+    """Sentence on the gap's locations, with inseparable locations together."""
+    where = [place for place in select_largest_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
+    named = [f"{' or '.join([p.location, *p.indistinguishable_from])} ({100 * p.gap_share:.0f} %)" for p in where]
+    if not named:
+        return "These data cannot locate it."
+    assert result.smoother_result is not None  # it found the locations
+    side = _GAP_ORIGIN_PHRASES.get(result.smoother_result.plant_or_sensor_origin, "")
+    return f"It lies in {' and '.join(named)}{side}."
+
+
+def _causes(result: DiagnosisResult) -> list[str]:
+    """Sentences on the selected effects, and on why the verdict is unknown."""
+    added, total = result.selected_effects, result.closure_by_selected_effects
+    limits, text = result.thresholds, list[str]()
+    if added:
+        names = " and ".join(_named(entry.effect, added[-1].refitted_model) for entry in added)
+        verb, part = "closes" if len(added) == 1 else "together close", "no measurable part of it on held-out motions"
+        if math.isfinite(total.ci_low):
+            interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
+            part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
+        text.append(f"{names} {verb} {part}.")
+    for own, *others in (entry.equivalent_effects for entry in result.accepted_selected_effects):
+        text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
+    explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
+    apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
+    reasons = {
+        "": f"The probability that this names the cause is {100 * result.probability:.0f} %.",
+        "none": "No effect tried is significant and closes enough of it.",
+        "little": f"On the fitted motions this explains {explained:.3g} % of the gap; {enough:.3g} % is required.",
+        "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
+    }
+    text.append(reasons[result.unknown_reason])
+    if result.unknown_reason:
+        text.append(_several_places(result))
+    return text
+
+
+def _several_places(result: DiagnosisResult) -> str:
+    """Sentence on the places where the kind of the best single effect is significant, if there are several."""
+    scores, level = result.screening.candidate_scores, result.thresholds.gap_significance_level
+    best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
+    alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
+    places = abbreviated_names_text([s.effect.location for s in alike])
+    advice = "add it to the model at all of them (`model.effects`, or `yid-ocp friction` for friction)"
+    return f"{best[0]} is significant at {places}: {advice}." if len(alike) > 1 else ""
+
+
+def _bound_by_priors(result: DiagnosisResult) -> list[str]:
+    """One sentence per refitted effect whose amplitudes only the priors of nominal parameters determine."""
+    text = []
+    for fit in result.single_effect_models:
+        if not isinstance(fit, RefittedModel) or fit.evaluation.jacobian is None:
+            continue
+        names, rows, own = fit.problem.unknown_names, fit.problem.residual_rows, fit.effects[-1]
+        data, priors = (fit.evaluation.jacobian[part] for part in (rows.data, rows.stated_priors))
+        others: dict[str, None] = {}
+        for name in own.amplitude_parameter_names:
+            by = priors_that_determine_unknown(data, priors, names.index(name))
+            others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
+        beside = f"These motions determine {own.label} only in relation to "
+        text.append(_listed(beside, others, ": state one of them exactly."))
+    return text
+
+
+def _named(effect: EffectBase, fit: RefitStatistics) -> str:
+    """An effect with its estimates, and a warning if an amplitude is far outside its expected range."""
+    values, odd = [], ""
+    for name, r in fit.effect_parameters_as_reported(effect).items():
+        known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".removesuffix(" 1")
+        values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
+    for name in fit.amplitudes_beyond_prior_range(effect):
+        low, high = effect.prior_ranges[name]
+        odd = f" (outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
+    return f"{effect.label} with {', '.join(values)}{odd}"
+
+
+def _remains(result: DiagnosisResult) -> list[str]:
+    """Sentences on the error that remains on held-out motions, and on what the effects change in the model."""
+    noise = {own.channel: own.noise_rmse for own in result.noise_floor}
+    errors = result.final_model.held_out_loss.channel_rmse.items()
+    beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
+    worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
+    mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
+    said = "What remains on held-out motions is within noise and the uncertainty of the parameters."
+    if result.remaining_test.p_value < result.thresholds.significance_level:
+        said = f"What remains on held-out motions is model error: {', '.join([*worst.values(), *mostly])}."
+    moved = [
+        f"{name} from {own['before']:.3g} to {own['after']:.3g}"
+        for name, own in result.nominal_parameters_before_and_after.items()
+        if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
+    ]
+    return [said, _listed("Changed parameters of the nominal model: ", moved)]
+
+
+def _earlier_runs(result: DiagnosisResult) -> list[str]:
+    """Sentences on changes since the baseline, and on recordings made without the effects, and with them."""
+    since, swapped, text = result.baseline_comparison, result.counterfactual, list[str]()
+    if since is not None:
+        moved = []
+        for own in since.changed_parameters:
+            before = f"{own.baseline_value:.3g} ± {own.baseline_std:.2g}"
+            moved.append(f"{own.name} goes from {before} to {own.current_value:.3g} ± {own.current_std:.2g} {own.unit}")
+        text.append(_listed("Against the baseline, ", moved or ["no parameter has changed detectably"]))
+        if since.between_runs_p_value < _RUNS_DIFFER_LEVEL:
+            differ = f"differ among themselves (p = {since.between_runs_p_value:.2g})"
+            text.append(f"The runs of the baseline {differ}; their ± includes this.")
+        if not since.is_baseline_explained:
+            text.append("The model did not explain the baseline's recordings, so its ± may be too small.")
+    parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
+    for how, part in parts.items():
+        made = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
+        made = f"Recordings made {how} the effects ({made})"
+        plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
+        if part.failure_message:
+            text.append(f"{made} could not be predicted ({part.failure_message}).")
+            continue
+        text.append(f"{made} are predicted to {errors} (rms) {how} them, and to {plain} without a diagnosis.")
+        if not part.is_improved_by_counterfactual:
+            text.append("That is no better, so the effect may be a substitute for another cause.")
+    return text
