@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import logging
 import math
@@ -113,14 +112,10 @@ def diagnose(
         composed = _composed(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
-        _end_stage(search, "compose")
+        search.end_stage("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 10.5)
         nominal = fit_nominal_model(problem, composed, known_fits.solution, known_fits.store, thresholds)
         return _diagnosed(problem, _examined(search, nominal), earlier)
-
-
-def _end_stage(search: RefitContext, stage: str) -> None:
-    search.stage_ends[stage] = time.perf_counter()
 
 
 @dataclass(frozen=True)
@@ -146,11 +141,11 @@ def _examined(
     """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
     limits = search.thresholds
     search, nominal, cuts = _followed(search, nominal, known)
-    _end_stage(search, "nominal")
+    search.end_stage("nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
     whole, with_events = _undivided(search.problem), search
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
-    _end_stage(search, "events")
+    search.end_stage("events")
     angles = _largest_joint_angles(nominal)
     effects = tuple(effect.with_prior_ranges_for_largest_angles(angles) for effect in search.problem.candidate_effects)
     held_out_test, spread = _held_out_null_test_and_spread(nominal, limits)
@@ -167,7 +162,7 @@ def _examined(
             raise
         return _examined(*_at_half_time_step(search, nominal, "the model with all candidates fails"))
     evidence = NominalModelGapEvidence(nominal, *tests, screened)
-    _end_stage(search, "screening")
+    search.end_stage("screening")
     if evidence.warrants_search(limits) and not is_corrected_for_links:
         # without the error of its discretisation, the gap may be none
         gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
@@ -310,9 +305,8 @@ def _excess_of(residual: Array) -> float:
 
 def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
-    steps, end_stage = (problem.step.time_step, nominal.problem.step.time_step), functools.partial(_end_stage, search)
     evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_from_baseline(nominal, limits))
-    judged = judge(search, evidence, end_stage)
+    judged = judge(search, evidence)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):
@@ -320,7 +314,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         # without events, the smoother already ran on all fitted data
         smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
-    end_stage("localisation")
+    search.end_stage("localisation")
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selected_effects:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
@@ -329,11 +323,11 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
         # a disturbance that a better model explains was no event
         events = _happened(seen.whole, final, limits)[0]
-    end_stage("remaining")
+    search.end_stage("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
     law = find_gap_law(search, problem, final, places, seen.events)
-    end_stage("law")
+    search.end_stage("law")
     ends = search.stage_ends
     finding = DiagnosisResult(
         **(vars(evidence) | vars(judged)),
@@ -353,7 +347,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         baseline_comparison=earlier.parameter_shifts_of_fit(final, limits),
         counterfactual=earlier.errors_on_recordings_with_and_without_effects(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
-        stated_and_used_time_step=steps,
+        stated_and_used_time_step=(problem.step.time_step, nominal.problem.step.time_step),
         is_corrected_for_links=seen.is_corrected_for_links,
         search_seconds=ends["refits"] - ends[""],
         law=law,

@@ -172,6 +172,10 @@ class RefitContext:
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
 
+    def end_stage(self, name: str) -> None:
+        """Record that a stage ends now."""
+        self.stage_ends[name] = time.perf_counter()
+
     def record_skip_if_past_deadline(self, *what: str) -> bool:
         """Check whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
         is_late = time.perf_counter() >= self.deadline
@@ -229,6 +233,8 @@ class RefitContext:
         return found
 
 
+EffectsWithStart = tuple[Sequence[EffectBase], Mapping[str, float]]
+"""Effects to refit, and their values at the start."""
 _Attempt = tuple[EstimationProblem, SolverResult, Evaluation]
 """Problem with filters linearised about the torques at the end of a run, the run, and the evaluation at its end."""
 
@@ -377,7 +383,7 @@ def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Arr
 def refit_with_each_effect(
     search: RefitContext,
     base: Sequence[EffectBase],
-    tried: Sequence[tuple[Sequence[EffectBase], Mapping[str, float]]],
+    tried: Sequence[EffectsWithStart],
     values: Mapping[str, float],
     where: str = "",
 ) -> list[RefitStatistics]:
@@ -399,7 +405,7 @@ def refit_with_each_effect(
         known = {name: fit.held_out_loss.chi2_per_sample for name, fit in [*search.record.refits.items()] if fit}
         return [head, *((name, f"{left:.4g}") for name, left in sorted(known.items(), key=lambda entry: entry[1]))]
 
-    def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefitStatistics | None:
+    def one(entry: EffectsWithStart) -> RefitStatistics | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
         fit = search.refit(effects, {**values, **entry[1]}, f"{join_effect_labels(effects)} {where}".strip())
         left = "no fit" if fit is None else f"held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"

@@ -13,7 +13,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
-from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics, refit_with_each_effect
+from yid_ocp.diagnosis.refit import (
+    EffectsWithStart,
+    HeldOutLoss,
+    RefitContext,
+    RefitStatistics,
+    refit_with_each_effect,
+)
 from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
@@ -120,8 +126,12 @@ def _near_best_models(
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
         best = min(fits, key=lambda fit: bic_difference(fit, nominal), default=nominal)
-        most = _undecided_chi2(nominal, best, limits)
-        distances = [bic_difference(fit, best) / most for fit in fits]
+        # errors of the models' responses leave a part of what the best one explains; more than a standard deviation of
+        # chi2 would be found by a test
+        samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
+        errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
+        decisive = max(2 * limits.min_log_bayes_factor, errors)
+        distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:
         distances = [_distance_in_prediction(fit, best) for fit in fits]
@@ -129,17 +139,6 @@ def _near_best_models(
     near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
     near.sort(key=lambda own: (not _is_plausible(own[0].effects[-1], own[0], limits), *own[2]))
     return [(fit, distance) for fit, distance, _ in near]
-
-
-def _undecided_chi2(nominal: RefitStatistics, best: RefitStatistics, limits: Thresholds) -> float:
-    """Difference of two models' BIC that decides between them.
-
-    Beyond decisive odds, it counts errors of the models' responses, which leave a part of what the best one explains,
-    but no more than the standard deviation of chi2, which a test would find.
-    """
-    samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
-    errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
-    return max(2 * limits.min_log_bayes_factor, errors)
 
 
 def _chi2(fit: RefitStatistics) -> float:
@@ -203,11 +202,7 @@ def _plausible_beside(
     return [fit for fit in fits if all(_is_plausible(effect, fit, limits) for effect in _beside(base, fit))]
 
 
-_Start = tuple[tuple[EffectBase, ...], Mapping[str, float]]
-"""Effects that are refitted, and their values at the start."""
-
-
-def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[_Start]:
+def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[EffectsWithStart]:
     """Candidates to refit, with initial values: the best, and as many that are confusable with them."""
     ranked = [score for score in screened.candidate_scores if score.p_value < limits.significance_level]
     best, others = ranked[: limits.n_refit_per_round], ranked[limits.n_refit_per_round :]
@@ -222,14 +217,12 @@ class _Choice:
     """The effects in the model, refitted together, and the equivalent effects of each, with their distances."""
 
     fit: RefitStatistics
-    rivals: Mapping[str, Sequence[tuple[EffectBase, float]]] = field(default_factory=dict)  # by label, itself first
+    rivals: Mapping[str, Sequence[tuple[EffectBase, float]]] = field(default_factory=dict)  # by label
 
     def replaced(self, fit: RefitStatistics, near: Sequence[tuple[EffectBase, float]]) -> _Choice:
         """The choice with other effects; the last has the rivals `near`, and effects that stay keep theirs."""
-        *before, last = fit.effects
-        kept = {effect.label: self.rivals.get(effect.label, [(effect, 0.0)]) for effect in before}
-        known = {effect.label: (effect, distance) for effect, distance in ((last, 0.0), *near)}
-        return _Choice(fit, kept | {last.label: (*known.values(),)})
+        kept = {effect.label: self.rivals.get(effect.label, ()) for effect in fit.effects}
+        return _Choice(fit, kept | {fit.effects[-1].label: near})
 
 
 def select_effects(
@@ -297,9 +290,9 @@ def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
     return refit_with_each_effect(search, (), _refit_shortlist(screened, search.thresholds), {}, where)
 
 
-def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[_Start]:
+def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[EffectsWithStart]:
     """The pairs of candidates to refit: best penalised decrease first, without confusable duplicates."""
-    limits, chosen = search.thresholds, list[_Start]()
+    limits, chosen = search.thresholds, list[EffectsWithStart]()
 
     def same(one: EffectBase, other: EffectBase) -> bool:
         alike = screened.confusability.confusable_with(one.label, limits.signature_overlap)
@@ -340,7 +333,7 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     company = f"in the place of {label}"
     screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
     best = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
-    tried = [pair for pair in best if pair[0][0].label != label]
+    tried = [start for start in best if start[0][0].label != label]
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
     near = _near_best_models(nominal, [own, *_plausible_beside(rest, others, limits)], limits)
@@ -362,15 +355,18 @@ def _with_closures(
         again = f"{join_effect_labels(effects[:i])} again"
         fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
         closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        found.append(_with_rivals(SelectedEffect(effect, fit, closed, (), ()), chosen.rivals[effect.label]))
+        found.append(_selected(effect, fit, closed, chosen.rivals[effect.label]))
     return tuple(found)
 
 
-def _with_rivals(entry: SelectedEffect, rivals: Sequence[tuple[EffectBase, float]]) -> SelectedEffect:
-    """The entry with equivalent effects, given with their distances, and their shares of its probability."""
-    effects, distances = zip(*rivals, strict=True)
+def _selected(
+    effect: EffectBase, fit: RefitStatistics, closed: GapClosure, rivals: Sequence[tuple[EffectBase, float]]
+) -> SelectedEffect:
+    """A selected effect with its rivals, given with their distances, and their shares of its probability."""
+    known = {own.label: (own, distance) for own, distance in ((effect, 0.0), *rivals)}
+    effects, distances = zip(*known.values(), strict=True)
     weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
-    return replace(entry, equivalent_effects=effects, shares=tuple(weights / weights.sum()))
+    return SelectedEffect(effect, fit, closed, effects, tuple(weights / weights.sum()))
 
 
 def selected_effect_alone(
@@ -378,5 +374,4 @@ def selected_effect_alone(
 ) -> SelectedEffect:
     """Return `entry` as the only selected effect, with its equivalent effects among the `fits` of single effects."""
     near = [(fit.effects[-1], distance) for fit, distance in _near_best_models(nominal, fits, limits)]
-    known = {effect.label: (effect, distance) for effect, distance in ((entry.effect, 0.0), *near)}
-    return _with_rivals(entry, [*known.values()])
+    return _selected(entry.effect, entry.refitted_model, entry.cumulative_closure, near)

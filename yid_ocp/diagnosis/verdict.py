@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -120,12 +119,6 @@ class Judgement:
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     @property
-    def _independent_effect_count(self) -> int:
-        """Number of independent effects selected: one per local effect and one per other kind."""
-        effects = (entry.effect for entry in self.selected_effects)
-        return len({effect.label if effect.is_local else effect.kind for effect in effects})
-
-    @property
     def failed_transfer_checks(self) -> tuple[EffectAmplitudeTransferCheck, ...]:
         """The checks in which estimation and held-out recordings give different values of an effect parameter."""
         return tuple(entry for entry in self.transfer_checks if not entry.is_consistent)
@@ -158,10 +151,12 @@ class Judgement:
     def required_total_explained_fraction(self, limits: Thresholds) -> float:
         """Compute the fraction of the gap that the selected effects must explain to be accepted.
 
-        For k independent effects it is 1 - (1 - `min_explained_fraction`)^k: each must explain that part of the
-        remainder.
+        For k independent effects (one per local effect and one per other kind) it is
+        1 - (1 - `min_explained_fraction`)^k: each must explain that part of the remainder.
         """
-        return 1.0 - (1.0 - limits.min_explained_fraction) ** self._independent_effect_count
+        effects = (entry.effect for entry in self.selected_effects)
+        independent = {effect.label if effect.is_local else effect.kind for effect in effects}
+        return 1.0 - (1.0 - limits.min_explained_fraction) ** len(independent)
 
 
 def _verdict_and_reason(
@@ -171,39 +166,31 @@ def _verdict_and_reason(
 
     A gap that is seen only along a candidate's signature counts only with an accepted effect.
     """
-    explained, rivals = said._largest_explained_fraction, said.selected_effects[:1]
-    reasons: tuple[tuple[bool, UnknownVerdictReason], ...] = (
-        (not said.selected_effects, "none"),
-        (explained < said.required_total_explained_fraction(limits), "little"),
-        (bool(said.failed_transfer_checks), "stand_in"),
-        (True, ""),
-    )
-    reason = next(reason for holds, reason in reasons if holds)
-    rules = (
-        (not are_data_sufficient, "insufficient_data"),
-        (reason and not exceeds_noise, "no_gap"),
-        (reason, "unknown"),
-        (any(len(entry.equivalent_effects) > 1 for entry in rivals), "confusable"),
-        (True, "effect"),
-    )
-    verdict = next(verdict for holds, verdict in rules if holds)
-    return verdict, reason if verdict == "unknown" else ""
+    reason: UnknownVerdictReason = ""
+    if not said.selected_effects:
+        reason = "none"
+    elif said._largest_explained_fraction < said.required_total_explained_fraction(limits):
+        reason = "little"
+    elif said.failed_transfer_checks:
+        reason = "stand_in"
+    if not are_data_sufficient:
+        return "insufficient_data", ""
+    if reason:
+        return ("unknown", reason) if exceeds_noise else ("no_gap", "")
+    return ("confusable" if len(said.selected_effects[0].equivalent_effects) > 1 else "effect"), ""
 
 
-def judge(
-    search: RefitContext, evidence: NominalModelGapEvidence, finished: Callable[[str], None] = lambda _: None
-) -> Judgement:
+def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     """Search for effects if there is evidence for a gap, and decide the verdict.
 
     Refits and screenings are requested by name and can come from a record, so the verdict depends on numbers alone.
-    `finished` is called with the name of each stage.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
     exceeds, suffice = evidence.exceeds_noise(limits), evidence.are_data_sufficient(limits)
     fits, added = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...]()
     if evidence.warrants_search(limits):
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
-    finished("refits")
+    search.end_stage("refits")
 
     def judged(chosen: tuple[SelectedEffect, ...]) -> Judgement:
         carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
@@ -217,11 +204,12 @@ def judge(
         verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
         return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, exceeds, limits))
 
-    whole = judged(added)
-    # a further effect that only corrects errors of the first is no reason to doubt this one
-    alone = (judged((selected_effect_alone(own, nominal, fits, limits),)) for own in added[: len(added) > 1])
-    said = next((own for own in itertools.chain([whole], alone) if own.verdict != "unknown"), whole)
-    finished("carry_over")
+    said = judged(added)
+    if said.verdict == "unknown" and len(added) > 1:
+        # a further effect that only corrects errors of the first is no reason to doubt this one
+        alone = judged((selected_effect_alone(added[0], nominal, fits, limits),))
+        said = alone if alone.verdict != "unknown" else said
+    search.end_stage("carry_over")
     return said
 
 
