@@ -25,21 +25,18 @@ from yid_ocp.diagnosis.hypotheses import (
     AllCandidatesProblem,
     CandidateNamesOrAll,
     HeldOutTruncation,
-    exclude_candidates,
-    make_candidate_effects,
+    compose_candidates,
 )
 from yid_ocp.diagnosis.law import find_gap_law
 from yid_ocp.diagnosis.refit import (
-    NO_REFIT_STORE,
-    NominalSolutionAndRefitStore,
     RefitContext,
-    RefitStore,
     RefittedModel,
     held_out_loss,
     reevaluate_refit_with_all_candidates,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.screening import screen_candidates
+from yid_ocp.diagnosis.refit_store import NO_REFIT_STORE, NominalSolutionAndRefitStore, RefitStore
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, screen_candidates
 from yid_ocp.diagnosis.sentences import (
     diagnosis_summary_text,
     held_out_truncation_message,
@@ -55,7 +52,6 @@ from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import ResidualAndJacobian, subtract_estimated_bias_and_clock_errors
 from yid_ocp.solvers import GaussNewton, Solution, solve
 
@@ -109,7 +105,7 @@ def diagnose(
         earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_run_estimates(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = add_baseline_prior(problem, earlier.combined_estimates)
-        composed = _composed(problem, candidates, exclude, held_out, progress)
+        composed = compose_candidates(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
         search.end_stage("compose")
@@ -143,7 +139,7 @@ def _examined(
     search, nominal, cuts = _followed(search, nominal, known)
     search.end_stage("nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
-    whole, with_events = _undivided(search.problem), search
+    whole, with_events = search.problem.problem_with_all_samples, search
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
     search.end_stage("events")
     angles = _largest_joint_angles(nominal)
@@ -155,12 +151,14 @@ def _examined(
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     nominal = replace(nominal, held_out_loss=held_out_loss(own, own.unknown_vector(nominal.values), spread))
+    why, h = "", own.step.time_step
     try:
         screened = screen_candidates(composed, (), nominal.values)
     except SolverError:
-        if not nominal.problem.step.time_step > _MAX_STEP_OF_LAST_HALVING:
+        if not h > _MAX_STEP_OF_LAST_HALVING:
             raise
-        return _examined(*_at_half_time_step(search, nominal, "the model with all candidates fails"))
+        # without candidates, the evidence warrants no search
+        why, screened = "the model with all candidates fails", EMPTY_SCREENING_RESULT
     evidence = NominalModelGapEvidence(nominal, *tests, screened)
     search.end_stage("screening")
     if evidence.warrants_search(limits) and not is_corrected_for_links:
@@ -168,10 +166,13 @@ def _examined(
         gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
         fall = _fall_at_half_time_step(search, nominal, events)
         if fall > gap / 2:
-            return _examined(*_at_half_time_step(search, nominal, f"half the time step lowers chi2 by {fall:.3g}"))
-        corrected = _without_error_of_links(with_events, nominal, gap)
-        if corrected is not None:
+            why = f"half the time step lowers chi2 by {fall:.3g}"
+        elif corrected := _without_error_of_links(with_events, nominal, gap):
             return _examined(*corrected, cuts, True)
+    if why:
+        search.progress.begin_stage(f"{why}: going on at {h / 2:g} s")
+        search = replace(search, problem=search.problem.with_time_step(h / 2))
+        return _examined(search, _fitted_nominal_model(search, nominal.values))
     found = nominal, cuts, whole, events, smoothed, evidence, is_corrected_for_links
     return _Examined(replace(search, problem=composed), *found)
 
@@ -183,14 +184,6 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     fine, x = problem_corrected_for_events(finer, events), fit.problem.unknown_vector(fit.values)
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
     return -math.inf if left is None else _excess_of(fit.evaluation.residual) - _excess_of(left)
-
-
-def _at_half_time_step(search: RefitContext, fit: RefittedModel, why: str) -> tuple[RefitContext, RefittedModel]:
-    """Hypotheses and nominal fit at half the time step."""
-    h = fit.problem.step.time_step / 2
-    search.progress.begin_stage(f"{why}: going on at {h:g} s")
-    search = replace(search, problem=search.problem.with_time_step(h))
-    return search, _fitted_nominal_model(search, fit.values)
 
 
 def _without_error_of_links(
@@ -227,19 +220,6 @@ def _followed(
         name = f"the nominal model, limited to the part that it can follow ({fraction:g})"
         nominal = _fitted_nominal_model(search, nominal.values, name)
     return search, nominal, tuple(found.values())
-
-
-def _undivided(composed: AllCandidatesProblem) -> EstimationProblem:
-    """The composed problem with all samples, even if a diagnosis divides a single recording in blocks."""
-    if not composed.is_split_in_blocks:
-        return composed.problem
-
-    def joined(own: Episode, other: Episode) -> Episode:
-        pairs = zip(own.measurements, other.measurements, strict=True)
-        parts = [replace(a, value=np.fmax(a.value, b.value), weight=a.weight + b.weight) for a, b in pairs]
-        return replace(own, measurements=tuple(parts))
-
-    return composed.problem.with_episodes(list(map(joined, composed.problem.episodes, composed.problem.held_out)), ())
 
 
 def _without_events(
@@ -367,25 +347,6 @@ def _fitted_nominal_model(
     if fit is None:
         raise failed_rollout_error("it fails at the fitted values", "nominal model")
     return fit
-
-
-def _composed(
-    problem: EstimationProblem,
-    candidates: CandidateNamesOrAll,
-    leave_out: Sequence[str],
-    held_out: Sequence[Recording],
-    progress: Progress,
-) -> AllCandidatesProblem:
-    """The problem with all candidates; see `diagnose` for errors."""
-    if problem.options.weighting != "whitened":
-        what = "a diagnosis needs residuals in units of their noise"
-        hint = "set problem.weighting: whitened and the noise levels under `sensors`"
-        raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
-    effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    exclude_candidates(effects, leave_out)  # reject names before compilation
-    progress.begin_stage(f"composing {len(effects)} candidates into one step", ahead=16.0)
-    composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
-    return replace(composed, candidate_effects=tuple(exclude_candidates(composed.candidate_effects, leave_out)))
 
 
 def _after(

@@ -11,9 +11,10 @@ import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
+from yid_ocp.display import Progress
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.effects.friction import effect_as_sharp_as_nominal_friction
-from yid_ocp.errors import ConfigError, DataError, nearest_name_question
+from yid_ocp.errors import ConfigError, DataError, SolverError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
     problem_relinearized_at_torque_bias,
@@ -164,6 +165,19 @@ class AllCandidatesProblem:
         return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held, alone)
 
     @property
+    def problem_with_all_samples(self) -> EstimationProblem:
+        """The composed problem with all samples, even if a single recording is divided in blocks."""
+        if not self.is_split_in_blocks:
+            return self.problem
+
+        def joined(own: Episode, other: Episode) -> Episode:
+            pairs = zip(own.measurements, other.measurements, strict=True)
+            parts = [replace(a, value=np.fmax(a.value, b.value), weight=a.weight + b.weight) for a, b in pairs]
+            return replace(own, measurements=tuple(parts))
+
+        return self.problem.with_episodes(list(map(joined, self.problem.episodes, self.problem.held_out)), ())
+
+    @property
     def nominal_free_parameter_names(self) -> tuple[str, ...]:
         """The names of the free parameters of the nominal problem."""
         return self.problem.free
@@ -246,6 +260,25 @@ class AllCandidatesProblem:
         if not own.has_process_noise:
             return own
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))
+
+
+def compose_candidates(
+    problem: EstimationProblem,
+    candidates: CandidateNamesOrAll,
+    leave_out: Sequence[str],
+    held_out: Sequence[Recording],
+    progress: Progress,
+) -> AllCandidatesProblem:
+    """Return the problem with all candidates that are not left out. See `diagnose` for errors."""
+    if problem.options.weighting != "whitened":
+        what = "a diagnosis needs residuals in units of their noise"
+        hint = "set problem.weighting: whitened and the noise levels under `sensors`"
+        raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
+    effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
+    exclude_candidates(effects, leave_out)  # reject names before compilation
+    progress.begin_stage(f"composing {len(effects)} candidates into one step", ahead=16.0)
+    composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
+    return replace(composed, candidate_effects=tuple(exclude_candidates(composed.candidate_effects, leave_out)))
 
 
 def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFunctions) -> EstimationProblem | None:

@@ -7,17 +7,17 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Protocol, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
+from yid_ocp.diagnosis.refit_store import NO_REFIT_STORE, RefitStore, StoredFit
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
@@ -35,7 +35,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
-from yid_ocp.solvers import GaussNewton, Solution, Status
+from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import SolverResult
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)  # good to a part of a std
@@ -74,16 +74,6 @@ class HeldOutLoss:
 
 
 @dataclass(frozen=True)
-class StoredFit:
-    """The stored values and standard deviations of a refit. One evaluation restores a `RefittedModel` from them."""
-
-    values: dict[str, float]  # values of all unknowns
-    std: dict[str, float]  # inflated by the misfit as in `solve`; infinite if not informed by the data
-    p_values: dict[str, float]  # by effect: p-value of its amplitudes, at fixed shape parameters
-    solver_message: str  # why the solver ended
-
-
-@dataclass(frozen=True)
 class RefitStatistics(StoredFit):
     """The result of a refit without its estimation problem: effects, estimates, cost and held-out errors."""
 
@@ -104,9 +94,9 @@ class RefitStatistics(StoredFit):
 
     def amplitudes_beyond_prior_range(self, effect: EffectBase) -> list[str]:
         """List the amplitudes of an effect that leave their prior range by more than a quarter of its width."""
-        ranges = {name: effect.prior_ranges[name] for name in effect.amplitude_parameter_names}
-        far = {name: abs(self.values[name] - (low + high) / 2) / (high - low) for name, (low, high) in ranges.items()}
-        return [name for name, away in far.items() if away > 0.5 + _PRIOR_RANGE_TOLERANCE]
+        ranges = ((name, *effect.prior_ranges[name]) for name in effect.amplitude_parameter_names)
+        away = {name: abs(self.values[name] - (low + high) / 2) / (high - low) for name, low, high in ranges}
+        return [name for name, widths in away.items() if widths > 0.5 + _PRIOR_RANGE_TOLERANCE]
 
 
 @dataclass(frozen=True)
@@ -119,34 +109,6 @@ class RefittedModel(RefitStatistics):
     def statistics(self) -> RefitStatistics:
         """Return the statistics of the refit without its problem and evaluation, which saves memory."""
         return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
-
-
-class RefitStore(Protocol):
-    """An interface for storing finished refits, so that an interrupted diagnosis can resume. Two threads call it."""
-
-    def stored_refit(self, name: str) -> StoredFit | None:
-        """Return the refit that is stored under a name, or None."""
-        return None
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit under a name."""
-        return None
-
-
-class _NoStore(RefitStore):
-    """Keeps nothing: the interface's own methods."""
-
-
-NO_REFIT_STORE: RefitStore = _NoStore()
-"""Store of a diagnosis that no other one resumes."""
-
-
-@dataclass(frozen=True)
-class NominalSolutionAndRefitStore:
-    """The results that an interrupted diagnosis left: the nominal solution and the finished refits."""
-
-    solution: Solution | None = None
-    store: RefitStore = NO_REFIT_STORE  # receives every new refit
 
 
 @dataclass(frozen=True)
@@ -222,14 +184,14 @@ class RefitContext:
     def ranked_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
-        found = screened.joint_score_model.ranked_candidate_pairs(labels)
-        return self._answer(self.record.pairs, without, lambda: tuple(itertools.islice(found, _MAX_RECORDED_PAIRS)))
+        ranked = screened.joint_score_model.ranked_candidate_pairs
+        return self._answer(self.record.pairs, without, lambda: tuple(ranked(labels))[:_MAX_RECORDED_PAIRS])
 
-    def _answer(self, answers: dict[str, _Answer], name: str, work: Callable[[], _Answer]) -> _Answer:
+    def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:
         """A result, which is recorded."""
         found = work()
         # a model's rollouts would fill the memory
-        answers.setdefault(name, cast(_Answer, found.statistics() if isinstance(found, RefittedModel) else found))
+        answers.setdefault(name, found.statistics() if isinstance(found, RefittedModel) else found)
         return found
 
 
@@ -259,15 +221,19 @@ def refit_with_effects(
         if at_stored.ok:
             return _model(stored, effects, placed, at_stored, problem.held_out_spread)
     runs = [_attempt(problem, effects, start)]
-    runs += [_attempt(problem, effects, other) for other in _other_starts(problem, effects, start, runs[0], limits)]
+    _, _, end = runs[0]
+    if not (end.ok and chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level):
+        # earlier effects were already tried from both starts
+        moved = [effect.alternative_start(start) for effect in effects[-1:]]
+        runs += [_attempt(problem, effects, {**start, **values}) for values in moved if values is not None]
     own, outcome, finish = min(runs, key=lambda run: run[-1].cost)
     if not finish.ok:
         return None
     values = own.named_values(outcome.x)
     own = problem.relinearize_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
-    ranges = {name: high - low for effect in effects for name, (low, high) in effect.prior_ranges.items()}
-    most = {name: _UNINFORMATIVE_STD_RATIO * width for name, width in ranges.items()}
+    ranges = ((name, *ends) for effect in effects for name, ends in effect.prior_ranges.items())
+    most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
     sizes = own.named_values(np.linalg.norm(factor, axis=1))
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
     found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
@@ -298,22 +264,6 @@ def _model(
     kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
     loss = held_out_loss(own, own.unknown_vector(known.values), spread)
     return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
-
-
-def _other_starts(
-    problem: AllCandidatesProblem,
-    effects: Sequence[EffectBase],
-    start: Mapping[str, float],
-    first: _Attempt,
-    limits: Thresholds,
-) -> list[Mapping[str, float]]:
-    """Further starts of a refit whose first run failed or leaves more than noise."""
-    end = first[-1]
-    if end.ok and chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level:
-        return []
-    # earlier effects were already tried from both starts
-    moved = [effect.alternative_start(start) for effect in effects[-1:]]
-    return [{**start, **values} for values in moved if values is not None]
 
 
 def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:
@@ -450,7 +400,10 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
         found = problem_with_sensor_noise_only(problem).predict_held_out(x)
-    channels, contradiction = held_out_rmse_and_unit_by_channel(found), _contradiction(problem, x)
+    joint = problem.options.multivariate_prior.restricted_to(problem.shared_parameters)
+    apart = (x - problem.initial_unknowns)[[problem.unknown_names.index(name) for name in joint.parameter_names]]
+    contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))
+    channels = held_out_rmse_and_unit_by_channel(found)
     return HeldOutLoss(np.concatenate(squares), np.concatenate(counts), channels, contradiction)
 
 
@@ -461,10 +414,3 @@ def held_out_rmse_and_unit_by_channel(
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_unit_and_count_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])
     return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
-
-
-def _contradiction(problem: EstimationProblem, x: Array) -> float:
-    """Sum of squares of the joint prior's residuals."""
-    joint = problem.options.multivariate_prior.restricted_to(problem.shared_parameters)
-    apart = (x - problem.initial_unknowns)[[problem.unknown_names.index(name) for name in joint.parameter_names]]
-    return float(apart @ np.linalg.solve(joint.covariance, apart))

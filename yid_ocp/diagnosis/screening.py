@@ -18,7 +18,7 @@ bounded by Bonferroni).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,6 +62,12 @@ class ProjectedCandidatesLinearization:
 
     projected_residual: Array  # P r, shape (nr,)
     signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
+
+    @property
+    def _grids(self) -> list[list[_EffectSignature]]:
+        """The signatures of each candidate, one per grid value."""
+        labels = dict.fromkeys(signature.effect.label for signature in self.signatures)
+        return [[own for own in self.signatures if own.effect.label == label] for label in labels]
 
 
 @dataclass(frozen=True)
@@ -166,20 +172,19 @@ def _basis(matrix: Array) -> Array:
 
 def _candidate_detectable_amplitudes(point: ProjectedCandidatesLinearization) -> tuple[CandidateDetectability, ...]:
     """Smallest amplitudes of every candidate that are detectable at `DETECTABLE_AMPLITUDE_Z` stds."""
-    found: dict[str, list[CandidateDetectability]] = {}
-    for signature in point.signatures:
-        effect, names = signature.effect, signature.effect.amplitude_parameter_names
-        information = signature.projected_sensitivity.T @ signature.projected_sensitivity
-        inverse = _pinv(information)
-        variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
-        sizes = DETECTABLE_AMPLITUDE_Z * np.sqrt(np.maximum(variance, 0.0))
-        sizes = np.where(np.diag(information) > 1e-16, sizes, np.inf)
-        room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
-        least = dict(zip(names, map(float, sizes), strict=True))
-        found.setdefault(effect.label, []).append(CandidateDetectability(effect, least, bool(np.any(sizes < room))))
-    return tuple(
-        min(own, key=lambda e: (not e.is_detectable, min(e.detectable_amplitudes.values()))) for own in found.values()
-    )
+    found = (map(_detectability, grid) for grid in point._grids)
+    return tuple(min(own, key=lambda e: (not e.is_detectable, min(e.detectable_amplitudes.values()))) for own in found)
+
+
+def _detectability(signature: _EffectSignature) -> CandidateDetectability:
+    effect, names = signature.effect, signature.effect.amplitude_parameter_names
+    information = signature.projected_sensitivity.T @ signature.projected_sensitivity
+    inverse = _pinv(information)
+    variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
+    sizes = DETECTABLE_AMPLITUDE_Z * np.sqrt(np.maximum(variance, 0.0))
+    sizes = np.where(np.diag(information) > 1e-16, sizes, np.inf)
+    room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
+    return CandidateDetectability(effect, dict(zip(names, sizes.tolist(), strict=True)), bool(np.any(sizes < room)))
 
 
 def _pinv(matrix: Array) -> Array:
@@ -216,13 +221,12 @@ def _score_candidates(
 ) -> tuple[CandidateScore, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
-    tries: dict[str, list[CandidateScore]] = {}
-    for signature in point.signatures:
-        if (label := signature.effect.label) in seen:
-            tries.setdefault(label, []).append(_score(signature, point.projected_residual, series))
-    # shape values that make no difference differ by rounding alone: the first one stays
-    best = [(max(own, key=lambda s: float(f"{s.predicted_chi2_decrease:.6g}")), len(own)) for own in tries.values()]
-    found = [replace(score, p_value=min(1.0, score.p_value * count)) for score, count in best]
+    found = []
+    for grid in (own for own in point._grids if own[0].effect.label in seen):
+        tried = [_score(signature, point.projected_residual, series) for signature in grid]
+        # shape values that make no difference differ by rounding alone: the first one stays
+        best = max(tried, key=lambda s: float(f"{s.predicted_chi2_decrease:.6g}"))
+        found.append(replace(best, p_value=min(1.0, best.p_value * len(tried))))
     return tuple(sorted(found, key=lambda s: -s.predicted_chi2_decrease))
 
 
@@ -296,23 +300,20 @@ class LinearModelOfAllCandidates:
         ends = np.cumsum([len(effect.amplitude_parameter_names) for effect in self.effects])
         return np.split(np.arange(len(self.score_vector)), ends)
 
-    def ranked_candidate_pairs(self, among: Sequence[str]) -> Iterator[ScoredCandidatePair]:
-        """Yield all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
+    def ranked_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
+        """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
         """
-        rooms, columns = [_room(effect) for effect in self.effects], self._columns
-        wanted = [i for i, effect in enumerate(self.effects) if effect.label in among]
-        found: list[tuple[float, int, int, Array]] = []
-        for i, j in itertools.combinations(wanted, 2):
-            at = np.concatenate([columns[i], columns[j]])
-            room = np.concatenate([rooms[i], rooms[j]], axis=1)
-            step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], room)
-            found.append((decrease - len(at), i, j, step))
-        for penalized, i, j, step in sorted(found, key=lambda entry: -entry[0]):
-            (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
-            values = _values(one, step[:width]) | _values(other, step[width:])
-            yield (one, other), values | self.shape_values[i] | self.shape_values[j], penalized
+        every = zip(self.effects, self.shape_values, self._columns[:-1], strict=True)
+        found: list[ScoredCandidatePair] = []
+        for (one, shape, first), (other, its_shape, second) in itertools.combinations(every, 2):
+            if {one.label, other.label}.issubset(among):
+                at, room = np.concatenate([first, second]), np.concatenate([_room(one), _room(other)], axis=1)
+                step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], room)
+                values = _values(one, step[: len(first)]) | _values(other, step[len(first) :])
+                found.append(((one, other), values | shape | its_shape, decrease - len(at)))
+        return sorted(found, key=lambda pair: -pair[-1])
 
 
 def _make_joint_score_model(
@@ -320,12 +321,10 @@ def _make_joint_score_model(
 ) -> LinearModelOfAllCandidates:
     """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
-    groups: dict[str, list[_EffectSignature]] = {}
-    for signature in point.signatures:
-        groups.setdefault(signature.effect.label, []).append(signature)
     kept = []
-    for label, group in groups.items():
-        kept.append(next((s for s in group if s.shape_values == shape.get(label)), group[len(group) // 2]))
+    for grid in point._grids:
+        known = shape.get(grid[0].effect.label)
+        kept.append(next((s for s in grid if s.shape_values == known), grid[len(grid) // 2]))
     every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
     effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
     bias = np.concatenate([np.zeros(0), *(s.score_bias for s in kept)])

@@ -21,7 +21,8 @@ from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefittedModel, StoredFit
+from yid_ocp.diagnosis.refit import RefittedModel
+from yid_ocp.diagnosis.refit_store import NominalSolutionAndRefitStore, RefitStore, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError
@@ -265,7 +266,7 @@ def _unknown_force_scene(finding: DiagnosisResult) -> list[AnimationData]:
     return [animation_of_trajectories(f"{episode.name} (unknown forces)", [course], episode.recording)]
 
 
-class _SingleJsonFileRefitStore:
+class _SingleJsonFileRefitStore(RefitStore):
     """A store of refits in one JSON file, replaced as a whole after every refit.
 
     A file from other inputs, another configuration or another version is ignored with a notice.
