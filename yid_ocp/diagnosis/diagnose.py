@@ -142,8 +142,8 @@ def _examined(
     whole, with_events = search.problem.problem_with_all_samples, search
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
     search.end_stage("events")
-    angles = _largest_joint_angles(nominal)
-    effects = tuple(effect.with_prior_ranges_for_largest_angles(angles) for effect in search.problem.candidate_effects)
+    states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
+    effects = search.problem.candidates_with_prior_ranges_for(states)
     held_out_test, spread = _held_out_null_test_and_spread(nominal, limits)
     tests = _estimation_null_test(nominal, limits), held_out_test
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
@@ -373,16 +373,6 @@ def fit_nominal_model(
     solution = solution or solve(problem, GaussNewton(max_iterations=30), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
-
-
-def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
-    """The largest joint angle of each segment in the estimation recordings [rad]."""
-    system, states = fit.problem.system, [r.rollout.state for r in fit.evaluation.episode_predictions]
-    found = {}
-    for segment in system.segment_layouts:
-        index = [system.mechanism.joint_index(joint) for link in segment.link_joints for joint in link]
-        found[segment.name] = max(float(np.abs(state[:, index]).max()) for state in states)
-    return found
 
 
 def _null_test(problem: EstimationProblem, residual: Array, fitted: float, limits: Thresholds) -> NullTestResult:

@@ -83,7 +83,8 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     @property
     def final_model(self) -> RefittedModel:
         """The model with all accepted effects, or the nominal model if there are none."""
-        last = [self.nominal_model, *(entry.refitted_model for entry in self.accepted_selected_effects)][-1]
+        accepted = self.accepted_selected_effects
+        last = accepted[-1].refitted_model if accepted else self.nominal_model
         assert isinstance(last, RefittedModel)
         return last
 

@@ -182,6 +182,14 @@ class AllCandidatesProblem:
         """The names of the free parameters of the nominal problem."""
         return self.problem.free
 
+    def candidates_with_prior_ranges_for(self, states: Sequence[Array]) -> tuple[EffectBase, ...]:
+        """Return the candidates with prior ranges for the largest joint angles of each segment in rolled-out states."""
+        mechanism, largest = self.problem.system.mechanism, {}
+        for segment in self.problem.system.segment_layouts:
+            index = [mechanism.joint_index(joint) for link in segment.link_joints for joint in link]
+            largest[segment.name] = max(float(np.abs(state[:, index]).max()) for state in states)
+        return tuple(effect.with_prior_ranges_for_largest_angles(largest) for effect in self.candidate_effects)
+
     def with_whitening_linearized_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
         """Return the problem whitened by sensor and torque noise, with filters linearised at `values`."""
         if not self.problem.has_process_noise:

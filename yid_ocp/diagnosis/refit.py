@@ -141,7 +141,8 @@ class RefitContext:
     def record_skip_if_past_deadline(self, *what: str) -> bool:
         """Check whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
         is_late = time.perf_counter() >= self.deadline
-        self.skipped.extend(what * is_late)
+        if is_late:
+            self.skipped.extend(what)
         return is_late
 
     def refit(self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str) -> RefitStatistics | None:

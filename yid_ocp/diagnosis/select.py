@@ -63,7 +63,7 @@ class SelectedEffect:
 
 def total_gap_closure(added: Sequence[SelectedEffect]) -> GapClosure:
     """Return the fraction of the gap that all selected effects close together. Undefined without effects."""
-    return [UNDEFINED_GAP_CLOSURE, *(entry.cumulative_closure for entry in added)][-1]
+    return added[-1].cumulative_closure if added else UNDEFINED_GAP_CLOSURE
 
 
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
@@ -153,8 +153,8 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     """
     loss, best = fit.held_out_loss, other.held_out_loss
     (lost, error), count = held_out_improvement_and_error(loss, best), len(best.block_chi2)
-    fewer = other.total_effect_parameter_count - fit.total_effect_parameter_count
-    fewer *= best.chi2_per_sample > _MODEL_ERROR_CHI2
+    is_model_error = best.chi2_per_sample > _MODEL_ERROR_CHI2
+    fewer = other.total_effect_parameter_count - fit.total_effect_parameter_count if is_model_error else 0
     if lost <= math.expm1(fewer * math.log(count) / count) * best.chi2_per_sample:
         return 0.0
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
