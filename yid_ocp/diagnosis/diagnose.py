@@ -17,16 +17,11 @@ from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_st
 from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis import hypotheses
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
-from yid_ocp.diagnosis.hypotheses import (
-    KEPT_FRACTIONS_BEFORE_FAILURE,
-    AllCandidatesProblem,
-    CandidateNamesOrAll,
-    HeldOutTruncation,
-    compose_candidates,
-)
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.law import find_gap_law
 from yid_ocp.diagnosis.refit import (
     RefitContext,
@@ -37,13 +32,9 @@ from yid_ocp.diagnosis.refit import (
 )
 from yid_ocp.diagnosis.refit_store import NO_REFIT_STORE, NominalSolutionAndRefitStore, RefitStore
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, screen_candidates
-from yid_ocp.diagnosis.sentences import (
-    diagnosis_summary_text,
-    held_out_truncation_message,
-    recommended_experiment_text,
-)
+from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
@@ -105,7 +96,7 @@ def diagnose(
         earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_run_estimates(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = add_baseline_prior(problem, earlier.combined_estimates)
-        composed = compose_candidates(problem, candidates, exclude, held_out, progress)
+        composed = hypotheses.compose_candidates(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
         search.end_stage("compose")
@@ -208,7 +199,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[HeldOutTruncation, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = {cut.recording: cut for cut in known}
-    for fraction in KEPT_FRACTIONS_BEFORE_FAILURE:
+    for fraction in hypotheses.KEPT_FRACTIONS_BEFORE_FAILURE:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
@@ -300,7 +291,13 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
         final = reevaluate_refit_with_all_candidates(search.problem, accepted[-1].refitted_model)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
-        remaining, where, rest = _after(evidence.nominal_test, final, where, judged, limits)
+        remaining, rest = _held_out_null_test_and_spread(final, limits)[0], ()
+        tests = _estimation_null_test(final, limits), remaining
+        if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria):
+            rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(final, limits))
+        flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
+        closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
+        where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
         events = _happened(seen.whole, final, limits)[0]
     search.end_stage("remaining")
@@ -347,19 +344,6 @@ def _fitted_nominal_model(
     if fit is None:
         raise failed_rollout_error("it fails at the fitted values", "nominal model")
     return fit
-
-
-def _after(
-    before: NullTestResult, last: RefittedModel, where: tuple[GapLocation, ...], judged: Judgement, limits: Thresholds
-) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
-    """Held-out null test with the accepted effects, locations of the gap, and locations of the residual gap."""
-    tests = _estimation_null_test(last, limits), _held_out_null_test_and_spread(last, limits)[0]
-    rest = tuple[GapLocation, ...]()
-    if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria):
-        rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(last, limits))
-    windows = smoother.merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
-    closed = judged.accepted_effects_closure_by_location
-    return tests[1], smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows), rest
 
 
 def fit_nominal_model(

@@ -12,13 +12,7 @@ from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import (
-    UNDEFINED_GAP_CLOSURE,
-    GapClosure,
-    bic_difference,
-    held_out_gap_closure,
-    total_gap_closure,
-)
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, GapClosure, bic_difference, held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprMixin, ReprTexts
@@ -65,8 +59,8 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprTexts:
-        closed = total_gap_closure(self.accepted_selected_effects)
-        said = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects), closed.text]
+        closed = self.closure_by_selected_effects.text if self.accepted_effects else ""
+        said = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects), closed]
         rows = [("candidate", "parameters", "closure alone", "p")]
         for entry in _ranked_candidates(self, self)[:8]:
             values = ((name, own["value"], own["unit"]) for name, own in entry["parameters"].items())
@@ -133,11 +127,12 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
     """Convert the verdict of a diagnosis and the evidence for it to a JSON-compatible dictionary."""
     added = judged.accepted_selected_effects
     before = _errors(seen.nominal_model) | attributes_to_dict(seen.nominal_held_out_test, "chi2_per_dof p_value")
+    closed = judged.closure_by_selected_effects if added else UNDEFINED_GAP_CLOSURE
     rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
     found = {
         "verdict": judged.verdict,
         "probability": judged.probability,
-        "gap": {"before": before, **_closure(total_gap_closure(added))},
+        "gap": {"before": before, **_closure(closed)},
         "where": [attributes_to_dict(place, _PLACE) for place in where],
         "which": _ranked_candidates(judged, seen),
         "effects": [attributes_to_dict(entry.effect, _EFFECT) for entry in added],

@@ -319,9 +319,8 @@ def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Arr
     """
     found = {}
     for effect in effects:
-        shapes, sized = (
-            [names.index(n) for n in of] for of in (effect.shape_parameter_names, effect.amplitude_parameter_names)
-        )
+        shapes = [names.index(name) for name in effect.shape_parameter_names]
+        sized = [names.index(name) for name in effect.amplitude_parameter_names]
         away = x[sized] - [effect.neutral_values[names[i]] for i in sized]
         others = np.linalg.qr(factor[shapes].T)[0]
         rows = factor[sized] - factor[sized] @ others @ others.T
@@ -380,24 +379,22 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
     """Compute the prediction loss on held-out recordings. `spread` (n, k) is from `AllCandidatesProblem`."""
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
-    found, residuals, numbered = problem.predict_held_out(x), [], []
+    found, residuals, numbered, count = problem.predict_held_out(x), [], [], 0
     for i, (episode, result) in enumerate(found):
         blocks = []
         for samples in episode.measurements:
             used, times = samples.positive_weight_mask, times_since_recording_start(episode, samples)
             block = np.trunc(times / length).reshape(len(times), -1)
             blocks.append(np.broadcast_to(block, used.shape)[used])
-        block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
+        own, block = np.unique(np.concatenate(blocks), return_inverse=True)
+        numbered.append(count + block)
+        count += len(own)
         residuals.append(np.full(len(block), np.inf))
         if not isinstance(result, str):
             residuals[-1] = problem.whitened_held_out_residual_and_jacobian(i, episode, result).residual
-        numbered.append(block)
-    whole = np.concatenate(residuals)
+    whole, number = np.concatenate(residuals), np.concatenate(numbered)
     if spread is not None:  # what the nominal parameters leave uncertain is no gap
         whole = np.nan_to_num(whiten_with_extra_errors(whole, spread), nan=np.inf, posinf=np.inf, neginf=np.inf)
-    parts = np.split(whole, np.cumsum([len(own) for own in residuals])[:-1])
-    squares = [np.bincount(block, weights=own**2) for block, own in zip(numbered, parts, strict=True)]
-    counts = [np.bincount(block).astype(float) for block in numbered]
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
         found = problem_with_sensor_noise_only(problem).predict_held_out(x)
@@ -405,7 +402,8 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
     apart = (x - problem.initial_unknowns)[[problem.unknown_names.index(name) for name in joint.parameter_names]]
     contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))
     channels = held_out_rmse_and_unit_by_channel(found)
-    return HeldOutLoss(np.concatenate(squares), np.concatenate(counts), channels, contradiction)
+    squares = np.bincount(number, weights=whole**2).astype(float)
+    return HeldOutLoss(squares, np.bincount(number).astype(float), channels, contradiction)
 
 
 def held_out_rmse_and_unit_by_channel(

@@ -28,14 +28,9 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
+from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
-from yid_ocp.inference.null_test import (
-    ChannelResidualIndices,
-    channels_with_residual_indices,
-    chi2_p_value,
-    encoder_noise_residual_covariance_factor,
-    episodes_with_added_path_noise,
-)
+from yid_ocp.inference.null_test import ChannelResidualIndices, channels_with_residual_indices
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 
@@ -109,11 +104,11 @@ def linearize_candidates(
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
     placed = problem.with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
-    scatter = encoder_noise_residual_covariance_factor(placed, placed.unknown_vector(values))[rows.data]
+    scatter = null_test.encoder_noise_residual_covariance_factor(placed, placed.unknown_vector(values))[rows.data]
     is_in_scatter = np.any(scatter, axis=1)
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
-    redrawn = [episodes_with_added_path_noise(placed, rng) for _ in draws]
+    redrawn = [null_test.episodes_with_added_path_noise(placed, rng) for _ in draws]
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
     for shapes in itertools.zip_longest(*map(_shape_grid, tried)):
         chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]
@@ -256,7 +251,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Channe
     covariance = _newey_west_covariance(x, residual + x @ step, series) + signature.score_prior_covariance
     # a residual below the noise must not make a score significant
     statistic = float(slope @ _pinv(max(floor, covariance, key=np.trace)) @ slope)
-    p_value = chi2_p_value(statistic, len(step))
+    p_value = null_test.chi2_p_value(statistic, len(step))
     if room[0].tolist() == [0.0]:
         statistic, p_value = (statistic, p_value / 2) if step[0] > 0 else (0.0, 1.0)
     values = _values(effect, step) | signature.shape_values

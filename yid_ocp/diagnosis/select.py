@@ -13,13 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
-from yid_ocp.diagnosis.refit import (
-    EffectsWithStart,
-    HeldOutLoss,
-    RefitContext,
-    RefitStatistics,
-    refit_with_each_effect,
-)
+from yid_ocp.diagnosis.refit import EffectsWithStart, HeldOutLoss, RefitContext, RefitStatistics, refit_with_each_effect
 from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
@@ -59,11 +53,6 @@ class SelectedEffect:
     cumulative_closure: GapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
-
-
-def total_gap_closure(added: Sequence[SelectedEffect]) -> GapClosure:
-    """Return the fraction of the gap that all selected effects close together. Undefined without effects."""
-    return added[-1].cumulative_closure if added else UNDEFINED_GAP_CLOSURE
 
 
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:

@@ -7,15 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import (
-    GapClosure,
-    SelectedEffect,
-    select_effects,
-    selected_effect_alone,
-    total_gap_closure,
-)
+from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, select_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
@@ -110,8 +105,8 @@ class Judgement:
 
     @property
     def closure_by_selected_effects(self) -> GapClosure:
-        """The fraction of the gap that all selected effects close together."""
-        return total_gap_closure(self.selected_effects)
+        """The fraction of the gap that all selected effects close together. Undefined without effects."""
+        return self.selected_effects[-1].cumulative_closure if self.selected_effects else select.UNDEFINED_GAP_CLOSURE
 
     @property
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
@@ -207,7 +202,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     said = judged(added)
     if said.verdict == "unknown" and len(added) > 1:
         # a further effect that only corrects errors of the first is no reason to doubt this one
-        alone = judged((selected_effect_alone(added[0], nominal, fits, limits),))
+        alone = judged((select.selected_effect_alone(added[0], nominal, fits, limits),))
         said = alone if alone.verdict != "unknown" else said
     search.end_stage("carry_over")
     return said
