@@ -261,11 +261,10 @@ def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     x, guesses = problem.unknown_vector(fit.values), fit.evaluation.equilibrium_guesses
     judged = problem_with_whitening_at(problem, x, guesses)
     evaluation = judged.evaluate(x, False, guesses)
-    if not evaluation.ok:
-        return math.inf
-    with contextlib.suppress(SolverError):
-        held_out = [part.residual for part in _held_out_residuals(judged, x)]
-        return _excess_of(np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out]))
+    if evaluation.ok:
+        with contextlib.suppress(SolverError):
+            held_out = [part.residual for part in _held_out_residuals(judged, x)]
+            return _excess_of(np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out]))
     return math.inf
 
 
@@ -339,11 +338,10 @@ def _fitted_nominal_model(
     """The nominal model fitted from a start, with whitening fixed there. Raises `SolverError` if it fails."""
     problem = search.problem.with_whitening_linearized_at(start)
     # a gap may move parameters so far that the solver's equilibrium is not found again from there
-    runs = (refit_with_effects(problem, (), own, search.store, name, search.thresholds) for own in (start, {}))
-    fit = next(filter(None, runs), None)
-    if fit is None:
-        raise failed_rollout_error("it fails at the fitted values", "nominal model")
-    return fit
+    for own in (start, {}):
+        if fit := refit_with_effects(problem, (), own, search.store, name, search.thresholds):
+            return fit
+    raise failed_rollout_error("it fails at the fitted values", "nominal model")
 
 
 def fit_nominal_model(

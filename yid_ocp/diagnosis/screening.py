@@ -31,8 +31,6 @@ from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.inference.null_test import ChannelResidualIndices, channels_with_residual_indices
-from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
 
 DETECTABLE_AMPLITUDE_Z = 2.576 + 1.282  # found with 90 % power at the 1 % level [standard deviations]
 _SHAPE_GRID_SIZE = 4  # values tried per shape parameter
@@ -123,9 +121,14 @@ def linearize_candidates(
         places = [trial.unknown_names.index(name) for name in amplitudes]
         basis = _basis(np.delete(jacobian, places, axis=1))
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
-        changes = _changes_by_path_noise(trial, redrawn, values, (data, jacobian))
-        errors = [change[rows.data] * ~is_in_scatter for change, _ in changes]
-        shifts = [part - basis @ (basis.T @ part) for part in (change[:, places] for _, change in changes)]
+        errors, shifts = [], []
+        for again in (trial.with_episodes(episodes, ()) for episodes in redrawn):
+            outcome = again.evaluate(again.unknown_vector(values))
+            if outcome.ok:
+                other, slopes = residual_and_jacobian_without_weak_priors(again, outcome)
+                change = (slopes - jacobian)[:, places]
+                errors.append((other - data)[rows.data] * ~is_in_scatter)
+                shifts.append(change - basis @ (basis.T @ change))
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
         parts = zip(*(np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, *shifts)), strict=True)
         for (effect, shape), (columns, *shifted) in zip(chosen, parts, strict=True):
@@ -139,23 +142,6 @@ def linearize_candidates(
                 bias += own[rows.data].T @ error / len(errors)
             signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors, bias))
     return ProjectedCandidatesLinearization(residual, tuple(signatures))
-
-
-def _changes_by_path_noise(
-    trial: EstimationProblem,
-    draws: Sequence[Sequence[Episode]],
-    values: Mapping[str, float],
-    before: tuple[Array, Array],
-) -> list[tuple[Array, Array]]:
-    """Changes of residual and Jacobian by each draw of the noise that moves an arm, without draws that fail."""
-    found = []
-    for episodes in draws:
-        again = trial.with_episodes(episodes, ())
-        evaluation = again.evaluate(again.unknown_vector(values))
-        if evaluation.ok:
-            after = residual_and_jacobian_without_weak_priors(again, evaluation)
-            found.append((after[0] - before[0], after[1] - before[1]))
-    return found
 
 
 def _basis(matrix: Array) -> Array:
