@@ -322,17 +322,14 @@ def _of(name: str) -> _Statistic:
     return lambda said, limits, truth: -math.inf if said.get(name) is None else float(said[name])
 
 
-def _rivals(said: _Statistics, limits: Thresholds, truth: str) -> Mapping[str, _Statistics]:
-    """Single-effect refits that leave only noise, if the true effect does; only then does likelihood separate them."""
-    most, behind = 1 + limits.min_excess_chi2_per_dof, said["behind"].items()
-    found = {label: own for label, own in behind if own["left"] is not None and own["left"] < most}
-    return found if truth in found else {}
-
-
 def _odds(said: _Statistics, limits: Thresholds, truth: str) -> float:
-    """Log odds of the most likely single effect against the true effect alone."""
-    known = {label: own["squares"] for label, own in _rivals(said, limits, truth).items()}
-    return 0.5 * (known[truth] - min(known.values())) if known else -math.inf
+    """Log odds of the most likely single effect against the true effect alone.
+
+    Refits count that leave only noise, if that of the true effect does; only then does likelihood separate them.
+    """
+    most, behind = 1 + limits.min_excess_chi2_per_dof, said["behind"].items()
+    known = {label: own["squares"] for label, own in behind if own["left"] is not None and own["left"] < most}
+    return 0.5 * (known[truth] - min(known.values())) if truth in known else -math.inf
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,6 @@ from yid_ocp.files import to_json_types
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.options import MultivariateGaussianPrior
 
 _N_KNOTS = 12
@@ -154,8 +153,12 @@ def find_gap_law(
     if not (gained > error and closure.ci_low > least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
-    tables = _tables(best.law, best.fit)
-    return GapLaw(best.law.location, tables, ranges, closure, runner_up, best.fit, bool(last.effects))
+    tables = []
+    for quantity, knots in (best.law.knots or {}).items():
+        names = best.law.knot_parameter_names(quantity)
+        torque, std = (np.array([own[name] for name in names]) for own in (best.fit.values, best.fit.std))
+        tables.append(TorqueLawTable(quantity, knots, torque, std))
+    return GapLaw(best.law.location, tuple(tables), ranges, closure, runner_up, best.fit, bool(last.effects))
 
 
 @dataclass(frozen=True)
@@ -174,7 +177,13 @@ def _refitted_families(
     only: Sequence[str] = (),
 ) -> tuple[RefittedModel | None, list[_RefittedLaw]]:
     """The model without a law, refitted together with the laws in one step, and refits of the best families."""
-    composed = _composed_with_laws(search, problem, last, laws, events)
+    # with the diagnosis' corrections and truncations
+    held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
+    composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
+    composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
+    start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
+    composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_FRACTIONS_BEFORE_FAILURE[0])
+    composed = composed.with_whitening_linearized_at(last.values)
     whole = replace(composed, functions_of_place=None)  # in the step that has the laws
     before = refit_with_effects(whole, last.effects, last.values, limits=search.thresholds)
     if before is None:
@@ -221,17 +230,13 @@ def _neutral_law(model: RefittedModel, place: str, names: Sequence[str], system:
     return torque_law_from_tables(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * size)
 
 
-def _along(prediction: EpisodePrediction, step: float) -> dict[str, Array]:
-    own = {name: getattr(prediction.rollout, name) for name in ("state", "torque", "multipliers")}
-    return own | {"time_step": np.array(step)}
-
-
 def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
     """Values of a quantity in all estimation recordings, (samples,)."""
     problem, x, found = model.problem, model.problem.unknown_vector(model.values), []
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
         theta = problem.predictor.theta_with_episode_values(episode, problem.unpack_episode_unknowns(x, i)[0])
-        nodes = _along(result, episode.grid.time_step)
+        nodes = {name: getattr(result.rollout, name) for name in ("state", "torque", "multipliers")}
+        nodes["time_step"] = np.array(episode.grid.time_step)
         found.append(torque_law_argument_along_rollout(problem.system, place, quantity, theta, nodes).ravel())
     values = np.concatenate(found)
     return values[np.isfinite(values)]
@@ -240,18 +245,6 @@ def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
 def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[float, float]:
     values = _visited(model, place, quantity)
     return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-
-
-def _composed_with_laws(
-    search: RefitContext, problem: EstimationProblem, last: RefittedModel, laws: Sequence[TorqueLaw], events: EventSet
-) -> AllCandidatesProblem:
-    """The problem with accepted effects and laws in one step, with the diagnosis' corrections and truncations."""
-    held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
-    composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
-    composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
-    start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
-    composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_FRACTIONS_BEFORE_FAILURE[0])
-    return composed.with_whitening_linearized_at(last.values)
 
 
 def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[TorqueLaw]) -> list[_Family]:
@@ -325,12 +318,3 @@ def _refitted(
     with_prior = replace(composed, problem=composed.problem.with_multivariate_prior(prior))
     effects: tuple[EffectBase, ...] = (*before.effects, family.law)
     return refit_with_effects(with_prior, effects, {**before.values, **family.values}, limits=search.thresholds)
-
-
-def _tables(law: TorqueLaw, fit: RefittedModel) -> tuple[TorqueLawTable, ...]:
-    made = []
-    for quantity, knots in (law.knots or {}).items():
-        names = law.knot_parameter_names(quantity)
-        torque, std = (np.array([own[name] for name in names]) for own in (fit.values, fit.std))
-        made.append(TorqueLawTable(quantity, knots, torque, std))
-    return tuple(made)
