@@ -41,9 +41,9 @@ from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.null_test import NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_sqrt
-from yid_ocp.inference.whitening import problem_with_sensor_noise_only, problem_with_whitening_at
+from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.measurements import ResidualAndJacobian, subtract_estimated_bias_and_clock_errors
+from yid_ocp.problem.measurements import ResidualAndJacobian
 from yid_ocp.solvers import GaussNewton, Solution, solve
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
@@ -172,7 +172,7 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     """How much half the time step lowers r'r - n of a fit; minus infinity if the motion cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
     finer = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False).problem
-    fine, x = problem_corrected_for_events(finer, events), fit.problem.unknown_vector(fit.values)
+    fine, x = problem_corrected_for_events(finer, events), fit.unknowns
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
     return -math.inf if left is None else _excess_of(fit.evaluation.residual) - _excess_of(left)
 
@@ -182,7 +182,7 @@ def _without_error_of_links(
 ) -> tuple[RefitContext, RefittedModel] | None:
     """Hypotheses and nominal fit on data without the error of the links, if half of the gap is closed there."""
     search.progress.begin_stage("trying twice the links", 1.0, 8.5)
-    composed, x = search.problem.problem, fit.problem.unknown_vector(fit.values)
+    composed, x = search.problem.problem, fit.unknowns
     corrected = problem_corrected_for_few_links(composed, x, fit.evaluation, gap / 2)
     if corrected is None:
         return None
@@ -237,7 +237,7 @@ def _happened(
     whole: EstimationProblem, fit: RefittedModel, limits: Thresholds
 ) -> tuple[EventSet, SmoothedUnknownsResult | None]:
     """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
-    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.unknown_vector(fit.values)
+    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.unknowns
     guesses = fit.evaluation.equilibrium_guesses
     judged = problem_with_whitening_at(own, x, guesses)
     residual = judged.evaluate(x, False, guesses)
@@ -248,7 +248,8 @@ def _happened(
     evaluation = own.evaluate(x, is_flagged, guesses)
     if not evaluation.ok:
         return NO_EVENTS, None
-    smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits) if is_flagged else None
+    least = limits.min_log_bayes_factor
+    smoothed = smoother.smooth_unknowns_about_fit(own, x, evaluation, least) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
     (pushed, others), share = found.split_force_from_other_events(), 1 - _MIN_FORCE_EVENT_GAP_FRACTION
     if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
@@ -282,7 +283,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     if judged.verdict not in ("no_gap", "insufficient_data"):
         search.progress.begin_stage("locating the gap", 1.0, 2.0)
         # without events, the smoother already ran on all fitted data
-        smoothed = seen.smoothed or _smooth_about_model(nominal, limits)
+        known = nominal.problem, nominal.unknowns, nominal.evaluation
+        smoothed = seen.smoothed or smoother.smooth_unknowns_about_fit(*known, limits.min_log_bayes_factor)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.end_stage("localisation")
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
@@ -293,7 +295,9 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         remaining, rest = _held_out_null_test_and_spread(final, limits)[0], ()
         tests = _estimation_null_test(final, limits), remaining
         if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria):
-            rest = smoother.gap_locations_by_smoother_evidence(_smooth_about_model(final, limits))
+            known = final.problem, final.unknowns, final.evaluation
+            left = smoother.smooth_unknowns_about_fit(*known, limits.min_log_bayes_factor)
+            rest = smoother.gap_locations_by_smoother_evidence(left)
         flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
@@ -364,7 +368,7 @@ def _null_test(problem: EstimationProblem, residual: Array, fitted: float, limit
 
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
-    spread = null_test.encoder_noise_residual_covariance_factor(fit.problem, fit.problem.unknown_vector(fit.values))
+    spread = null_test.encoder_noise_residual_covariance_factor(fit.problem, fit.unknowns)
     residual = null_test.whiten_with_extra_errors(fit.evaluation.residual, spread)
     return _null_test(fit.problem, residual, effective_parameter_count(fit.problem, fit.evaluation), limits)
 
@@ -383,7 +387,7 @@ def _held_out_null_test_and_spread(
     fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[NullTestResult, Array]:
     """The held-out null test, and the change (n, k) of residuals by one std of each error of shared parameters."""
-    problem, x, shared = fit.problem, fit.problem.unknown_vector(fit.values), len(fit.problem.shared_parameters)
+    problem, x, shared = fit.problem, fit.unknowns, len(fit.problem.shared_parameters)
     own, filters = problem.with_episodes(problem.held_out, ()), problem.held_out_whitening_filters
 
     def residual_of(moved: EstimationProblem) -> Array | None:
@@ -399,19 +403,3 @@ def _held_out_null_test_and_spread(
     by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
     residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
     return _null_test(own, residual, 0, limits), by_parameters
-
-
-def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmoothedUnknownsResult:
-    """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns."""
-    problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.unknown_vector(fit.values)
-    if problem.has_process_noise:
-        problem = problem_with_sensor_noise_only(problem)
-        evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
-    if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
-        less = [
-            replace(e, measurements=subtract_estimated_bias_and_clock_errors(e.measurements, result.predicted_outputs))
-            for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
-        ]
-        problem = problem.with_episodes(less, ())
-        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
-    return smoother.select_and_smooth_unknowns(problem, x, evaluation, limits.min_log_bayes_factor)

@@ -232,7 +232,7 @@ def _neutral_law(model: RefittedModel, place: str, names: Sequence[str], system:
 
 def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
     """Values of a quantity in all estimation recordings, (samples,)."""
-    problem, x, found = model.problem, model.problem.unknown_vector(model.values), []
+    problem, x, found = model.problem, model.unknowns, []
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
         theta = problem.predictor.theta_with_episode_values(episode, problem.unpack_episode_unknowns(x, i)[0])
         nodes = {name: getattr(result.rollout, name) for name in ("state", "torque", "multipliers")}

@@ -106,6 +106,11 @@ class RefittedModel(RefitStatistics):
     problem: EstimationProblem  # composed system; free nominal parameters and parameters of the effects
     evaluation: Evaluation
 
+    @property
+    def unknowns(self) -> Array:
+        """The fitted values of the problem's unknowns, shape (nx,)."""
+        return self.problem.unknown_vector(self.values)
+
     def statistics(self) -> RefitStatistics:
         """Return the statistics of the refit without its problem and evaluation, which saves memory."""
         return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})

@@ -32,10 +32,12 @@ from yid_ocp.inference.smoother_model import (
     SmoothedUnknownGroup,
     residual_models_with_smoother_unknowns,
 )
+from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.measurements import subtract_estimated_bias_and_clock_errors
 
 _Models = Sequence[LinearResidualModel]
 _Groups = Sequence[SmoothedUnknownGroup]
@@ -366,6 +368,23 @@ def select_and_smooth_unknowns(
         detectable = {s: math.sqrt(_DETECTABLE_CHI2_RISE / score) for s, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
         return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
+
+
+def smooth_unknowns_about_fit(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float
+) -> SmoothedUnknownsResult:
+    """Do `select_and_smooth_unknowns` with torque noise among the unknowns and without constant sensor errors."""
+    if problem.has_process_noise:
+        problem = problem_with_sensor_noise_only(problem)
+        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
+    if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
+        less = [
+            replace(e, measurements=subtract_estimated_bias_and_clock_errors(e.measurements, result.predicted_outputs))
+            for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
+        ]
+        problem = problem.with_episodes(less, ())
+        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
+    return select_and_smooth_unknowns(problem, x, evaluation, least)
 
 
 def force_log_likelihood_coefficients(

@@ -103,7 +103,7 @@ def run_diagnose(
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
         moving = not last.problem.options.clamp_pose_point_names and bool(system.driven or system.prescribed)
-        x = last.problem.unknown_vector(last.values)
+        x = last.unknowns
         recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
         own = {
             "model": _final_model_to_dict(finding),
@@ -124,7 +124,7 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.screening.detectability} - {effect.label for effect in fit.effects}
-    theta, _ = problem.unpack_episode_unknowns(problem.unknown_vector(fit.values), 0)
+    theta, _ = problem.unpack_episode_unknowns(fit.unknowns, 0)
     found = {}
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
@@ -216,7 +216,7 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
 
 def _held_out_predictions(finding: DiagnosisResult) -> list[EpisodeWithNominalAndEffectPredictions]:
     before, after = (
-        problem_with_sensor_noise_only(fit.problem).predict_held_out(fit.problem.unknown_vector(fit.values))
+        problem_with_sensor_noise_only(fit.problem).predict_held_out(fit.unknowns)
         for fit in (finding.nominal_model, finding.final_model)
     )
     pairs = ((episode, first, last) for (episode, first), (_, last) in zip(before, after, strict=True))
@@ -238,7 +238,7 @@ def _scenes(finding: DiagnosisResult, predicted: list[EpisodeWithNominalAndEffec
 
 
 def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePrediction) -> ConfigurationTrajectory:
-    theta = fit.problem.unpack_episode_unknowns(fit.problem.unknown_vector(fit.values), 0)[0]
+    theta = fit.problem.unpack_episode_unknowns(fit.unknowns, 0)[0]
     return prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
 
 
