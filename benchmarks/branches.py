@@ -14,7 +14,7 @@ from pathlib import Path
 
 import yid_ocp
 
-JUDGEMENT = ("select", "verdict", "screening", "refit", "diagnose", "diagnosis_result")
+JUDGEMENT = ("select", "verdict", "screening", "refit", "diagnose", "diagnosis_result", "sentences")
 
 
 def count_branches(source: str) -> int:

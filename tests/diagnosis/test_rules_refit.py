@@ -12,12 +12,12 @@ from heard import Heard
 
 from yid_ocp.diagnosis.refit import (
     RefitContext,
+    StoredFit,
     _effect_p_values,
     held_out_loss,
     refit_with_each_effect,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.refit_store import StoredFit
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import SolverError
 from yid_ocp.problem.options import ProblemOptions

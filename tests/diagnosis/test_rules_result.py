@@ -7,7 +7,7 @@ from typing import get_args
 import factories as f
 import pytest
 
-from yid_ocp.diagnosis.result_format import _ranked_candidates
+from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text
 from yid_ocp.diagnosis.verdict import UnknownVerdictReason
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel

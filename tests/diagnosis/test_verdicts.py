@@ -10,7 +10,7 @@ import pytest
 from pendulum_bench import Bench
 
 from yid_ocp.diagnosis.diagnose import diagnose
-from yid_ocp.diagnosis.refit_store import NominalSolutionAndRefitStore
+from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress

@@ -15,8 +15,7 @@ from small_problems import pendulum_step
 
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.refit import REFIT_SOLVER
-from yid_ocp.diagnosis.refit_store import StoredFit
+from yid_ocp.diagnosis.refit import REFIT_SOLVER, StoredFit
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording

@@ -18,9 +18,8 @@ import scipy.stats
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
-from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStatistics
-from yid_ocp.diagnosis.result_format import judgement_to_dict
 from yid_ocp.diagnosis.screening import (
     EMPTY_SCREENING_RESULT,
     CandidateDetectability,

@@ -24,13 +24,15 @@ from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_e
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.law import find_gap_law
 from yid_ocp.diagnosis.refit import (
+    NO_REFIT_STORE,
+    NominalSolutionAndRefitStore,
     RefitContext,
+    RefitStore,
     RefittedModel,
     held_out_loss,
     reevaluate_refit_with_all_candidates,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.refit_store import NO_REFIT_STORE, NominalSolutionAndRefitStore, RefitStore
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, screen_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,10 +10,9 @@ from yid_ocp.diagnosis.baseline import CounterfactualErrorsOfFoundEffects, Param
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.law import GapLaw
-from yid_ocp.diagnosis.refit import EffectSearchRecord, RefittedModel
-from yid_ocp.diagnosis.result_format import EFFECT_KEYS, PLACE_KEYS, closure_to_dict, errors_to_dict, judgement_to_dict
-from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import bic_difference
+from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
+from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, bic_difference, held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprMixin, ReprTexts
@@ -21,6 +20,9 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
+
+_EFFECT_KEYS = "kind location"
+_PLACE_KEYS = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -91,8 +93,8 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     def to_dict(self) -> dict[str, Any]:
         """Convert the result to a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
         judged = judgement_to_dict(self, self, self.gap_locations)
-        after = errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
-        left = [attributes_to_dict(place, PLACE_KEYS) for place in self.remaining_gap_locations]
+        after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
+        left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
         reason = "; ".join(check.both_estimates_text for check in self.failed_transfer_checks)
         rejected = self.selected_effects if self.unknown_reason == "stand_in" else ()
         found = {
@@ -103,7 +105,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             "reason": self.unknown_reason,
             "law": self.law and self.law.to_dict(),
             "rejected_candidates": [
-                {**attributes_to_dict(e.effect, EFFECT_KEYS), **closure_to_dict(e.cumulative_closure), "reason": reason}
+                {**attributes_to_dict(e.effect, _EFFECT_KEYS), **e.cumulative_closure.to_dict(), "reason": reason}
                 for e in rejected
             ],
             "events": [event.to_dict() for event in self.events.disturbances],
@@ -111,7 +113,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             "statistics": diagnosis_decision_statistics(self),
             "summary": self.summary,
             "absorption": self.nominal_parameters_before_and_after,
-            "steps": [{"added": e.effect.label, **errors_to_dict(e.refitted_model)} for e in self.selected_effects],
+            "steps": [{"added": e.effect.label, **_errors_to_dict(e.refitted_model)} for e in self.selected_effects],
             "unseen": [v.effect.label for v in self.screening.detectability if not v.is_detectable],
             "untried": self.untried,
             "baseline": self.baseline_comparison and self.baseline_comparison.to_dict(),
@@ -141,3 +143,55 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
         },
     }
     return dict(to_json_types(found))
+
+
+def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
+    """Convert the verdict of a diagnosis and the evidence for it to a JSON-compatible dictionary."""
+    added = judged.accepted_selected_effects
+    before = _errors_to_dict(seen.nominal_model) | attributes_to_dict(
+        seen.nominal_held_out_test, "chi2_per_dof p_value"
+    )
+    closed = judged.closure_by_selected_effects if added else UNDEFINED_GAP_CLOSURE
+    rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
+    found = {
+        "verdict": judged.verdict,
+        "probability": judged.probability,
+        "gap": {"before": before, **closed.to_dict()},
+        "where": [attributes_to_dict(place, _PLACE_KEYS) for place in where],
+        "which": _ranked_candidates(judged, seen),
+        "effects": [attributes_to_dict(entry.effect, _EFFECT_KEYS) for entry in added],
+        "confusable": [[attributes_to_dict(effect, _EFFECT_KEYS) for effect in own] for own in rivals],
+    }
+    return dict(to_json_types(found))
+
+
+def _errors_to_dict(fit: RefitStatistics) -> dict[str, Any]:
+    """Held-out errors of a fit and their units, by channel."""
+    channels = fit.held_out_loss.channel_rmse.items()
+    return {"rmse": {name: rmse for name, (rmse, _) in channels}, "unit": {name: unit for name, (_, unit) in channels}}
+
+
+def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list[dict[str, Any]]:
+    """All candidates: accepted effects, then other refits by held-out loss, then the rest by score."""
+    added, alone = judged.accepted_selected_effects, judged.single_effect_models
+    before = seen.nominal_model.held_out_loss
+    closures = {fit.effects[0].label: held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
+    scores = {score.effect.label: score for score in seen.screening.candidate_scores}
+    probabilities = judged.selected_effect_and_equivalent_probabilities
+    found = [
+        *((e.effect, added[-1].refitted_model.effect_parameters_as_reported(e.effect)) for e in added),
+        *((fit.effects[0], fit.effect_parameters_as_reported(fit.effects[0])) for fit in alone),
+        *((s.effect, s.effect.parameters_as_reported(s.predicted_values)) for s in scores.values()),
+    ]
+    listed: dict[str, dict[str, Any]] = {}
+    for effect, reported in found:
+        score = scores.get(effect.label, CandidateScore(effect, {}, 0.0, 0.0, 1.0))
+        entry = {
+            **attributes_to_dict(effect, _EFFECT_KEYS),
+            "parameters": {name: attributes_to_dict(own, "value std unit") for name, own in reported.items()},
+            **attributes_to_dict(score, "score=lm_statistic p_value"),
+            "probability": probabilities.get(effect.label, 0.0),
+            **closures.get(effect.label, UNDEFINED_GAP_CLOSURE).to_dict(),
+        }
+        listed.setdefault(effect.label, to_json_types(entry))
+    return list(listed.values())

@@ -14,7 +14,6 @@ from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import KEPT_FRACTIONS_BEFORE_FAILURE, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
-from yid_ocp.diagnosis.result_format import closure_to_dict
 from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement_and_error
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.law import (
@@ -91,7 +90,7 @@ class GapLaw:
             "location": self.location,
             "depends_on": self.depends_on,
             "table": rows,
-            **closure_to_dict(self.closure),
+            **self.closure.to_dict(),
             "visited_range": {name: list(ends) for name, ends in self.visited_range.items()},
             "runner_up": rival,
             "sentence": self.sentence,

@@ -17,7 +17,6 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
-from yid_ocp.diagnosis.refit_store import NO_REFIT_STORE, RefitStore, StoredFit
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
@@ -35,7 +34,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
-from yid_ocp.solvers import GaussNewton, Status
+from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)  # good to a part of a std
@@ -45,6 +44,39 @@ _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, abou
 _PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
+
+
+@dataclass(frozen=True)
+class StoredFit:
+    """The stored values and standard deviations of a refit. One evaluation restores a `RefittedModel` from them."""
+
+    values: dict[str, float]  # values of all unknowns
+    std: dict[str, float]  # inflated by the misfit as in `solve`; infinite if not informed by the data
+    p_values: dict[str, float]  # by effect: p-value of its amplitudes, at fixed shape parameters
+    solver_message: str  # why the solver ended
+
+
+class RefitStore:
+    """A base class for stores of finished refits, which keeps nothing. Two threads call it."""
+
+    def stored_refit(self, name: str) -> StoredFit | None:
+        """Return the refit that is stored under a name, or None."""
+        return None
+
+    def put(self, name: str, refitted: StoredFit) -> None:
+        """Store a refit under a name."""
+
+
+NO_REFIT_STORE = RefitStore()
+"""Store of a diagnosis that no other one resumes."""
+
+
+@dataclass(frozen=True)
+class NominalSolutionAndRefitStore:
+    """The results that an interrupted diagnosis left: the nominal solution and the finished refits."""
+
+    solution: Solution | None = None
+    store: RefitStore = NO_REFIT_STORE  # receives every new refit
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,10 @@ class GapClosure:
         """A text that states the closed fraction; empty if there is no gap."""
         return f"{100 * self.fraction:.3g} % of the held-out gap closed" if math.isfinite(self.fraction) else ""
 
+    def to_dict(self) -> dict[str, float | list[float]]:
+        """Convert the closed fraction and its interval to entries of result.json."""
+        return {"closure": self.fraction, "closure_ci": [self.ci_low, self.ci_high]}
+
 
 UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 

@@ -21,8 +21,7 @@ from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.refit import RefittedModel
-from yid_ocp.diagnosis.refit_store import NominalSolutionAndRefitStore, RefitStore, StoredFit
+from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefitStore, RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError
