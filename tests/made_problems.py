@@ -24,8 +24,8 @@ def linear(matrix, residual=None):
 class MadeUp:
     """A problem of shared parameters, whose residual and Jacobian are functions of them.
 
-    `rows` gives both from x and the horizon [s], or None where the rollout fails; `stated` and `weak` of them are
-    priors, at the end. `count` of all rows is needed where the start fails. `priors` are standard deviations by name.
+    `rows` gives both from x and the horizon [s], or None where the rollout fails; the last `stated` and `weak` rows are
+    priors. `count` of all rows is needed where the start fails; `priors` are standard deviations by name.
     """
 
     guess: str | None = "warm"

@@ -96,10 +96,7 @@ def pendulum(urdf_folder):
 
 @pytest.fixture(scope="session")
 def held_tube(tmp_path_factory):
-    """A tube of three links that stands on the ground, its tip held by a hand of three motors that move it slowly.
-
-    The hand measures the tip at 100 Hz, a camera sees the middle; nothing turns the tube about its axis.
-    """
+    """A standing tube of three links. A hand of three motors moves and measures its tip, a camera sees its middle."""
     motors = {"x": ("prismatic", "1 0 0"), "z": ("prismatic", "0 0 1"), "turn": ("continuous", "0 0 1")}
     robot = chain_of_motors(tmp_path_factory.mktemp("hand"), **motors)
     tube = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -11,7 +12,7 @@ import pytest
 import yid_ocp as yid
 from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import config_yaml_with_defaults
+from yid_ocp.config.settings import EffectSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
@@ -293,14 +294,14 @@ def test_what_is_said_of_a_parameter_or_an_effect_goes_before_a_section() -> Non
     assert not settings_by_parameter_name(run, system.parameters)["joint.damping"].free
 
 
-@pytest.mark.parametrize(
-    ("config", "said", "speed"), [(None, "", 1e-3), (None, ", sign_smoothing_speed: 3e-3", 3e-3), (CONFIG, "", 0.02)]
-)
-def test_joints_driven_by_torques_have_sharp_friction_and_candidates_are_as_sharp(config, said, speed) -> None:
-    run = load_config(config, ["recordings={}", f"model.friction={{law: coulomb{said}}}"])
-    candidates = make_candidate_effects(system := build_system(run), [], ["joint_stribeck"])
-    known = [effect for effect in system.effects if effect.kind == "joint_coulomb"]
-    assert {effect.sign_smoothing_speed for effect in (*known, *candidates)} == {speed}
+@pytest.mark.parametrize(("file", "v_s"), [(None, "null"), (None, "3e-3"), (CONFIG, "null")])
+def test_joints_driven_by_torques_have_sharp_friction_and_candidates_are_as_sharp(file, v_s) -> None:
+    run = load_config(file, ["recordings={}", f"model.friction={{law: coulomb, sign_smoothing_speed: {v_s}}}"])
+    candidates = make_candidate_effects(build_system(run), [], ["joint_stribeck"])
+    stated = EffectSettings(kind="joint_stribeck", location=candidates[0].location, values={"tau_s": 0.1})
+    known = build_system(replace(run, model=replace(run.model, effects=(*run.model.effects, stated)))).effects
+    dry = [own for own in (*known, *candidates) if own.kind in ("joint_coulomb", "joint_stribeck")]
+    assert {effect.sign_smoothing_speed for effect in dry} == {3e-3 if v_s == "3e-3" else 0.02 if file else 1e-3}
 
 
 def test_friction_of_a_joint_that_is_not_there_is_refused() -> None:

@@ -92,7 +92,7 @@ class _JointViscous(_JointFriction):
 
 @EFFECTS.register("joint_coulomb")
 class _JointCoulomb(_JointFriction):
-    """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s = `SIGN_SMOOTHING_SPEED`."""
+    """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s."""
 
     equation = "F = -tau_c tanh(v/v_s)"
     declared_parameters = (effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)

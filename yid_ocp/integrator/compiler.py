@@ -254,7 +254,7 @@ def _is_ours(built: Path) -> bool:
 
 
 class MappedFunction:
-    """A CasADi function of dense columns, evaluated at many points in one call, compiled if possible and if it is long.
+    """A CasADi function that is evaluated at many points in one call, compiled if possible and if it is long.
 
     Inputs and outputs are dense columns. `shared_inputs` are the indices of inputs that have one value for all points.
     """

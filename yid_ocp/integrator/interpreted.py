@@ -99,8 +99,9 @@ class InterpretedKernel:
         tolerance, error, balance = self._model.tolerance, math.inf, slice(self._coordinates - self._model.sizes["nz"])
         if not len(self._unknown):  # all coordinates are prescribed
             return NewtonStatusCode.OK, 0.0, 1
+        previous = math.inf
         for iteration in range(1, NEWTON_ITERATION_LIMIT + 1):
-            residual, previous = value(point)[0][self._residual, 0], error
+            residual = value(point)[0][self._residual, 0]
             if not np.isfinite(residual).all():
                 return NewtonStatusCode.NOT_FINITE, error, iteration
             factors = _factorised(slope(point)[0])
@@ -114,17 +115,21 @@ class InterpretedKernel:
             if error <= tolerance or (is_near and error > 0.5 * previous):
                 point[self._at["lam"]] += change[self._coordinates :]
                 return NewtonStatusCode.OK, error, iteration
-            work, start = residual[balance] @ change[balance], point[self._unknown]
-            longest = min(1.0, 0.5 / error) * (-1.0 if by_work and work < 0 else 1.0)
+            work, start = float(residual[balance] @ change[balance]), point[self._unknown]
+            if by_work and work == 0:
+                return NewtonStatusCode.NOT_CONVERGED, error, iteration
+            longest = min(1.0, 0.5 / error) * (-1.0 if by_work and work < 0 and not is_near else 1.0)
             low, low_left, high, part = 0.0, 1.0, 1.0, 1.0
             while True:
                 point[self._unknown] = start + longest * part * change
                 residual, left = value(point)[0][self._residual, 0], math.nan
-                if by_work:
-                    left = float(residual[balance] @ change[balance] / work)
+                is_finite = bool(np.isfinite(residual).all())
+                if by_work and is_finite:
+                    left = float(residual[balance] @ change[balance]) / work
                     is_good = abs(left) <= 0.5 or (left > 0 and part == 1.0)
                 else:
-                    is_good = largest(_solved(factors, residual)) <= (1 - 0.25 * longest * part) * error
+                    after = largest(_solved(factors, residual))
+                    is_good = is_finite and not by_work and after <= (1 - 0.25 * longest * part) * error
                 if is_good or is_near or (by_work and high - low < 1e-4):
                     break
                 if high - low < 1e-4:
@@ -135,6 +140,7 @@ class InterpretedKernel:
                     high = part
                 root = low + (high - low) * low_left / (low_left - left) if left < 0 else 0.5 * (low + high)
                 part = min(max(root, 0.9 * low + 0.1 * high), 0.1 * low + 0.9 * high)
+            previous = error if longest * part == 1.0 else math.inf
         return NewtonStatusCode.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
 
     @np.errstate(over="ignore", invalid="ignore")  # the status says what is not finite
@@ -156,10 +162,12 @@ class InterpretedKernel:
             guess = x if k == 0 else 2 * x - state[k - 1]
             if k > 1:
                 guess[:n] += x[:n] - 2 * state[k - 1, :n] + state[k - 2, :n]
-            for first, pull, by_work in ((guess, lam, False), (x, 0 * lam, False), (x, 0 * lam, True)):
+            attempts = (guess, lam, False), (x, 0 * lam, False), (x, 0 * lam, True)
+            for i, (first, pull, by_work) in enumerate(attempts):
                 point = self._point(theta, x, first, pull, u)
                 point[self._fixed] = path[k + 1]
-                code, error, spent = self._newton(value, slope, point, by_work)
+                end, error, spent = self._newton(value, slope, point, by_work)
+                code = end if i == 0 or end == NewtonStatusCode.OK else code
                 total += spent
                 if code == NewtonStatusCode.OK:
                     break

@@ -424,9 +424,9 @@ static double work_along(const Work *k, const double *step) {
 
 /* Full Newton. A correction is shortened until the next one is smaller (natural monotonicity test, Deuflhard 2011,
  * section 3.3). `by_work`: until the residual's work along it is small. Where friction changes its sign within a small
- * part of a step no correction may get smaller, but this work changes its sign once. */
+ * part of a step no correction may get smaller, but without constraints this work changes its sign once. */
 static int newton_damped(Work *k, const Point *a, double tolerance, int limit, int by_work, double *error) {
-    double step[ONE(NY)], trial[ONE(NY)], previous = INFINITY;
+    double q_keep[ONE(N)], z_keep[ONE(NZ)], lam_keep[ONE(M)], step[ONE(NY)], trial[ONE(NY)], previous = INFINITY;
     for (int it = 0; it < limit; it++) {
         k->iterations++;
         if (!evaluate(k, a)) return NOT_FINITE;
@@ -435,18 +435,24 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, i
         for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
         solve(k, k->r, step);
         const double norm = *error = coordinate_norm(step), work = -work_along(k, step);
+        const int is_near = norm < 1e3 * tolerance;
         if (!isfinite(norm)) return NOT_FINITE;
-        if (norm <= tolerance || (norm < 1e3 * tolerance && norm > 0.5 * previous)) {
+        if (norm <= tolerance || (is_near && norm > 0.5 * previous)) {
             settle_multipliers(k, a, step, EVERY);
             return OK;
         }
-        previous = norm;
+        if (by_work && work == 0) return NOT_CONVERGED;
+        memcpy(q_keep, a->q1, sizeof(double) * N);
+        memcpy(z_keep, a->z1, sizeof(double) * NZ);
+        memcpy(lam_keep, a->lam, sizeof(double) * M);
         /* backwards where friction falls more steeply with the speed than inertia grows */
-        const double longest = (norm > 0.5 ? 0.5 / norm : 1.0) * (by_work && work < 0 ? -1.0 : 1.0);
-        double low = 0.0, low_left = 1.0, high = 1.0, part = 1.0, at = 0.0;
+        const double longest = (norm > 0.5 ? 0.5 / norm : 1.0) * (by_work && work < 0 && !is_near ? -1.0 : 1.0);
+        double low = 0.0, low_left = 1.0, high = 1.0, part = 1.0;
         for (;;) {
-            advance(a, step, longest * (part - at), EVERY);
-            at = part;
+            memcpy(a->q1, q_keep, sizeof(double) * N);
+            memcpy(a->z1, z_keep, sizeof(double) * NZ);
+            memcpy(a->lam, lam_keep, sizeof(double) * M);
+            advance(a, step, longest * part, EVERY);
             double left = NAN;
             if (evaluate(k, a) && by_work) {
                 left = work_along(k, step) / work;
@@ -457,7 +463,7 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, i
                 const double size = coordinate_norm(trial);
                 if (isfinite(size) && size <= (1.0 - 0.25 * longest * part) * norm) break;
             }
-            if (norm < 1e3 * tolerance) break; /* only rounding keeps it from getting smaller */
+            if (is_near) break; /* only rounding keeps it from getting smaller */
             if (high - low < 1e-4) {
                 if (!by_work) return NOT_CONVERGED;
                 break;
@@ -467,6 +473,7 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, i
             const double root = left < 0 ? low + (high - low) * low_left / (low_left - left) : 0.5 * (low + high);
             part = fmin(fmax(root, 0.9 * low + 0.1 * high), 0.1 * low + 0.9 * high);
         }
+        previous = longest * part == 1.0 ? norm : INFINITY; /* a shortened correction need not halve the next one */
     }
     return NOT_CONVERGED;
 }

@@ -342,7 +342,6 @@ class _ExperimentVariation:
         own = [text for text in self.simulation_overrides(arm) if text != "model.friction=null"]
         if arm.friction_law != "none":
             law = self.friction if arm.friction_law == "varied" else arm.friction_law
-            # because these joints stand still at the start and at every reversal
             speed = _PRESCRIBED_SIGN_SMOOTHING_SPEED if self.has_prescribed_arms else "null"
             own.append(f"model.friction={{law: {law}, sign_smoothing_speed: {speed}}}")
             own += ['parameters={"*.v_stribeck": {free: false}}'] if "stribeck" in law else []

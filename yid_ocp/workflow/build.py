@@ -21,6 +21,7 @@ from yid_ocp.effects.bodies import system_with_link_mass_factors
 from yid_ocp.effects.friction import (
     EFFECT_KINDS_BY_FRICTION_LAW,
     TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED,
+    effect_as_sharp_as_nominal_friction,
     effect_with_sign_smoothing_speed,
 )
 from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
@@ -225,7 +226,8 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
             what, where = f"the effect {said.kind} has `law_csv` or `depends_on`", f"{said.kind}@{said.location}"
             allowed, hint = "`law_csv` and `depends_on` with kind: law", "leave them out, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
-        return make_effect(said.kind, said.location, system, dict(said.values))
+        made = make_effect(said.kind, said.location, system, dict(said.values))
+        return effect_as_sharp_as_nominal_friction(made, system)
     if said.law_csv is None or said.depends_on is None or said.values:
         what, hint = "the law lacks `law_csv` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
         allowed = "`law_csv` and `depends_on`, without `values`"

@@ -93,7 +93,9 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
         yield
         unchanged = all(set(registry) == names for registry, names in zip(registries, before, strict=True))
         if unchanged and not known:
-            allowed = "a class or function under @EFFECTS.register(NAME) or @SENSOR_READERS.register(NAME)"
+            allowed = (
+                "code under @EFFECTS.register(NAME), @SENSOR_READERS.register(NAME) or @register_report_section(...)"
+            )
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
     except (Exception, SystemExit) as error:
         for registry, names in zip(registries, before, strict=True):
