@@ -286,14 +286,14 @@ class LinearModelOfAllCandidates:
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
         """
-        every = zip(self.effects, self.shape_values, self._columns[:-1], strict=True)
+        every, labels = zip(self.effects, self.shape_values, self._columns[:-1], strict=True), {*among}
+        wanted = [(effect, shape, at, _room(effect)) for effect, shape, at in every if effect.label in labels]
         found: list[ScoredCandidatePair] = []
-        for (one, shape, first), (other, its_shape, second) in itertools.combinations(every, 2):
-            if {one.label, other.label}.issubset(among):
-                at, room = np.concatenate([first, second]), np.concatenate([_room(one), _room(other)], axis=1)
-                step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], room)
-                values = _values(one, step[: len(first)]) | _values(other, step[len(first) :])
-                found.append(((one, other), values | shape | its_shape, decrease - len(at)))
+        for (one, shape, first, room), (other, its_shape, second, its_room) in itertools.combinations(wanted, 2):
+            at, both = np.concatenate([first, second]), np.concatenate([room, its_room], axis=1)
+            step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], both)
+            values = _values(one, step[: len(first)]) | _values(other, step[len(first) :])
+            found.append(((one, other), values | shape | its_shape, decrease - len(at)))
         return sorted(found, key=lambda pair: -pair[-1])
 
 
