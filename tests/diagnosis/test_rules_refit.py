@@ -29,6 +29,10 @@ diagnosing = importlib.import_module("yid_ocp.diagnosis.diagnose")
 LIMITS = Thresholds()
 FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
 A, S = "friction@elbow.a", "friction@elbow.s"
+TWO_RECORDINGS = SimpleNamespace(
+    problem=SimpleNamespace(episodes=["first", "second"]),
+    restricted_to_effects=lambda group: [effect.label for effect in group],
+)
 
 
 class Problem:
@@ -38,13 +42,11 @@ class Problem:
         self.cost, self.rows, self.unknown_names, self.nominal_free_parameter_names = cost, rows, names, ("k",)
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters, self.has_process_noise = None, (), False
+        self.shared_parameters = ("k",)
         self.step, self.held_out_spread = SimpleNamespace(time_step=0.01), np.zeros((0, 0))
 
     @property
     def problem(self):
-        return self
-
-    def restricted_to_effect_location(self, effects):
         return self
 
     def with_nominal_and_effects_free(self, effects):
@@ -96,13 +98,15 @@ def solved(monkeypatch):
         status = Status.FAILED if failed else Status.STALLED
         return SimpleNamespace(x=np.asarray(x), message="done", status=status, equilibrium_guesses="there")
 
-    def held_out(problem, x, spread):
+    def held_out(problem, x, spread, parameter_factor):
         assert spread is problem.held_out_spread
+        np.testing.assert_array_equal(parameter_factor, np.eye(5)[:1])  # of the shared parameter k
         made.losses.append(problem.named_values(x))
         return loss(1.5, 1.6)
 
     monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
     monkeypatch.setattr(module, "held_out_loss", held_out)
+    monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, end: np.eye(5))
     monkeypatch.setattr(
         module, "_refit_covariance_factor", lambda problem, finish, limits: 0.1 * np.eye(len(problem.unknown_names))
     )
@@ -233,13 +237,15 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         return None if effects[-1] is third else fit(effects, loss(left, left))
 
     monkeypatch.setattr(module, "refit_with_effects", one)
-    search = RefitContext("problem", LIMITS, heard, "store")
+    search = RefitContext(TWO_RECORDINGS, LIMITS, heard, "store")
     tried = [((FRICTION,), {A: 0.7}), ((other,), {"k": 3.0}), ((third,), {})]
     found = refit_with_each_effect(search, (effect("base@x"),), tried, {"k": 2.0})
     assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
     by_kind = {kinds[-1]: (problem, kinds, *rest) for problem, kinds, *rest in asked}
     name = "base@x and friction@elbow"
-    assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", name, LIMITS)
+    # one step for all, without other candidates
+    group = ["base@x", "friction@elbow", "offset@elbow", "third@x"]
+    assert by_kind["friction"] == (group, ["base", "friction"], {"k": 2.0, A: 0.7}, "store", name, LIMITS)
     assert by_kind["offset"][2] == {"k": 3.0}
     assert heard.stages == ["refitting base@x with each of 3 effects"]
     both = [(f"base@x and {label}", "1.234") for label in ("friction@elbow", "offset@elbow")]
@@ -250,6 +256,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         "refitted with third@x: no fit",
     ]
     assert refit_with_each_effect(search, (), [((lost,), {})], {}) == [], "it predicts no held-out recording"
+    assert asked[3][0] is TWO_RECORDINGS, "a step for one refit costs more than it saves"
     # from elsewhere they have names of their own in the store
     refit_with_each_effect(search, (effect("base@x"),), tried, {}, "from there")
     assert sorted(name for *_, name, _ in asked[4:]) == [
@@ -262,7 +269,7 @@ def test_where_the_model_with_all_candidates_fails_there_are_none(monkeypatch):
         raise SolverError("it snaps", where="model")
 
     monkeypatch.setattr(module, "screen_candidates", snap)
-    search = RefitContext("problem", LIMITS, Heard())
+    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard())
     assert search.screen((FRICTION,), {A: 0.7}, "beside it").candidate_scores == ()
     assert list(search.record.screenings) == ["beside it"]
 
@@ -283,14 +290,14 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     monkeypatch.setattr(module, "refit_with_effects", one)
     monkeypatch.setattr(module, "map_with_merged_calls", batched)
-    search, march = RefitContext("problem", LIMITS, Heard(), deadline=35.0), [["a"], ["b", "c"], ["d"]]
+    search, march = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0), [["a"], ["b", "c"], ["d"]]
     found = refit_with_each_effect(search, (), tried, {})
     assert ([f.effects[-1].kind for f in found], batches, search.skipped) == ([*"abcd"], march, ["e@x", "f@x"])
     assert refit_with_each_effect(search, (), tried[:1], {}) == []
     assert [name for name, _ in search.progress.table[1:]] == ["d@x", "c@x", "b@x", "a@x"]
     # without one all march together, as ever
     batches.clear()
-    assert len(refit_with_each_effect(RefitContext("problem", LIMITS, Heard()), (), tried, {})) == 6
+    assert len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard()), (), tried, {})) == 6
     assert batches == [[*"abcdef"]]
 
 
@@ -318,13 +325,14 @@ def predicting(monkeypatch):
 
     def rows(i, there, result):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)
-        return SimpleNamespace(residual=np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs]))
+        residual = np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs])
+        return SimpleNamespace(residual=residual, jacobian=np.full((len(residual), 2), [1.0, 7.0]))
 
     usual = {"whitened_held_out_residual_and_jacobian": rows, "has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": (), "unknown_names": (), "initial_unknowns": np.zeros(0)}
 
     def made(*pairs):
-        return SimpleNamespace(held_out=[e for e, _ in pairs], predict_held_out=lambda x: list(pairs), **usual), told
+        return SimpleNamespace(held_out=[e for e, _ in pairs], predict_held_out=lambda x, _: list(pairs), **usual), told
 
     return made
 
@@ -345,6 +353,12 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     # an uncertain offset of all eleven residuals, whose sum is 14, is no gap
     unsure = held_out_loss(problem, np.zeros(1), np.full((11, 1), 1e6))
     assert unsure.total_chi2 == pytest.approx(found.total_chi2 - 14**2 / 11)
+    # a fit to all recordings changes the offset, whose std is 2, at the price of its square
+    joint = held_out_loss(problem, np.zeros(1), None, np.array([[2.0]]))
+    shift = -14 / (11 + 1 / 4)
+    residual = found.total_chi2 + 2 * 14 * shift + 11 * shift**2
+    assert joint.total_chi2 == found.total_chi2 == found.joint_fit_chi2
+    assert joint.joint_fit_chi2 == pytest.approx(residual + (shift / 2) ** 2)
 
 
 @cases(

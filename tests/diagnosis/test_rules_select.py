@@ -473,6 +473,9 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
     assert bic_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
     assert near(spring, offset) == ["offset@elbow", "spring@elbow"]
+    # uncertain parameters predict badly; a fit to all recordings would change them
+    updated = replace(spring, held_out_loss=replace(spring.held_out_loss, updated_chi2=150.0))
+    assert bic_difference(updated, spring) == pytest.approx(150.0 - spring.held_out_loss.total_chi2)
     assert near(spring, replace(offset, cost=101.5)) == ["spring@elbow", "offset@elbow"]
     # up to odds of 150 to 1
     assert near(spring, replace(offset, cost=106.2)) == ["spring@elbow", "offset@elbow"]

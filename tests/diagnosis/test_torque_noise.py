@@ -130,22 +130,21 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     np.testing.assert_allclose(again.evaluate(x).residual, moved.evaluate(x).residual, atol=0.1)
 
 
-def test_candidates_of_other_places_are_left_out_of_a_refit(step):
-    """A step of one place's candidates gives the residuals of all, also where others add internal coordinates."""
+def test_other_candidates_are_left_out_of_refits(step):
+    """A step of some candidates gives the residuals of all, also where others add internal coordinates."""
     made = composed(step, True, "joint_viscous", "joint_presliding", "effort_offset")
-    all_places, at = (
+    all_candidates, at = (
         made.with_whitening_linearized_at({"elbow.stiffness": 2.5}),
         {"elbow.stiffness": 2.6, "joint_viscous@shoulder.b": 0.02},
     )
     friction = next(e for e in made.candidate_effects if e.label == "joint_viscous@shoulder")
-    elsewhere = next(e for e in made.candidate_effects if e.location != "shoulder")
-    one_place = all_places.restricted_to_effect_location([friction])
-    assert one_place.problem.step.sizes["nx"] < all_places.problem.step.sizes["nx"]
-    assert all_places.restricted_to_effect_location(()) is all_places
-    assert all_places.restricted_to_effect_location([friction, elsewhere]) is all_places
-    assert made.restricted_to_effect_location([friction]).problem.whitening_filters == (None,)
+    elsewhere = next(e for e in made.candidate_effects if e.label == "joint_viscous@elbow")
+    some = all_candidates.restricted_to_effects([friction, elsewhere])
+    assert some.problem.step.sizes["nx"] < all_candidates.problem.step.sizes["nx"]
+    assert {own.label for own in some.problem.system.effects} == {friction.label, elsewhere.label}
+    assert made.restricted_to_effects([friction]).problem.whitening_filters == (None,)
     found = []
-    for hypotheses in (all_places, one_place):
+    for hypotheses in (all_candidates, some):
         own = hypotheses.with_effects_and_relinearized_filters([friction], at)
         own = hypotheses.relinearize_held_out_filters(own, [friction], at)
         x = own.unknown_vector(at)
@@ -242,7 +241,8 @@ def test_a_law_is_sought_at_another_joint_than_that_of_a_named_effect(sprung):
     problem, made = sprung
     spring = next(e for e in made.candidate_effects if e.kind == "joint_spring")
     nominal = fit_nominal_model(problem, made)
-    found = refit_with_effects(replace(made, problem=nominal.problem), [spring], nominal.values)
+    own = replace(made, problem=nominal.problem).restricted_to_effects([spring])
+    found = refit_with_effects(own, [spring], nominal.values)
     assert found.problem.step is not made.problem.step
     search, sought = RefitContext(made, Thresholds(), NULL_PROGRESS), law._neutral_law(found, "elbow", ("angle",))
     before, families = law._refitted_families(search, problem, found, [sought], NO_EVENTS)

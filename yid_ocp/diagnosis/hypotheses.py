@@ -130,8 +130,8 @@ class AllCandidatesProblem:
     problem: EstimationProblem
     candidate_effects: tuple[EffectBase, ...]  # candidates to try: neutral in the nominal model and not excluded
     is_split_in_blocks: bool  # whether a single recording is both estimated on and held out, in alternate blocks
-    # functions of the nominal system with the effects of one location, by time step [s]
-    functions_of_place: CasadiLockedCache[tuple[str, float], ModelFunctions] | None = None
+    # functions of the nominal system with some candidates, by their labels and the time step [s]
+    functions_of_some: CasadiLockedCache[tuple[tuple[str, ...], float], ModelFunctions] | None = None
     held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
 
     @staticmethod
@@ -152,17 +152,17 @@ class AllCandidatesProblem:
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
 
-        def functions(key: tuple[str, float]) -> ModelFunctions:
-            place, time_step = key
+        def functions(key: tuple[tuple[str, ...], float]) -> ModelFunctions:
+            labels, time_step = key
             if time_step != problem.step.time_step:
-                return alone((place, problem.step.time_step)).with_time_step(time_step)
-            own = [effect for effect in effects if effect.location == place]
+                return some((labels, problem.step.time_step)).with_time_step(time_step)
+            own = [effect for effect in effects if effect.label in labels]
             names = (*problem.free, *(name for effect in own for name in effect.parameters.names))
             step = compile_step_like(problem.step, problem.step.system.with_effects(own))
             return ModelFunctions(step, names, problem.options.initial_state_fit_parameters)
 
-        alone = CasadiLockedCache[tuple[str, float], ModelFunctions](functions)
-        return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held, alone)
+        some = CasadiLockedCache[tuple[tuple[str, ...], float], ModelFunctions](functions)
+        return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held, some)
 
     @property
     def problem_with_all_samples(self) -> EstimationProblem:
@@ -233,18 +233,17 @@ class AllCandidatesProblem:
         cut = problem.with_episodes(problem.episodes, kept) if kept else _in_blocks(problem)
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
-    def restricted_to_effect_location(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
-        """Return a cheaper problem whose step contains only the candidates at the location of `effects`.
+    def restricted_to_effects(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
+        """Return a cheaper problem whose step contains only the given candidates.
 
-        A step of all candidates costs three times as much. The problem is unchanged without process noise, if `effects`
-        have no or several locations, or if the filters contain states of other candidates.
+        A step of all candidates costs three times as much. The problem is unchanged if the filters contain states of
+        other candidates.
         """
-        places = {effect.location for effect in effects}
-        if self.functions_of_place is None or len(places) != 1 or not self.problem.has_process_noise:
+        if self.functions_of_some is None:
             return self
-        functions = self.functions_of_place((places.pop(), self.problem.step.time_step))
-        own = _on_step_of_fewer_effects(self.problem, functions)
-        return self if own is None else replace(self, problem=own, functions_of_place=None)
+        key = tuple(sorted(effect.label for effect in effects)), self.problem.step.time_step
+        own = _on_step_of_fewer_effects(self.problem, self.functions_of_some(key))
+        return self if own is None else replace(self, problem=own, functions_of_some=None)
 
     def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the problem in which the nominal free parameters and all parameters of `effects` are free."""

@@ -183,8 +183,7 @@ def _refitted_families(
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
     composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_FRACTIONS_BEFORE_FAILURE[0])
     composed = composed.with_whitening_linearized_at(last.values)
-    whole = replace(composed, functions_of_place=None)  # in the step that has the laws
-    before = refit_with_effects(whole, last.effects, last.values, limits=search.thresholds)
+    before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
     if before is None:
         return None, []
     composed = replace(composed, problem=before.problem.with_free_parameters_without_recompiling(problem.free))

@@ -43,6 +43,7 @@ _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter 
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
+_MIN_REFITS_FOR_OWN_STEP = 4  # of one recording, from which a step of their own candidates pays for its compilation
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -88,11 +89,18 @@ class HeldOutLoss:
     channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
     # chi2 of the deviation from a baseline, which does not depend on the resampled blocks
     baseline_chi2: float = 0.0
+    # sum of chi2 with all parameters fitted again to these recordings too, minus the rise of the fit's own chi2
+    updated_chi2: float | None = None
 
     @property
     def total_chi2(self) -> float:
         """The sum of chi2 over all held-out time blocks, plus chi2 of the deviation from earlier runs."""
         return float(self.block_chi2.sum()) + self.baseline_chi2
+
+    @property
+    def joint_fit_chi2(self) -> float:
+        """What these recordings add to the smallest chi2 of a fit to all recordings, in the linear model."""
+        return self.total_chi2 if self.updated_chi2 is None else self.updated_chi2 + self.baseline_chi2
 
     @property
     def chi2_per_sample(self) -> float:
@@ -170,6 +178,8 @@ class RefitContext:
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
+    # effects that are refitted in one round, and the number of refits, likewise
+    rounds: list[tuple[tuple[EffectBase, ...], int]] = field(default_factory=list)
 
     def end_stage(self, name: str) -> None:
         """Record that a stage ends now."""
@@ -184,22 +194,33 @@ class RefitContext:
 
     def refit(self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str) -> RefitStatistics | None:
         """Refit the model with the given effects. None if no simulation succeeds. `name` distinguishes the starts."""
-        asked = (self.problem, effects, start, self.store, name, self.thresholds)
-        return self._answer(self.record.refits, name, lambda: refit_with_effects(*asked))
+        asked = (effects, start, self.store, name, self.thresholds)
+        return self._answer(
+            self.record.refits, name, lambda: refit_with_effects(self._problem_of_round(effects), *asked)
+        )
 
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
         """Fit the effects of `fit` again, on the held-out recordings. None if that is not possible."""
         name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
         return self._answer(self.record.refits, name, lambda: self._turned(fit, name))
 
+    def _problem_of_round(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
+        """The problem with the effects of the first round that has all the given ones, or with all candidates."""
+        for own, count in self.rounds:
+            is_worth_a_step = count * len(self.problem.problem.episodes) >= _MIN_REFITS_FOR_OWN_STEP
+            if is_worth_a_step and {effect.label for effect in effects} <= {effect.label for effect in own}:
+                return self.problem.restricted_to_effects(own)
+        return self.problem
+
     def _turned(self, fit: RefitStatistics, name: str) -> RefittedModel | None:
         """The effects of a fit, refitted with estimation and held-out recordings exchanged."""
         if self.problem.is_split_in_blocks:
             return None
         self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
-        problem = self.problem.problem
+        composed = self._problem_of_round(fit.effects)
+        problem = composed.problem
         exchanged = problem.with_episodes(problem.held_out, problem.episodes)
-        turned = replace(self.problem, problem=exchanged, held_out_spread=None)
+        turned = replace(composed, problem=exchanged, held_out_spread=None)
         # parameters shared by both sets of recordings, without initial states
         names = (*problem.free, *(name for effect in fit.effects for name in effect.parameters.names))
         start = {name: fit.values[name] for name in fit.values.keys() & names}
@@ -252,7 +273,6 @@ def refit_with_effects(
     `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` and
     the time step are the name in the store of refits.
     """
-    problem = problem.restricted_to_effect_location(effects)
     name = f"{name} at {problem.problem.step.time_step:g} s"
     if stored := store.stored_refit(name):
         placed, at_stored = _evaluated(problem, effects, stored.values)
@@ -300,7 +320,8 @@ def _model(
     known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation, spread: Array | None
 ) -> RefittedModel:
     kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
-    loss = held_out_loss(own, own.unknown_vector(known.values), spread)
+    errors = None if spread is None else noise_only_covariance_sqrt(own, end)[: len(own.shared_parameters)]
+    loss = held_out_loss(own, own.unknown_vector(known.values), spread, errors)
     return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
 
 
@@ -399,6 +420,8 @@ def refit_with_each_effect(
         parts.count_done(f"refitted with {label}: {left}", table)
         return fit
 
+    together = {effect.label: effect for effects, _ in tried for effect in (*base, *effects)}
+    search.rounds.append((tuple(together.values()), len(tried)))
     fits: list[RefitStatistics | None] = []
     rest, begun = list(tried), time.perf_counter()
     while rest and not search.record_skip_if_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
@@ -412,11 +435,17 @@ def refit_with_each_effect(
 
 
 @np.errstate(invalid="ignore")  # of recordings that cannot be predicted
-def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = None) -> HeldOutLoss:
-    """Compute the prediction loss on held-out recordings. `spread` (n, k) is from `AllCandidatesProblem`."""
+def held_out_loss(
+    problem: EstimationProblem, x: Array, spread: Array | None = None, parameter_factor: Array | None = None
+) -> HeldOutLoss:
+    """Compute the prediction loss on held-out recordings. `spread` (n, k) is from `AllCandidatesProblem`.
+
+    With a factor F (k, nx) of the covariance F F' of the k shared parameters, `HeldOutLoss.updated_chi2` is computed.
+    """
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
-    found, residuals, numbered, count = problem.predict_held_out(x), [], [], 0
+    found, residuals, numbered, count = problem.predict_held_out(x, parameter_factor is not None), [], [], 0
+    errors: list[Array] = []
     for i, (episode, result) in enumerate(found):
         blocks = []
         for samples in episode.measurements:
@@ -428,8 +457,14 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
         count += len(own)
         residuals.append(np.full(len(block), np.inf))
         if not isinstance(result, str):
-            residuals[-1] = problem.whitened_held_out_residual_and_jacobian(i, episode, result).residual
+            part = problem.whitened_held_out_residual_and_jacobian(i, episode, result)
+            residuals[-1] = part.residual
+            if parameter_factor is not None:
+                errors.append(np.asarray(part.jacobian)[:, : len(parameter_factor)] @ parameter_factor)
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
+    updated = None
+    if errors and np.all(np.isfinite(whole)):
+        updated = float(np.sum(whiten_with_extra_errors(whole, np.vstack(errors)) ** 2))
     if spread is not None:  # what the nominal parameters leave uncertain is no gap
         whole = np.nan_to_num(whiten_with_extra_errors(whole, spread), nan=np.inf, posinf=np.inf, neginf=np.inf)
     if problem.has_process_noise:
@@ -440,7 +475,7 @@ def held_out_loss(problem: EstimationProblem, x: Array, spread: Array | None = N
     contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))
     channels = held_out_rmse_and_unit_by_channel(found)
     squares = np.bincount(number, weights=whole**2).astype(float)
-    return HeldOutLoss(squares, np.bincount(number).astype(float), channels, contradiction)
+    return HeldOutLoss(squares, np.bincount(number).astype(float), channels, contradiction, updated)
 
 
 def held_out_rmse_and_unit_by_channel(
