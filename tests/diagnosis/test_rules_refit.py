@@ -29,6 +29,7 @@ diagnosing = importlib.import_module("yid_ocp.diagnosis.diagnose")
 LIMITS = Thresholds()
 FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
 A, S = "friction@elbow.a", "friction@elbow.s"
+CERTAIN = np.zeros((1, 1))
 TWO_RECORDINGS = SimpleNamespace(
     problem=SimpleNamespace(episodes=["first", "second"]),
     restricted_to_effects=lambda group: [effect.label for effect in group],
@@ -42,7 +43,6 @@ class Problem:
         self.cost, self.rows, self.unknown_names, self.nominal_free_parameter_names = cost, rows, names, ("k",)
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters, self.has_process_noise = None, (), False
-        self.shared_parameters = ("k",)
         self.step, self.held_out_spread = SimpleNamespace(time_step=0.01), np.zeros((0, 0))
 
     @property
@@ -98,15 +98,13 @@ def solved(monkeypatch):
         status = Status.FAILED if failed else Status.STALLED
         return SimpleNamespace(x=np.asarray(x), message="done", status=status, equilibrium_guesses="there")
 
-    def held_out(problem, x, spread, parameter_factor):
+    def held_out(problem, x, evaluation, spread):
         assert spread is problem.held_out_spread
-        np.testing.assert_array_equal(parameter_factor, np.eye(5)[:1])  # of the shared parameter k
         made.losses.append(problem.named_values(x))
         return loss(1.5, 1.6)
 
     monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
     monkeypatch.setattr(module, "held_out_loss", held_out)
-    monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, end: np.eye(5))
     monkeypatch.setattr(
         module, "_refit_covariance_factor", lambda problem, finish, limits: 0.1 * np.eye(len(problem.unknown_names))
     )
@@ -329,7 +327,8 @@ def predicting(monkeypatch):
         return SimpleNamespace(residual=residual, jacobian=np.full((len(residual), 2), [1.0, 7.0]))
 
     usual = {"whitened_held_out_residual_and_jacobian": rows, "has_process_noise": False, "options": ProblemOptions()}
-    usual |= {"shared_parameters": (), "unknown_names": (), "initial_unknowns": np.zeros(0)}
+    usual |= {"shared_parameters": ("k",), "unknown_names": (), "initial_unknowns": np.zeros(0)}
+    monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, evaluation: evaluation)
 
     def made(*pairs):
         return SimpleNamespace(held_out=[e for e, _ in pairs], predict_held_out=lambda x, _: list(pairs), **usual), told
@@ -344,17 +343,17 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     predicted = np.array([[2.0, 1.0], [3.0, 9.0], [3.0, 1.0], [4.0, 5.0], [6.0, 6.0]])
     outputs = SimpleNamespace(predicted_outputs=(predicted, np.array([[1.0, 2.0]])))
     problem, told = predicting((episode(of=[group, more]), outputs))
-    found = held_out_loss(problem, np.zeros(1))
+    found = held_out_loss(problem, np.zeros(1), CERTAIN)
     # blocks of half a second: [0, 0.5), [0.5, 1.0) and the last sample
     np.testing.assert_allclose(found.block_chi2, [1 + 4 + 9 + 36, 4 + 1, 1 + 4])
     np.testing.assert_allclose(found.block_sample_counts, [2 + 1 + 2, 4, 2])
     assert found.channel_rmse == {"a": (0.25, "m")}
     assert told["episodes"] == ["other"]
     # an uncertain offset of all eleven residuals, whose sum is 14, is no gap
-    unsure = held_out_loss(problem, np.zeros(1), np.full((11, 1), 1e6))
+    unsure = held_out_loss(problem, np.zeros(1), CERTAIN, np.full((11, 1), 1e6))
     assert unsure.total_chi2 == pytest.approx(found.total_chi2 - 14**2 / 11)
     # a fit to all recordings changes the offset, whose std is 2, at the price of its square
-    joint = held_out_loss(problem, np.zeros(1), None, np.array([[2.0]]))
+    joint = held_out_loss(problem, np.zeros(1), np.array([[2.0]]))
     shift = -14 / (11 + 1 / 4)
     residual = found.total_chi2 + 2 * 14 * shift + 11 * shift**2
     assert joint.total_chi2 == found.total_chi2 == found.joint_fit_chi2
@@ -370,19 +369,20 @@ def test_held_out_time_is_cut_in_some_forty_blocks(predicting, seconds, length):
     group = measured([0.0, 0.99 * length, 1.01 * length], np.ones((3, 2)), np.ones((3, 2)))
     outputs = SimpleNamespace(predicted_outputs=(np.ones((3, 2)),))
     problem, _ = predicting(*((episode(steps=round(s / 0.01), of=[group]), outputs) for s in seconds))
-    np.testing.assert_array_equal(held_out_loss(problem, np.zeros(1)).block_sample_counts, [4.0, 2.0] * len(seconds))
+    found = held_out_loss(problem, np.zeros(1), CERTAIN)
+    np.testing.assert_array_equal(found.block_sample_counts, [4.0, 2.0] * len(seconds))
 
 
 def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting):
     group = measured([0.1, 0.6], [[1, 1], [1, 1]], [[1, 1], [1, 0]])
     good = SimpleNamespace(predicted_outputs=(np.ones((2, 2)),))
     problem, told = predicting((episode("one", of=[group]), "it snaps"), (episode("two", of=[group]), good))
-    found = held_out_loss(problem, np.zeros(1))
+    found = held_out_loss(problem, np.zeros(1), CERTAIN)
     np.testing.assert_array_equal(found.block_chi2, [math.inf, math.inf, 0.0, 0.0])
     np.testing.assert_array_equal(found.block_sample_counts, [2.0, 1.0, 2.0, 1.0])
     assert told["episodes"] == ["two"]
     none, _ = predicting((episode("one", of=[group]), "it snaps"))
-    assert held_out_loss(none, np.zeros(1)).channel_rmse == {}
+    assert held_out_loss(none, np.zeros(1), CERTAIN).channel_rmse == {}
 
 
 @cases(

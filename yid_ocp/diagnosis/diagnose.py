@@ -143,7 +143,7 @@ def _examined(
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
-    nominal = replace(nominal, held_out_loss=held_out_loss(own, nominal.unknowns, spread))
+    nominal = replace(nominal, held_out_loss=held_out_loss(own, nominal.unknowns, nominal.evaluation, spread))
     why, h = "", own.step.time_step
     try:
         screened = screen_candidates(composed, (), nominal.values)

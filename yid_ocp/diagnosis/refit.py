@@ -89,7 +89,7 @@ class HeldOutLoss:
     channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
     # chi2 of the deviation from a baseline, which does not depend on the resampled blocks
     baseline_chi2: float = 0.0
-    # sum of chi2 with all parameters fitted again to these recordings too, minus the rise of the fit's own chi2
+    # what the blocks add to chi2 if all parameters are fitted to them, too; None: the same as without
     updated_chi2: float | None = None
 
     @property
@@ -320,8 +320,7 @@ def _model(
     known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation, spread: Array | None
 ) -> RefittedModel:
     kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
-    errors = None if spread is None else noise_only_covariance_sqrt(own, end)[: len(own.shared_parameters)]
-    loss = held_out_loss(own, own.unknown_vector(known.values), spread, errors)
+    loss = held_out_loss(own, own.unknown_vector(known.values), end, spread)
     return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
 
 
@@ -436,16 +435,16 @@ def refit_with_each_effect(
 
 @np.errstate(invalid="ignore")  # of recordings that cannot be predicted
 def held_out_loss(
-    problem: EstimationProblem, x: Array, spread: Array | None = None, parameter_factor: Array | None = None
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, spread: Array | None = None
 ) -> HeldOutLoss:
-    """Compute the prediction loss on held-out recordings. `spread` (n, k) is from `AllCandidatesProblem`.
+    """Compute the prediction loss on held-out recordings of a fit at `x`, where it has the given evaluation.
 
-    With a factor F (k, nx) of the covariance F F' of the k shared parameters, `HeldOutLoss.updated_chi2` is computed.
+    `spread` (n, k) is from `AllCandidatesProblem`.
     """
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
-    found, residuals, numbered, count = problem.predict_held_out(x, parameter_factor is not None), [], [], 0
-    errors: list[Array] = []
+    factor = noise_only_covariance_sqrt(problem, evaluation)[: len(problem.shared_parameters)]
+    found, residuals, errors, numbered, count = problem.predict_held_out(x, True), [], [], [], 0
     for i, (episode, result) in enumerate(found):
         blocks = []
         for samples in episode.measurements:
@@ -456,17 +455,18 @@ def held_out_loss(
         numbered.append(count + block)
         count += len(own)
         residuals.append(np.full(len(block), np.inf))
+        errors.append(np.zeros((len(block), factor.shape[1])))
         if not isinstance(result, str):
             part = problem.whitened_held_out_residual_and_jacobian(i, episode, result)
-            residuals[-1] = part.residual
-            if parameter_factor is not None:
-                errors.append(np.asarray(part.jacobian)[:, : len(parameter_factor)] @ parameter_factor)
+            residuals[-1], errors[-1] = part.residual, np.asarray(part.jacobian)[:, : len(factor)] @ factor
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
-    updated = None
-    if errors and np.all(np.isfinite(whole)):
-        updated = float(np.sum(whiten_with_extra_errors(whole, np.vstack(errors)) ** 2))
+
+    def whitened(beside: Array) -> Array:
+        return np.nan_to_num(whiten_with_extra_errors(whole, beside), nan=np.inf, posinf=np.inf, neginf=np.inf)
+
+    updated = float(np.sum(whitened(np.vstack(errors)) ** 2))
     if spread is not None:  # what the nominal parameters leave uncertain is no gap
-        whole = np.nan_to_num(whiten_with_extra_errors(whole, spread), nan=np.inf, posinf=np.inf, neginf=np.inf)
+        whole = whitened(spread)
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
         found = problem_with_sensor_noise_only(problem).predict_held_out(x)
