@@ -157,6 +157,8 @@ class AllCandidatesProblem:
             if time_step != problem.step.time_step:
                 return some((labels, problem.step.time_step)).with_time_step(time_step)
             own = [effect for effect in effects if effect.label in labels]
+            if not own:
+                return problem.model_functions
             names = (*problem.free, *(name for effect in own for name in effect.parameters.names))
             step = compile_step_like(problem.step, problem.step.system.with_effects(own))
             return ModelFunctions(step, names, problem.options.initial_state_fit_parameters)
