@@ -447,7 +447,7 @@ def _rounded(value: float, up: bool) -> float:
     return round(whole / 10.0**digits, max(digits, 0))
 
 
-_EVIDENCE_FORMAT = "yid-evidence/2"  # 1 had standard deviations of amplitudes in place of p-values of effects
+_EVIDENCE_FORMAT = "yid-evidence/3"  # 2 had no chi2 of one fit to all recordings
 _MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of two candidates is recorded
 
 
