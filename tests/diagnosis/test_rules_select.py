@@ -407,6 +407,10 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     # of those that close too little, what does as well and is plausible is said first, even if it leaves more
     little = {"": (3.0, 3.2), "a": (2.951, 3.151), "b": (2.95, 3.15), "c": (2.98, 3.18)}
     assert Rounds(monkeypatch, little).compose() == (["a", "b", "c"], [], ())
+    # where all leave a gap, what explains enough of it and is plausible
+    large = {"": (9.0, 9.2), "a": (2.0, 2.1), "b": (1.5, 1.6), "c": (9.0, 9.0)}
+    assert Rounds(monkeypatch, large).compose(max_effects=1)[1] == ["a"]
+    assert Rounds(monkeypatch, large | {"a": (6.0, 6.1)}).compose(max_effects=1)[1] == ["b"]
     # the first one may be larger, and what is in the place of one that is may be too
     alone = Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)})
     assert alone.compose()[1] == ["b"]
@@ -606,6 +610,11 @@ def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
     assert [of.kind for of in added[0].equivalent_effects] == ["a", "c"]
     assert sum(added[0].shares) == pytest.approx(1.0)
     assert added[0].shares[0] > added[0].shares[1] > 0.1, "the nearer, the likelier"
+    one = fit([effect("a@x")])
+    far = select._selected(one.effects[0], one, select.UNDEFINED_GAP_CLOSURE, [(effect("b@x"), 0.8), (effect("c@x"), 0.3)])
+    assert [(of.kind, round(share, 2)) for of, share in zip(far.equivalent_effects, far.shares, strict=True)] == [
+        ("a", 0.81), ("c", 0.18)
+    ], "what is unlikely is not named"
 
 
 @pytest.mark.parametrize(("std", "there"), [(0.499, True), (0.51, False)])

@@ -24,6 +24,7 @@ _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' 
 _MIN_CHI2_FRACTION = 0.05**2
 _MIN_REST_FRACTION = 4e-4  # of the whole gap: so little can be an error of the response to the effects found
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
+_SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
@@ -114,7 +115,8 @@ def _near_best_models(
     """Models that the recordings cannot distinguish from the best one, with their distance from it, 0 to 1.
 
     Plausible models come first. If the best one leaves only noise, the distance is a log odds in units of what decides.
-    Otherwise it is the held-out error in units of its standard error, and of equals the simplest is first.
+    Otherwise it is the held-out error in units of its standard error, and of equals the simplest is first. A model that
+    is not plausible is then the best one only if no plausible model explains enough.
     """
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
@@ -127,6 +129,9 @@ def _near_best_models(
         distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:
+        most = (1 - limits.min_explained_fraction) * nominal.held_out_loss.excess_chi2_per_sample
+        enough = [fit for fit in fits if fit.held_out_loss.excess_chi2_per_sample <= most]
+        best = min((fit for fit in enough if _is_plausible(fit.effects[-1], fit, limits)), key=_chi2, default=best)
         distances = [_distance_in_prediction(fit, best) for fit in fits]
         ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
     near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
@@ -355,11 +360,14 @@ def _with_closures(
 def _selected(
     effect: EffectBase, fit: RefitStatistics, closed: GapClosure, rivals: Sequence[tuple[EffectBase, float]]
 ) -> SelectedEffect:
-    """A selected effect with its rivals, given with their distances, and their shares of its probability."""
+    """A selected effect with its likely rivals, given with their distances, and their shares of its probability."""
     known = {own.label: (own, distance) for own, distance in ((effect, 0.0), *rivals)}
     effects, distances = zip(*known.values(), strict=True)
     weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
-    return SelectedEffect(effect, fit, closed, effects, tuple(weights / weights.sum()))
+    shares = weights / weights.sum()
+    order = np.array([0, *1 + np.argsort(-shares[1:], kind="stable")])
+    kept = order[np.cumsum(shares[order]) - shares[order] < _SET_PROBABILITY]
+    return SelectedEffect(effect, fit, closed, tuple(effects[i] for i in kept), tuple(shares[kept].tolist()))
 
 
 def selected_effect_alone(
