@@ -71,6 +71,7 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
     evidence, limits = seen((f.outcome(), f.outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
     assert (evidence.may_have_gap(limits), evidence.exceeds_noise(limits)) == (gap, False)
+    assert not replace(evidence, discretisation_chi2=1e9).may_have_gap(limits), "links and steps may remove it"
 
 
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)

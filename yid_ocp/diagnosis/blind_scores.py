@@ -463,6 +463,7 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
         "tests": [plain(test) for test in (result.nominal_test, result.nominal_held_out_test)],
         "screening": _screening_to_json(result.screening),
         "has_left_baseline": result.has_left_baseline,
+        "discretisation_chi2": result.discretisation_chi2,
         "thresholds": plain(result.thresholds),
         "located_gap": {"locations": plain(result.located_gap)},
         "remaining": [plain(place) for place in result.remaining_gap_locations],
@@ -506,7 +507,8 @@ class _RecordedCase:
         restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
-        self.evidence = NominalModelGapEvidence(nominal, before, held, screened, data["has_left_baseline"])
+        other = (data[name] for name in ("has_left_baseline", "discretisation_chi2"))
+        self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *other)
         located = data["located_gap"] or {"locations": ()}
         self.located_gap = tuple(restored(GapLocation, place) for place in located["locations"])
         self.record = EffectSearchRecord(

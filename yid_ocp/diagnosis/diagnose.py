@@ -50,6 +50,8 @@ from yid_ocp.solvers import GaussNewton, Solution, solve
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
 _MIN_FORCE_EVENT_GAP_FRACTION = 0.1  # of the gap that force events must remove
+# of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
+_LEFT_BY_DISCRETISATION = 1 / 9
 _MAX_STEP_OF_LAST_HALVING = 2.5e-3  # step from which on a failure of the model with all candidates is final [s]
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
@@ -126,6 +128,7 @@ def _examined(
     nominal: RefittedModel,
     known: tuple[HeldOutTruncation, ...] = (),
     is_corrected_for_links: bool = False,
+    removed: float = 0.0,
 ) -> _Examined:
     """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
     limits = search.thresholds
@@ -152,20 +155,20 @@ def _examined(
             raise
         # without candidates, the evidence warrants no search
         why, screened = "the model with all candidates fails", EMPTY_SCREENING_RESULT
-    evidence = NominalModelGapEvidence(nominal, *tests, screened)
+    evidence = NominalModelGapEvidence(nominal, *tests, screened, discretisation_chi2=_LEFT_BY_DISCRETISATION * removed)
     search.end_stage("screening")
     if evidence.warrants_search(limits) and not is_corrected_for_links:
         # without the error of its discretisation, the gap may be none
         gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
         fall = _fall_at_half_time_step(search, nominal, events)
         if fall > gap / 2:
-            why = f"half the time step lowers chi2 by {fall:.3g}"
+            why, removed = f"half the time step lowers chi2 by {fall:.3g}", removed + fall
         elif corrected := _without_error_of_links(with_events, nominal, gap):
-            return _examined(*corrected, cuts, True)
+            return _examined(*corrected, cuts, True, removed + 2 * (nominal.cost - corrected[1].cost))
     if why:
         search.progress.begin_stage(f"{why}: going on at {h / 2:g} s")
         search = replace(search, problem=search.problem.with_time_step(h / 2))
-        return _examined(search, _fitted_nominal_model(search, nominal.values))
+        return _examined(search, _fitted_nominal_model(search, nominal.values), removed=removed)
     found = nominal, cuts, whole, events, smoothed, evidence, is_corrected_for_links
     return _Examined(replace(search, problem=composed), *found)
 

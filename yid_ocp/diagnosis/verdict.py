@@ -66,6 +66,7 @@ class NominalModelGapEvidence:
     nominal_held_out_test: NullTestResult
     screening: ScreeningResult
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
+    discretisation_chi2: float = 0.0  # r'r that a finer discretisation may still remove
 
     def exceeds_noise(self, limits: Thresholds) -> bool:
         """Check whether the residual as a whole exceeds noise by a relevant amount."""
@@ -77,8 +78,10 @@ class NominalModelGapEvidence:
 
         A gap that parameters close by leaving the estimates of an earlier run counts only if an effect explains it.
         """
-        p_value = bonferroni_corrected_min_candidate_p_value(self.screening.candidate_scores)
-        return self.has_left_baseline or p_value < limits.gap_significance_level or self.exceeds_noise(limits)
+        scores = self.screening.candidate_scores
+        seen = [score for score in scores if score.predicted_chi2_decrease > self.discretisation_chi2]
+        is_along_candidate = bonferroni_corrected_min_candidate_p_value(seen) < limits.gap_significance_level
+        return self.has_left_baseline or is_along_candidate or self.exceeds_noise(limits)
 
     def are_data_sufficient(self, limits: Thresholds) -> bool:
         """Check whether the data suffice for the nominal model's unknowns, and whether any candidate is detectable."""
