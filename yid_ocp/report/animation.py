@@ -31,6 +31,7 @@ _MAX_MESH_FACES = {True: 6000, False: 4000}  # largest number of triangles on a 
 _FIRST_MESH_CELL, _CELL_GROWTH = 0.004, 1.3  # edge of the cubes in which vertices are merged [m], and its growth factor
 _QUATERNION_SCALE = 1e4
 _MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # shortest stick [m], and tolerance of equal times [s]
+_MAX_ORDINARY_GAP = 1.5  # largest gap between measurements that is interpolated [median sample periods]
 
 
 @dataclass(frozen=True)
@@ -328,9 +329,14 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     for group in recording.points:
         near = np.ceil(np.interp(t, group.t, np.arange(len(group.t))) - 0.5).astype(int)
         apart, period = np.abs(group.t[near] - t) - _TIME_TOLERANCE, max(_spacing(group.t), _spacing(t))
+        after = np.searchsorted(group.t, t).clip(max=len(group.t) - 1)
+        is_ordinary = group.t[after] - group.t[after - 1] <= _MAX_ORDINARY_GAP * _spacing(group.t)
         for i, name in enumerate(group.names):
             own = np.where((apart <= period / 2)[:, None], group.position[near, i], np.nan)
             now = (apart <= _spacing(t) / 2) & np.isfinite(own).all(axis=1)
+            # a frame between two measurements compares the model with the motion between them
+            between = np.stack([np.interp(t, group.t, column) for column in group.position[:, i].T], axis=1)
+            own = np.where((now & is_ordinary)[:, None] & np.isfinite(between), between, own)
             fresh[name] = now | fresh.get(name, False)
             seen[name] = own if name not in seen else np.where(np.isfinite(seen[name]), seen[name], own)
     indices = {name: places.shape[1] + i for i, name in enumerate(seen)}

@@ -24,7 +24,10 @@ _TEXT_COLOR, _GRID_COLOR, _BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
 LINE_PALETTE = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
 _LINE_DASHES, _SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "diamond", "square", "cross")
 BEFORE_COLOR, AFTER_COLOR, MEASURED_COLOR = LINE_PALETTE[1], LINE_PALETTE[0], "#8d99a4"
-_DIVERGING_COLORS = ("#2166ac", "#92c5de", _BACKGROUND_COLOR, "#f4a582", "#b2182b")
+# pairs (position, color): plotly ignores a list of colors alone
+_DIVERGING_COLORSCALE = (
+    (0.0, "#2166ac"), (0.25, "#92c5de"), (0.5, _BACKGROUND_COLOR), (0.75, "#f4a582"), (1.0, "#b2182b")
+)  # fmt: skip
 _SEQUENTIAL_COLORSCALE = ((0.0, _BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
@@ -310,6 +313,7 @@ def parameter_values_by_source_figure(
     sources = list(dict.fromkeys([*(colors or ()), *(source for row in rows.values() for source in row)]))
     names = list(rows)
     figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), axis, "")
+    figure["layout"]["showlegend"] = True
     spread = 0.6 / max(len(sources), 1)
     for i, source in enumerate(sources):
         own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
@@ -333,7 +337,7 @@ def parameter_values_by_source_figure(
 
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
     """Plot a heat map (n, n) in per cent that shows how much of each row's effect the column's effect explains."""
-    figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
+    figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "signature of")
     _add_trace(
         figure, "heatmap", x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False,
         xgap=1, ygap=1,
@@ -375,7 +379,7 @@ def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str
         figure, "heatmap", x=edges.tolist(), y=list(range(len(rows))),
         z=[[v if np.isfinite(v) else None for v in row.tolist()] for row in _even(values)],
         text=[list(row.hover_texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
-        colorscale=_DIVERGING_COLORS, colorbar=bar,
+        colorscale=_DIVERGING_COLORSCALE, colorbar=bar,
     )  # fmt: skip
     figure["layout"] |= {"plot_bgcolor": _GRID_COLOR, "margin": {**_LAYOUT["margin"], "r": 150, "t": 40}}
     labels = [_axis_title(f"color: {axis}", 1)]
