@@ -99,6 +99,10 @@ def test_a_whole_report_is_one_self_contained_page(solved_pendulum, tmp_path):
     page = written(findings(solved_pendulum), tmp_path)
     body = page[page.index("<body>") :]
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=", page)
+    [(_, band), *_] = REPORT_SECTIONS["fit"].prepare_context(findings(solved_pendulum))["figures"]
+    less = replace(findings(solved_pendulum), noise_fraction=0.5)
+    [(_, half), *_] = REPORT_SECTIONS["fit"].prepare_context(less)["figures"]
+    assert half["layout"]["shapes"][0]["y1"] == 0.5 * band["layout"]["shapes"][0]["y1"]
     packed = re.search(r'id="packed">([^<]+)</script>', page).group(1)
     assert gzip.decompress(base64.b64decode(packed)).decode() == plotly.offline.get_plotlyjs()
     assert len(page) < 2.5e6
@@ -215,11 +219,14 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     (name, values) = next(iter(finding.nominal_parameters_before_and_after.items()))
     before = finding.nominal_model.values | {name: values["after"] / 2}
     moved = replace(finding, nominal_model=replace(finding.nominal_model, values=before))
+    tried = text_of(page_of(replace(moved, verdict="unknown", unknown_reason="none"), tmp_path))
+    assert "the errors with joint_coulomb@elbow, which was not accepted" in tried
     text = text_of(page_of(moved, tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
     assert "would have been detected" in text
     assert "By evidence the gap lies in the mechanics or what the effort sensors read" in text
     assert "Closed by joint_coulomb@elbow" in text
+    assert "No two signatures are similar in both directions" in text
     assert "The most significant value is that of elbow" in text
     assert f"{name} goes from" in text
 

@@ -96,7 +96,7 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         for name, own in entry["parameters"].items():
             unit = "" if own["unit"] == "1" else f" {own['unit']}"
             if own["value"] is not None and own["std"] is not None:
-                values.append(f"{name} = {own['value']:.3g} ± {own['std']:.2g}{unit}")
+                values.append(f"{name} = {value_and_uncertainty_text(own['value'], own['std'], least_digits=3)}{unit}")
             elif own["value"] is not None:
                 values.append(f"{name} = {own['value']:.3g}{unit}" if entry["closure"] is None else f"{name} unknown")
         closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
@@ -289,6 +289,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "What it took")
+    yield "cost compares methods; chi2 compares each with noise, by the degrees of freedom at its own estimate"
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]

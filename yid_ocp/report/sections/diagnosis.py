@@ -72,7 +72,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
-        change = f"goes from {first:.3g} to {last:.3g} (one is noise alone)"
+        change = f"goes from {first:.3g} to {last:.3g} (1 = noise alone)"
         sentences.append(f"With {names}, chi² per degree of freedom {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
@@ -80,8 +80,10 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
-        level = f"chi² per degree of freedom is {first:.3g} (one is noise alone)"
-        sentences.append(f"No effect is named, so no error is shown after it; {level}.")
+        level = f"chi² per degree of freedom is {first:.3g} (1 = noise alone)"
+        sentences.append(f"No effect is accepted, so the figure has the nominal model alone; {level}.")
+        tried = " and ".join(entry.effect.label for entry in finding.selected_effects)
+        sentences.append(f"The table above has the errors with {tried}, which was not accepted." if tried else "")
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
@@ -226,7 +228,10 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     absolute = "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
     unit = "as a fraction of the excess over noise" if percent else absolute
     promise = f"redicted decrease of the fitted misfit by each, to first order, {unit}."
-    sentences = [f"P{promise}", "No predicted decrease is large enough for a refit."]
+    refitted = ", ".join(own.effects[0].label for own in finding.single_effect_models)
+    why = ", because they show no gap beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
+    unmeasured = f"Refitted: {refitted}. Held-out motions do not measure what a refit closes{why}."
+    sentences = [f"P{promise}", unmeasured if refitted else "No predicted decrease is large enough for a refit."]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
         best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
@@ -293,13 +298,15 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     at = [labels.index(name) for name in names]
     values = finding.screening.confusability.overlap_fractions[np.ix_(at, at)]
     pairs = ((min(values[i, j], values[j, i]), names[i], names[j]) for i, j in combinations(range(len(names)), 2))
-    said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
+    said = [(v, f"{a} and {b} ({100 * v:.0f} % or more)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     sentences = [
         "Percentage of the row's signature that the column can reproduce, beyond the stiffnesses. These motions and "
         "sensors cannot distinguish a pair with 100 %, for any residual.",
-        f"Similar signatures: {listed}." if close else f"No two signatures are similar; the closest are {said[0][1]}.",
+        f"Similar in both directions: {listed}."
+        if close
+        else f"No two signatures are similar in both directions; the closest are {said[0][1]}.",
     ]
     return "What could be mistaken for what", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
