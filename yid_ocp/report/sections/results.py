@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -112,7 +113,9 @@ def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
         for name, entry in result["parameters"].items():
             known = {r: own for r, own in entry["values"].items() if own.get("verdict") != "not_identifiable"}
             rows.append((name, entry["unit"], {run: (own["value"], own["std"]) for run, own in known.items()}))
-    return draw_figure_per_unit(rows, figures.parameter_values_by_source_figure)
+    runs = dict.fromkeys(run for entry in result.get("parameters", {}).values() for run in entry["values"])
+    colors = dict(zip(runs, itertools.cycle(figures.LINE_PALETTE), strict=False))
+    return draw_figure_per_unit(rows, partial(figures.parameter_values_by_source_figure, colors=colors))
 
 
 @register_report_section("methods", 10, "Methods")
@@ -236,13 +239,13 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
 
 @register_report_section("fit", 20, "How well it fits")
 def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
-    found = []
+    found, share = [], findings.noise_fraction
     whitened: dict[str, list[Array]] = {}
     for own in _predicted_episodes(findings):
-        found += [(f"{name} in {own.episode.name} ({own.role})", curves) for name, curves in _fitted_curves(own)]
+        found += [(f"{name} in {own.episode.name} ({own.role})", curves) for name, curves in _fitted_curves(own, share)]
         for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
             if own.role == _ESTIMATED:
-                ratio = (predicted - samples.value) / samples.std
+                ratio = (predicted - samples.value) / (share * samples.std)
                 whitened.setdefault(samples.sensor.group_name, []).append(ratio[np.isfinite(ratio)])
     if not found:
         return None
@@ -270,7 +273,7 @@ def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
         yield f"{first.channel} in {first.recording}", figures.time_plots_figure(curves, figures.MEASURED_COLOR)
 
 
-def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotData]]]:
+def _fitted_curves(own: _PredictedEpisode, noise_fraction: float) -> Iterator[tuple[str, list[TimePlotData]]]:
     """Title and curves of each point, or of all joints of a group together."""
     grid = own.episode.grid
     for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
@@ -286,7 +289,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
             curves: list[TimePlotData] = []
             for i in columns:
                 name = sensor.output_names[i].rsplit(".", 1)[1]
-                told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
+                told = (t, samples.value[:, i], noise_fraction * samples.std[:, i], {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
                 curves += figures.channel_prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
             yield title, curves
