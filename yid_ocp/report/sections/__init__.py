@@ -77,7 +77,7 @@ def draw_figure_per_unit(
     grouped: dict[str, dict[str, _Row]] = {}
     for name, unit, row in rows:
         grouped.setdefault(unit, {})[name] = row
-    return [("", draw(own, unit)) for unit, own in grouped.items()]
+    return [("", draw(own, "" if unit == "1" else unit)) for unit, own in grouped.items()]
 
 
 def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:

@@ -13,6 +13,7 @@ from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
 from yid_ocp.inference.null_test import channels_with_residual_indices
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, z_scores_of_smoothed_unknowns
+from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
@@ -28,7 +29,7 @@ _MAX_CHANNELS = 3  # held-out channels
 _NOMINAL_LABEL, _EXTENDED_LABEL = "nominal model", "with the effects"
 _MODEL_COLORS = {_NOMINAL_LABEL: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
 _EVENT_COLORS = {"event": figures.AFTER_COLOR} | dict.fromkeys(
-    ("allowed", "allowed, other side"), figures.MEASURED_COLOR
+    ("upper limit of the model error", "lower limit of the model error"), figures.MEASURED_COLOR
 )
 _TitledFigures = list[tuple[str, Any]]
 _Chapter = tuple[str, Sequence[str], _TitledFigures]
@@ -93,7 +94,7 @@ def _figures_by_model(
     colors = {nominal_label: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
     colors["noise alone"] = figures.MEASURED_COLOR
     draw = figures.parameter_values_by_source_figure
-    return draw_figure_per_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]", colors))
+    return draw_figure_per_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]".removesuffix(" []"), colors))
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
@@ -150,7 +151,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     axis = "value in its standard deviations"
 
     def said(j: int, k: int) -> str:
-        return f"{mean[j, k]:.3g} ± {std[j, k]:.2g} {units[k]}"
+        factor, shown = scale_and_unit_with_metres_as_mm(units[k])
+        return f"{value_and_uncertainty_text(factor * mean[j, k], factor * std[j, k], least_digits=3)} {shown}"
 
     if np.any(np.isfinite(values)):
         j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
@@ -170,7 +172,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     for k in kept:
         spans = [f"{edges[j]:.2f} to {edges[j + 1]:.2f} s" for j in range(len(mean))]
         texts = [f"{names[k]}, {span}: {said(j, k)}" for j, span in enumerate(spans)]
-        about = f"{groups[k].location} {groups[k].kind} [{units[k]}]"
+        kind = "torque" if groups[k].kind == "force" and units[k] == "N m" else groups[k].kind
+        about = f"{groups[k].location} {kind} [{scale_and_unit_with_metres_as_mm(units[k])[1]}]"
         rows.append(TimeHeatMapRow(names[k], about, values[:, k], texts))
     return figures.time_heat_map_figure(edges, rows, axis), sentence
 
@@ -182,7 +185,8 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     if not events:
         return None
     sentences = [
-        "Points: the force in addition to model and recording. Grey lines: the error that a correct model may have. "
+        "Points: the force or torque that acts in addition to the model, estimated from the recording. Grey lines: "
+        "the error that a correct model may have. "
         "Shaded: windows of events, with their shape as a line. Events are excluded from the results below "
         "where possible."
         if events.force_estimates
@@ -197,7 +201,8 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         courses = (shape, force.assumed_model_error, -force.assumed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
-        plot = TimePlotData(title, lines, force.t, force.max_likelihood_force, marked_intervals=spans)
+        told = (title, lines, force.t, force.max_likelihood_force)
+        plot = TimePlotData(*told, marked_intervals=spans, dots_name="estimated")
         by_recording.setdefault(force.recording, []).append(plot)
     return "Brief disturbances", sentences, _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
 
@@ -241,7 +246,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
             f"Right: p{promise}",
         ]
     # room for one word on a narrow screen
-    axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
+    axes = ("closed [%]", "promised [%]" if percent else "promised")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return title, sentences, [("", figures.gap_closure_and_screening_figure(entries, *axes))]
 
@@ -298,15 +303,15 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     at = [labels.index(name) for name in names]
     values = finding.screening.confusability.overlap_fractions[np.ix_(at, at)]
     pairs = ((min(values[i, j], values[j, i]), names[i], names[j]) for i, j in combinations(range(len(names)), 2))
-    said = [(v, f"{a} and {b} ({100 * v:.0f} % or more)") for v, a, b in sorted(pairs, reverse=True)]
+    said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     sentences = [
         "Percentage of the row's signature that the column can reproduce, beyond the stiffnesses. These motions and "
         "sensors cannot distinguish a pair with 100 %, for any residual.",
-        f"Similar in both directions: {listed}."
+        f"Similar in both directions, with the smaller percentage: {listed}."
         if close
-        else f"No two signatures are similar in both directions; the closest are {said[0][1]}.",
+        else f"No two signatures are similar in both directions; by the smaller percentage {said[0][1]} are closest.",
     ]
     return "What could be mistaken for what", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
@@ -359,7 +364,7 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
         values = {"fitted without the effects": (before, std), _EXTENDED_LABEL: (after, entry["std"])}
         rows.append((name, entry["unit"], values))
         if abs(after - before) > 0.1 * max(abs(before), 1e-9):
-            text = f"{name} goes from {before:.3g} to {after:.3g} {entry['unit']}"
+            text = f"{name} goes from {before:.3g} to {after:.3g} {entry['unit']}".removesuffix(" 1")
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
     shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])

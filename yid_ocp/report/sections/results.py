@@ -15,7 +15,7 @@ import numpy as np
 from yid_ocp.analysis.compare import MethodsComparisonResult
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, Recording
-from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, VERDICT_TABLE_TEXTS
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -100,7 +100,7 @@ def _provenance(findings: ReportData) -> Mapping[str, Any] | None:
 @register_report_section("pictures", 50, "Pictures")
 def _image_files(findings: ReportData) -> Mapping[str, Any] | None:
     files = findings.section_data.get("pictures", ())
-    shown = [(path.name, base64.b64encode(path.read_bytes()).decode("ascii")) for path in files]
+    shown = [(path.stem.replace("_", " "), base64.b64encode(path.read_bytes()).decode("ascii")) for path in files]
     return {"pictures": shown} if shown else None
 
 
@@ -143,15 +143,16 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
     result = findings.result
     if result.get("format") != "yid-identifiability/1":
         return None
-    curves = {}
+    curves: dict[str, dict[str, tuple[list[float], list[float]]]] = {}  # by verdict, with a range of its own
     for name, profile in result["profiles"].items():
-        best = result["parameters"][name]["value"]
+        best, verdict = (result["parameters"][name][key] for key in ("value", "verdict"))
         if best > 0:
-            curves[name] = ([value / best for value in profile["values"]], profile["delta_chi2"])
-    figure = figures.profile_likelihood_figure(curves, CHI2_95_TWO_SIDED) if curves else None
+            own = ([value / best for value in profile["values"]], profile["delta_chi2"])
+            curves.setdefault(VERDICT_TABLE_TEXTS[verdict], {})[name] = own
+    shown = {said: figures.profile_likelihood_figure(own, CHI2_95_TWO_SIDED) for said, own in curves.items()}
     asked, names = result["what_if"], list(result["parameters"])
     changes = [] if asked is None else [asked["base"], *asked["singles"], *asked["smallest"]]
-    return {"figure": figure, "changes": changes, "names": names} if figure is not None or changes else None
+    return {"figures": shown, "changes": changes, "names": names} if shown or changes else None
 
 
 @register_report_section("friction", 10, "Friction torque of the data and of the law")
@@ -171,7 +172,12 @@ def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     system, names = found.simulator.step.system, found.joint_names
     if (where := found.point_trajectories.get(findings.result.get("point"))) is not None:
         lines, tolerance = _lines(found.t, "xyz", 1e3 * (where - found.target_position)), findings.result["tolerance"]
-        yield "", lines_over_time_figure(TimePlotData("from the place [mm]", lines, band_half_height=1e3 * tolerance))
+        yield (
+            "",
+            lines_over_time_figure(
+                TimePlotData("from the place, its tolerance shaded [mm]", lines, band_half_height=1e3 * tolerance)
+            ),
+        )
     for words, channel, values in (
         ("joints, from the start", "position", found.joint_positions - found.joint_positions[0]),
         ("velocity", "velocity", found.joint_velocities),
@@ -269,7 +275,14 @@ def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
             curves.append(TimePlotData(f"{name} [{first.unit}]", lines, first.t, first.measured[:, i]))
             band = 2 * factor * float(np.nanmedian(first.noise_std[:, i]))
             difference = {f"{other} minus {own}": (first.t, factor * apart[:, i])}
-            curves.append(TimePlotData(f"difference [{shown}]", difference, band_half_height=band, is_low_row=True))
+            curves.append(
+                TimePlotData(
+                    f"difference, two standard deviations of the noise shaded [{shown}]",
+                    difference,
+                    band_half_height=band,
+                    is_low_row=True,
+                )
+            )
         yield f"{first.channel} in {first.recording}", figures.time_plots_figure(curves, figures.MEASURED_COLOR)
 
 
@@ -312,3 +325,5 @@ def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
             lines = _lines(group.t, names, group.position.reshape(len(group.t), -1))
             figure = lines_over_time_figure(TimePlotData("position [m]", lines))
             yield f"Points: {group.name} of {recording.name}", figure
+    if (left := len(findings.section_data.get("recordings", ())) - len(recordings)) > 0:
+        yield f"{left} more recordings are not drawn.", None
