@@ -141,10 +141,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     limits, text = result.thresholds, list[str]()
     if added:
         names = " and ".join(_named(entry.effect, added[-1].refitted_model) for entry in added)
-        verb, part = (
-            "closes" if len(added) == 1 else "together close",
-            "a part of it that held-out motions do not measure",
-        )
+        verb, part = "closes" if len(added) == 1 else "together close", "an unknown part of it on held-out motions"
         if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
             part += ", because the nominal model's error there is within noise"
         if math.isfinite(total.ci_low):
@@ -213,15 +210,10 @@ def _remains(result: DiagnosisResult) -> list[str]:
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
     mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
-    what = (
-        "What remains on held-out motions"
-        if result.accepted_effects
-        else "The nominal model's error on held-out motions"
-    )
+    what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
     said = f"{what} is within noise and the uncertainty of the parameters."
     if result.remaining_test.p_value < result.thresholds.significance_level:
-        beyond_noise = "is model error" if result.accepted_effects else "exceeds noise"
-        said = f"{what} {beyond_noise}: {', '.join([*worst.values(), *mostly])}."
+        said = f"{what} exceeds noise: {', '.join([*worst.values(), *mostly])}."
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_parameters_before_and_after.items()

@@ -466,10 +466,7 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
 def value_and_uncertainty_text(
     value: float, std: float | None, interval: ConfidenceInterval | None = None, least_digits: int = 4
 ) -> str:
-    """Format a value with its 95 % interval or, without an interval, with its standard deviation if known.
-
-    A value with a standard deviation has at least `least_digits` digits, and more down to the second of the deviation.
-    """
+    """Format a value with its 95 % interval, or with its std if known: all digits down to the second of the std."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
     if std is None:

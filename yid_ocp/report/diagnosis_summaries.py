@@ -55,14 +55,16 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
             rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
     yield SummaryTable(rows, "Where")
-    rows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
+    rows = [("event", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "its unit")]
     for own in result.get("events", ()):
         peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
         impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
-        rows.append((own["channel"], own["recording"], *times, peak, impulse, f"{own['unit']}, {own['unit']} s"))
+        rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
+    yield "refitted candidates come first; closure alone is the part of the held-out gap that a refit with one closes"
+    yield "the others follow by score: their significance before a refit; p is the probability of it by noise alone"
     left = len(result["which"]) - _MAX_CANDIDATES
     yield f"{left} more candidates are in result.json" if left > 0 else ""
     yield f"not detectable in these recordings: {', '.join(result['unseen'])}" if result.get("unseen") else ""
@@ -363,9 +365,9 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "run", "differs from the others", "p", "most in", "model explains it", ""
+    yield "run", "chi2 from the others", "degrees of freedom", "p", "most in", "model explains it", ""
     for entry in history["runs"]:
-        apart = (f"chi2 {entry['chi2']:.3g} of {entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
+        apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
         yield entry["name"], *apart, "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
 
 

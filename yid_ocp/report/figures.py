@@ -24,10 +24,7 @@ _TEXT_COLOR, _GRID_COLOR, _BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
 LINE_PALETTE = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
 _LINE_DASHES, _SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "diamond", "square", "cross")
 BEFORE_COLOR, AFTER_COLOR, MEASURED_COLOR = LINE_PALETTE[1], LINE_PALETTE[0], "#8d99a4"
-# pairs (position, color): plotly ignores a list of colors alone
-_DIVERGING_COLORSCALE = (
-    (0.0, "#2166ac"), (0.25, "#92c5de"), (0.5, _BACKGROUND_COLOR), (0.75, "#f4a582"), (1.0, "#b2182b")
-)  # fmt: skip
+_DIVERGING_COLORS = ("#2166ac", "#92c5de", _BACKGROUND_COLOR, "#f4a582", "#b2182b")
 _SEQUENTIAL_COLORSCALE = ((0.0, _BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
@@ -57,6 +54,7 @@ def _line_color(i: int) -> str:
 def figure_html(figure: _Figure) -> str:
     """Convert a figure to an HTML element. The page's script draws it in light or dark colors."""
     told = json.dumps(_plotly_json(figure), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    told = told.replace("^2", "²").replace("^3", "³")
     script = f'<script type="application/json">{told}</script>'
     return f'<div class="plot" style="height:{figure["layout"]["height"]}px">{script}</div>'
 
@@ -72,8 +70,8 @@ def _plotly_json(value: Any) -> Any:
 
 def _styled_figure(height: int, x: str, y: str) -> _Figure:
     """A figure with height [px], axis titles, and the report's colors and fonts."""
-    titles = (("x", _with_raised_powers(x)), ("y", _with_raised_powers(y)))
-    axes = {f"{name}axis": {"title": {"text": title, "standoff": 6}, **_AXIS_STYLE} for name, title in titles}
+    titles = {"x": {"text": x, "standoff": 6}, "y": {"text": y, "standoff": 6}}
+    axes = {f"{name}axis": {"title": title, **_AXIS_STYLE} for name, title in titles.items()}
     return {"data": [], "layout": {**_LAYOUT, "height": height, **axes, "shapes": [], "annotations": []}}
 
 
@@ -215,11 +213,7 @@ def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along
 
 def _axis_title(text: str, y: float) -> dict[str, Any]:
     at = {"x": 0, "xref": "paper", "xanchor": "left", "y": y, "yref": "paper", "yanchor": "bottom"}
-    return {"text": _with_raised_powers(text), "showarrow": False, **at}
-
-
-def _with_raised_powers(text: str) -> str:
-    return text.replace("^2", "²").replace("^3", "³")
+    return {"text": text, "showarrow": False, **at}
 
 
 def lines_over_time_figure(curve: TimePlotData) -> _Figure:
@@ -274,8 +268,8 @@ def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Fi
     _add_line(figure, "y", level, color=_TEXT_COLOR, dash="dot")
     at = {"x": 1, "xref": "x domain", "xanchor": "right", "y": level, "yref": "y", "yanchor": "bottom"}
     figure["layout"]["annotations"].append({"text": "95 %", "showarrow": False, **at})
-    seen = [abs(np.log10(x)) for own in curves.values() for x, rise in zip(*own, strict=True) if rise <= 2.5 * level]
-    reach = min(max(seen, default=1.0), 1.0)
+    points = [point for own in curves.values() for point in zip(*own, strict=True)]
+    reach = min(max((abs(np.log10(x)) for x, rise in points if x > 0 and 0 < rise <= 2.5 * level), default=1.0), 1.0)
     _set_axis(figure, "xaxis", type="log", range=[-reach, reach])
     return _set_axis(figure, "yaxis", range=[-0.2, 2.5 * level])
 
@@ -386,7 +380,7 @@ def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str
         figure, "heatmap", x=edges.tolist(), y=list(range(len(rows))),
         z=[[v if np.isfinite(v) else None for v in row.tolist()] for row in _even(values)],
         text=[list(row.hover_texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
-        colorscale=_DIVERGING_COLORSCALE, colorbar=bar,
+        colorscale=[*zip((0.0, 0.25, 0.5, 0.75, 1.0), _DIVERGING_COLORS, strict=True)], colorbar=bar,
     )  # fmt: skip
     figure["layout"] |= {"plot_bgcolor": _GRID_COLOR, "margin": {**_LAYOUT["margin"], "r": 150, "t": 40}}
     labels = [_axis_title(f"color: {axis}", 1)]
@@ -435,12 +429,8 @@ def gap_closure_and_screening_figure(
         _add_trace(figure, **points, mode="markers", marker=marker, showlegend=False, xaxis="x", yaxis="y")
         # a worse prediction has no lower limit of closure
         left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6
-        layout["xaxis"] = {
-            "title": {"text": closed, "standoff": 6},
-            **_AXIS_STYLE,
-            "range": [left, 108],
-            "domain": [0, 0.46],
-        }
+        title = {"text": closed, "standoff": 6}
+        layout["xaxis"] = {"title": title, **_AXIS_STYLE, "range": [left, 108], "domain": [0, 0.46]}
         _add_line(figure, "x", 0, color=_TEXT_COLOR, width=1)
         texts = {name: f"◀ {value:.0f}" for name, (value, *_) in done.items() if value < left}
         at = {"x": left, "xanchor": "left", "xref": "x", "yref": "y", "showarrow": False}

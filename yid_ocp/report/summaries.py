@@ -226,8 +226,9 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield "intervals of parameters are computed on request: --intervals NAME,NAME or --intervals all"
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
-        rows = [("change", "found", "gain [nat]", "")]
-        for entry in [asked["base"], *asked["singles"], *asked["smallest"]]:
+        rows = [("change", "found", "gain [nat]", "note")]
+        changes = {own["words"]: own for own in (asked["base"], *asked["singles"], *asked["smallest"])}
+        for entry in changes.values():
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
             rows.append((entry["words"], f"{entry['identifiable']} of {len(parameters)}", gain, entry["message"]))
         yield SummaryTable(rows, "What another experiment would identify")
@@ -249,7 +250,7 @@ def _relative(value: float | None) -> str:
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
+    rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "note")]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
         note = ("warranted" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")

@@ -185,9 +185,10 @@ def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
 
 
 def bound_range_text(entry: Mapping[str, Any], digits: int) -> str:
-    """Format the range between the bounds of a parameter, such as "0 to inf". Missing bounds are `-inf` and `inf`."""
-    ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
-    return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
+    """Format the range between the bounds of a parameter, such as "0 to 5", "from 0", "up to 5" or "none"."""
+    lower, upper = ("" if entry[key] is None else f"{entry[key]:.{digits}g}" for key in ("lower", "upper"))
+    one_sided = f"from {lower}" if lower else f"up to {upper}" if upper else "none"
+    return f"{lower} to {upper}" if lower and upper else one_sided
 
 
 def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:

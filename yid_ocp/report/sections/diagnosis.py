@@ -185,8 +185,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     if not events:
         return None
     sentences = [
-        "Points: the force or torque that acts in addition to the model, estimated from the recording. Grey lines: "
-        "the error that a correct model may have. "
+        "Points: force or torque beyond the model, estimated from the recording. Grey: error that a correct model has. "
         "Shaded: windows of events, with their shape as a line. Events are excluded from the results below "
         "where possible."
         if events.force_estimates
@@ -201,8 +200,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         courses = (shape, force.assumed_model_error, -force.assumed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
-        told = (title, lines, force.t, force.max_likelihood_force)
-        plot = TimePlotData(*told, marked_intervals=spans, dots_name="estimated")
+        plot = TimePlotData(title, lines, force.t, force.max_likelihood_force, None, spans, dots_name="estimated")
         by_recording.setdefault(force.recording, []).append(plot)
     return "Brief disturbances", sentences, _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
 
@@ -306,12 +304,11 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
+    none = f"No two signatures are similar in both directions; closest, smaller percentage: {said[0][1]}."
     sentences = [
         "Percentage of the row's signature that the column can reproduce, beyond the stiffnesses. These motions and "
         "sensors cannot distinguish a pair with 100 %, for any residual.",
-        f"Similar in both directions, with the smaller percentage: {listed}."
-        if close
-        else f"No two signatures are similar in both directions; by the smaller percentage {said[0][1]} are closest.",
+        f"Similar in both directions, smaller percentage: {listed}." if close else none,
     ]
     return "What could be mistaken for what", sentences, [("", figures.confusability_matrix_figure(names, values))]
 

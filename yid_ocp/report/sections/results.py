@@ -151,7 +151,8 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
             curves.setdefault(VERDICT_TABLE_TEXTS[verdict], {})[name] = own
     shown = {said: figures.profile_likelihood_figure(own, CHI2_95_TWO_SIDED) for said, own in curves.items()}
     asked, names = result["what_if"], list(result["parameters"])
-    changes = [] if asked is None else [asked["base"], *asked["singles"], *asked["smallest"]]
+    tried = [] if asked is None else [asked["base"], *asked["singles"], *asked["smallest"]]
+    changes = {entry["words"]: entry for entry in tried}
     return {"figures": shown, "changes": changes, "names": names} if shown or changes else None
 
 
@@ -172,12 +173,8 @@ def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     system, names = found.simulator.step.system, found.joint_names
     if (where := found.point_trajectories.get(findings.result.get("point"))) is not None:
         lines, tolerance = _lines(found.t, "xyz", 1e3 * (where - found.target_position)), findings.result["tolerance"]
-        yield (
-            "",
-            lines_over_time_figure(
-                TimePlotData("from the place, its tolerance shaded [mm]", lines, band_half_height=1e3 * tolerance)
-            ),
-        )
+        title = "from the place, its tolerance shaded [mm]"
+        yield "", lines_over_time_figure(TimePlotData(title, lines, band_half_height=1e3 * tolerance))
     for words, channel, values in (
         ("joints, from the start", "position", found.joint_positions - found.joint_positions[0]),
         ("velocity", "velocity", found.joint_velocities),
@@ -275,14 +272,8 @@ def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
             curves.append(TimePlotData(f"{name} [{first.unit}]", lines, first.t, first.measured[:, i]))
             band = 2 * factor * float(np.nanmedian(first.noise_std[:, i]))
             difference = {f"{other} minus {own}": (first.t, factor * apart[:, i])}
-            curves.append(
-                TimePlotData(
-                    f"difference, two standard deviations of the noise shaded [{shown}]",
-                    difference,
-                    band_half_height=band,
-                    is_low_row=True,
-                )
-            )
+            title = f"difference, two standard deviations of the noise shaded [{shown}]"
+            curves.append(TimePlotData(title, difference, band_half_height=band, is_low_row=True))
         yield f"{first.channel} in {first.recording}", figures.time_plots_figure(curves, figures.MEASURED_COLOR)
 
 
