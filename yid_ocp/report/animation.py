@@ -273,14 +273,19 @@ def _shown_frames(system: System) -> list[str]:
 
 
 def animation_of_trajectories(
-    title: str, trajectories: Sequence[ConfigurationTrajectory], recording: Recording | None = None
+    title: str,
+    trajectories: Sequence[ConfigurationTrajectory],
+    recording: Recording | None = None,
+    goal: Array | None = None,
 ) -> AnimationData:
-    """Animate model trajectories and the recorded motion. The first trajectory sets the times and joints.
+    """Animate model trajectories, the recorded motion and a `goal` (3,). The first trajectory sets times and joints.
 
     The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames.
     """
     t = _frame_times(trajectories[0].t)
     motions = [_model_motion(entry, t, entry._q_at(t)) for entry in trajectories]
+    if goal is not None:
+        motions.insert(0, _AnimatedMotion("goal", (), np.tile(goal, (len(t), 1, 1)), {"goal": 0}))
     if recording is not None:
         motions.append(_measured_motion(trajectories[0], recording, t))
     return AnimationData(title, t, tuple(motions))

@@ -40,7 +40,10 @@ _MAX_RUN_DIFFERENCE = 2  # between two runs, from which on a parameter is named 
 def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     verdict = result["verdict"].replace("_", " ")
-    yield SummaryStatement(f"Verdict: {verdict}. {result['summary']}", "verdict")
+    found, _, advice = result["summary"].partition(" Next experiment: ")
+    gap, _, cause = found.partition(". ")
+    parts = (f"Verdict: {verdict}. {gap.removesuffix('.')}.", cause, f"Next experiment: {advice}" if advice else "")
+    yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
     for channel, error in before["rmse"].items():

@@ -347,7 +347,7 @@ def _curves(
     what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
     sentences = [
         f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
-        "each the error, with two standard deviations of the noise shaded; a correct model stays inside."
+        "each the error, two standard deviations of the noise shaded; a correct model is inside 95 % of the time."
     ]
     return "Measured and predicted", sentences, shown
 

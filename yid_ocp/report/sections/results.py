@@ -233,9 +233,9 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
     scenes = [entry for entry in scenes if len(entry.t) > 1]
     text = json.dumps(animations_to_dict(scenes[:_MAX_ANIMATIONS], findings.robot), separators=(",", ":"))
     both = any(
-        motion.name == "measured" and motion.point_indices and len(entry.motions) > 1
+        motion.name == "measured" and any({*motion.point_indices} & {*own.point_indices} for own in others)
         for entry in scenes
-        for motion in entry.motions
+        for *others, motion in (entry.motions,)
     )
     return {"scenes": text.replace("<", "\\u003c"), "both": both} if scenes else None
 
