@@ -99,10 +99,9 @@ def test_a_whole_report_is_one_self_contained_page(solved_pendulum, tmp_path):
     page = written(findings(solved_pendulum), tmp_path)
     body = page[page.index("<body>") :]
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=", page)
-    [(_, band), *_] = REPORT_SECTIONS["fit"].prepare_context(findings(solved_pendulum))["figures"]
-    less = replace(findings(solved_pendulum), noise_fraction=0.5)
-    [(_, half), *_] = REPORT_SECTIONS["fit"].prepare_context(less)["figures"]
-    assert half["layout"]["shapes"][0]["y1"] == 0.5 * band["layout"]["shapes"][0]["y1"]
+    data = (replace(findings(solved_pendulum), noise_fraction=part) for part in (1.0, 0.5))
+    bands = [REPORT_SECTIONS["fit"].prepare_context(own)["figures"][0][1]["layout"]["shapes"][0]["y1"] for own in data]
+    assert bands[1] == 0.5 * bands[0]
     packed = re.search(r'id="packed">([^<]+)</script>', page).group(1)
     assert gzip.decompress(base64.b64decode(packed)).decode() == plotly.offline.get_plotlyjs()
     assert len(page) < 2.5e6
@@ -221,6 +220,9 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     moved = replace(finding, nominal_model=replace(finding.nominal_model, values=before))
     tried = text_of(page_of(replace(moved, verdict="unknown", unknown_reason="none"), tmp_path))
     assert "the errors with joint_coulomb@elbow, which was not accepted" in tried
+    lost = moved.nominal_model.held_out_loss
+    quiet = replace(moved.nominal_model, held_out_loss=replace(lost, block_chi2=0 * lost.block_chi2, baseline_chi2=0.0))
+    assert "Refitted: joint_coulomb@elbow" in text_of(page_of(replace(moved, nominal_model=quiet), tmp_path))
     text = text_of(page_of(moved, tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
     assert "would have been detected" in text
