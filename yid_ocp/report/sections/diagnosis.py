@@ -304,11 +304,11 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
-    none = f"No two signatures are similar in both directions; closest, smaller percentage: {said[0][1]}."
+    none = f"No two signatures are similar in both directions; by the smaller percentage the closest are {said[0][1]}."
     sentences = [
         "Percentage of the row's signature that the column can reproduce, beyond the stiffnesses. These motions and "
         "sensors cannot distinguish a pair with 100 %, for any residual.",
-        f"Similar in both directions, smaller percentage: {listed}." if close else none,
+        f"Similar in both directions, with the smaller percentage: {listed}." if close else none,
     ]
     return "What could be mistaken for what", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
