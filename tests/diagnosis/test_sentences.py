@@ -100,8 +100,8 @@ def places():
 
 def effects():
     """What was added, how sure it is, what it closes and what is left."""
-    for unit, std in [("N m", 0.0234), ("1", 0.0234), ("N m", math.inf), ("N m", math.nan)]:
-        yield f"a = 0.457, std {std} {unit}", with_effect(effect("friction@elbow", amplitude(unit=unit)), 0.4567, std)
+    for unit, std in [("N m", 0.0234), ("1", 2.34e-6), ("N m", math.inf), ("N m", math.nan)]:
+        yield f"a = 0.457, std {std} {unit}", with_effect(effect("friction@elbow", amplitude(unit=unit)), 0.456789, std)
     yield "closure", with_effect(FRICTION, 0.5, gap_closure=closed(0.9123, 0.8012, 0.9534))
     yield "no sure closure", with_effect(FRICTION, 0.5, gap_closure=closed(0.9, -0.01, 0.95))
     both = fit([FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25})

@@ -93,9 +93,15 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     # it is a measurement of one moment alone
     np.testing.assert_array_equal(measured.is_new_measurement[:, 0], near <= 0.5 * np.median(np.diff(made.t)))
     np.testing.assert_array_equal(measured.positions[np.argmin(abs(made.t - 0.5)), k], seen[0, 0])
+    often = np.arange(0.003, 2.0, 0.01)
+    moving = PointGroup("camera", ("w_T1",), often, often[:, None, None] * np.ones(3))
+    between = animation_of_trajectories("a", [told], Recording(joints, (moving,), name="a")).motions[1].positions[1:, k]
+    np.testing.assert_allclose(between[:-2], made.t[1:-2, None] * np.ones(3), atol=1e-9)
     arm, recorded = measured.sticks[0].end_indices[1], np.where(np.isin(np.arange(n), at), q[:1] + 0.01, q[:1])
     moved = animated(single_arm, recorded).positions
     np.testing.assert_allclose(measured.positions[0, arm], moved[0, arm], atol=1e-9)
+    goal = animation_of_trajectories("a", [told], goal=np.ones(3)).motions[0]
+    assert (goal.name, goal.positions.min(), goal.positions.max()) == ("goal", 1.0, 1.0)
     [page] = animations_to_dict([made])["scenes"]
     assert page["motions"][1]["places"][0][3 * k] is None
     first = np.array(page["motions"][0]["places"][0]).reshape(-1, 3) / page["scale"]
@@ -153,9 +159,8 @@ def test_meshes_move_with_their_joints(single_arm, worn):
 
 
 def test_a_robot_without_meshes_is_sticks(single_arm, urdf_folder):
-    told = ConfigurationTrajectory(
-        "p", single_arm, single_arm.parameters.vector(), np.arange(2), np.zeros((2, single_arm.n_coordinates))
-    )
+    q = np.zeros((2, single_arm.n_coordinates))
+    told = ConfigurationTrajectory("p", single_arm, single_arm.parameters.vector(), np.arange(2), q)
     for robot in (None, str(urdf_folder / "double_pendulum.urdf"), "nowhere.urdf"):
         page = animations_to_dict([animation_of_trajectories("a", [told])], robot)
         assert page["meshes"] == {}
@@ -293,7 +298,7 @@ def test_values_of_very_different_sizes_get_a_logarithmic_axis():
 
     close = drawn(a={"1": (2.0, None), "2": (1.0, None)}, b={"1": (3.0, None), "3": (1.0, None)})
     far = drawn(a={"1": (20.0, None), "2": (0.1, None)})
-    assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
+    assert (close.layout.xaxis.type, far.layout.xaxis.type, far.layout.showlegend) == (None, "log", True)
     assert [trace.name for trace in close.data] == ["2", "1", "3"]
     assert close.data[0].marker.color == "#000000" != close.data[1].marker.color
     # bars of what cannot be told do not widen the axis
@@ -306,8 +311,9 @@ def test_values_of_very_different_sizes_get_a_logarithmic_axis():
 def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
     values = np.array([1.0, np.nan, -4000.0])
     rows = [TimeHeatMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
-    figure = go.Figure(figures.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations"))
+    figure = go.Figure(raw := figures.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations"))
     [heat] = figure.data
+    assert raw["data"][0]["colorscale"][2] == (0.5, "#ffffff"), "the script needs pairs"
     assert (heat.z[0][1], len(heat.x), "1000" in heat.colorbar.ticktext) == (None, 4, True)
     assert heat.zmax == -heat.zmin > 0
     assert [a.text for a in figure.layout.annotations] == ["color: deviations", "a", "b"]

@@ -77,7 +77,7 @@ addEventListener("load", async () => {
 
 
 def text_of(page: str) -> str:
-    body = re.sub(r"<script.*?</script>", "", page.split("<body>")[1], flags=re.DOTALL)
+    body = re.sub(r"<script.*?</script>", "", re.sub("</?code>", "", page.split("<body>")[1]), flags=re.DOTALL)
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
 
 
@@ -99,6 +99,9 @@ def test_a_whole_report_is_one_self_contained_page(solved_pendulum, tmp_path):
     page = written(findings(solved_pendulum), tmp_path)
     body = page[page.index("<body>") :]
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=", page)
+    data = (replace(findings(solved_pendulum), noise_fraction=part) for part in (1.0, 0.5))
+    bands = [REPORT_SECTIONS["fit"].prepare_context(own)["figures"][0][1]["layout"]["shapes"][0]["y1"] for own in data]
+    assert bands[1] == 0.5 * bands[0]
     packed = re.search(r'id="packed">([^<]+)</script>', page).group(1)
     assert gzip.decompress(base64.b64decode(packed)).decode() == plotly.offline.get_plotlyjs()
     assert len(page) < 2.5e6
@@ -215,11 +218,17 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     (name, values) = next(iter(finding.nominal_parameters_before_and_after.items()))
     before = finding.nominal_model.values | {name: values["after"] / 2}
     moved = replace(finding, nominal_model=replace(finding.nominal_model, values=before))
+    tried = text_of(page_of(replace(moved, verdict="unknown", unknown_reason="none"), tmp_path))
+    assert "the errors with joint_coulomb@elbow, which was not accepted" in tried
+    lost = moved.nominal_model.held_out_loss
+    quiet = replace(moved.nominal_model, held_out_loss=replace(lost, block_chi2=0 * lost.block_chi2, baseline_chi2=0.0))
+    assert "Refitted: joint_coulomb@elbow" in text_of(page_of(replace(moved, nominal_model=quiet), tmp_path))
     text = text_of(page_of(moved, tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
     assert "would have been detected" in text
     assert "By evidence the gap lies in the mechanics or what the effort sensors read" in text
     assert "Closed by joint_coulomb@elbow" in text
+    assert "No two signatures are similar in both directions" in text
     assert "The most significant value is that of elbow" in text
     assert f"{name} goes from" in text
 
@@ -351,4 +360,4 @@ def assert_same_words(out: str, page: str) -> None:
     for line in lines:
         for cell in re.split(r"\s{2,}", line.strip()):
             if cell and set(cell) != {"-"}:
-                assert " ".join(cell.split()) in page, cell
+                assert " ".join(cell.split()).replace("`", "") in page, cell

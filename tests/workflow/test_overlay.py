@@ -77,7 +77,6 @@ def test_a_value_that_cannot_be_found_has_no_digits_and_no_difference():
     assert (parameters["k"]["difference"], parameters["k"]["difference_in_std"]) == (None, None)
     channel = {"recording": "r", "channel": "points.p", "unit": "m", "held_out": True, "rmse": {"a": 1.0, "b": 2.0}}
     result = {"format": "yid-overlay/1", "runs": {"a": "a", "b": "b"}, "parameters": parameters}
-    lines = summary_terminal_lines(
-        SUMMARY_BY_RESULT_FORMAT["yid-overlay/1"](result | {"channels": [channel | {"difference": 0.5}]})
-    )
+    result |= {"channels": [channel | {"difference": 0.5}]}
+    lines = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT["yid-overlay/1"](result))
     assert "k          –  2.5 ± 0.1  N m/rad" in lines

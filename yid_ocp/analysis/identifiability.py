@@ -41,6 +41,7 @@ _RANK_RTOL = 1e-10
 _MAX_DIRECTION_MISMATCH = 0.05  # between the unit vectors of a direction and of a simple combination
 _FINITE_CHANGE_FACTOR = 1.3  # factor on the first parameter in the test of a combination at a finite change
 _MAX_LISTED_NAMES = 4  # in a sentence
+_MIN_NAMED_SHARE = 0.1  # of the largest change along a determined direction, from which on a parameter is named
 _MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that by one parameter
 
 
@@ -429,6 +430,7 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
 
 def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) -> str:
     parts = sorted(_components(view, vector), key=lambda part: -abs(part.coefficient))
+    parts = [part for part in parts if abs(part.coefficient) > _MIN_NAMED_SHARE * abs(parts[0].coefficient)]
     own = float(std[view.names.index(parts[0].name)])
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
     how = "is determined" if spread <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD else "is determined only weakly"
@@ -436,7 +438,8 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
     if len(parts) > 1:
         ratio = " : ".join([*changes[:_MAX_LISTED_NAMES], "..."][: len(parts)])
         what = f"a relative change of {_joined([part.name for part in parts])} in the ratio {ratio}"
-    return f"{what} {how} (± {uncertainty.percent_number_text(spread)} %)"
+    order = "" if len(parts) > 1 or math.isfinite(own) else " to first order"
+    return f"{what} {how} (± {uncertainty.percent_number_text(spread)} %{order})"
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:

@@ -16,7 +16,7 @@ from yid_ocp.display import abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
-from yid_ocp.inference.uncertainty import priors_that_determine_unknown
+from yid_ocp.inference.uncertainty import priors_that_determine_unknown, value_and_uncertainty_text
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
@@ -116,7 +116,9 @@ def _gap(result: DiagnosisResult) -> str:
     if result.verdict in texts:
         return texts[result.verdict]
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
-        return f"The gap is real ({sizes}; p {_p_value_relation(p_value)})."
+        seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
+        only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
+        return f"The gap is real{only} ({sizes}; p {_p_value_relation(p_value)})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
     small = f"not along what {best.effect.label} would do (p {_p_value_relation(p_value)})"
     return f"As a whole the recordings are explained to within their noise ({sizes}), but {small}."
@@ -139,7 +141,9 @@ def _causes(result: DiagnosisResult) -> list[str]:
     limits, text = result.thresholds, list[str]()
     if added:
         names = " and ".join(_named(entry.effect, added[-1].refitted_model) for entry in added)
-        verb, part = "closes" if len(added) == 1 else "together close", "no measurable part of it on held-out motions"
+        verb, part = "closes" if len(added) == 1 else "together close", "an unknown part of it on held-out motions"
+        if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
+            part += ", because the nominal model's error there is within noise"
         if math.isfinite(total.ci_low):
             interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
             part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
@@ -191,7 +195,7 @@ def _named(effect: EffectBase, fit: RefitStatistics) -> str:
     """An effect with its estimates, and a warning if an amplitude is far outside its expected range."""
     values, odd = [], ""
     for name, r in fit.effect_parameters_as_reported(effect).items():
-        known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".removesuffix(" 1")
+        known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
     for name in fit.amplitudes_beyond_prior_range(effect):
         low, high = effect.prior_ranges[name]
@@ -206,9 +210,10 @@ def _remains(result: DiagnosisResult) -> list[str]:
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
     mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
-    said = "What remains on held-out motions is within noise and the uncertainty of the parameters."
+    what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
+    said = f"{what} is within noise and the uncertainty of the parameters."
     if result.remaining_test.p_value < result.thresholds.significance_level:
-        said = f"What remains on held-out motions is model error: {', '.join([*worst.values(), *mostly])}."
+        said = f"{what} exceeds noise: {', '.join([*worst.values(), *mostly])}."
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_parameters_before_and_after.items()
@@ -223,8 +228,9 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
     if since is not None:
         moved = []
         for own in since.changed_parameters:
-            before = f"{own.baseline_value:.3g} ± {own.baseline_std:.2g}"
-            moved.append(f"{own.name} goes from {before} to {own.current_value:.3g} ± {own.current_std:.2g} {own.unit}")
+            before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
+            now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
+            moved.append(f"{own.name} goes from {before} to {now} {own.unit}")
         text.append(_listed("Against the baseline, ", moved or ["no parameter has changed detectably"]))
         if since.between_runs_p_value < _RUNS_DIFFER_LEVEL:
             differ = f"differ among themselves (p = {since.between_runs_p_value:.2g})"

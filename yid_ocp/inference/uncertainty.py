@@ -463,11 +463,16 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     return f"the model does not explain the recordings ({size}, 1 is noise alone); run `yid-ocp diagnose`"
 
 
-def value_and_uncertainty_text(value: float, std: float | None, interval: ConfidenceInterval | None) -> str:
-    """Format a value with its 95 % interval or, without an interval, with its standard deviation if known."""
+def value_and_uncertainty_text(
+    value: float, std: float | None, interval: ConfidenceInterval | None = None, least_digits: int = 4
+) -> str:
+    """Format a value with its 95 % interval, or with its std if known: all digits down to the second of the std."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
-    return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
+    if std is None:
+        return f"{value:.4g}"
+    ratio = math.floor(math.log10(abs(value))) - math.floor(math.log10(std)) if 0 < std < abs(value) else 0
+    return f"{value:.{max(least_digits, ratio + 2)}g} ± {std:.2g}"
 
 
 def finite_or_none(value: float) -> float | None:

@@ -31,6 +31,7 @@ _MAX_MESH_FACES = {True: 6000, False: 4000}  # largest number of triangles on a 
 _FIRST_MESH_CELL, _CELL_GROWTH = 0.004, 1.3  # edge of the cubes in which vertices are merged [m], and its growth factor
 _QUATERNION_SCALE = 1e4
 _MIN_STICK_LENGTH, _TIME_TOLERANCE = 1e-6, 1e-9  # shortest stick [m], and tolerance of equal times [s]
+_MAX_ORDINARY_GAP = 1.5  # largest gap between measurements that is interpolated [median sample periods]
 
 
 @dataclass(frozen=True)
@@ -272,14 +273,19 @@ def _shown_frames(system: System) -> list[str]:
 
 
 def animation_of_trajectories(
-    title: str, trajectories: Sequence[ConfigurationTrajectory], recording: Recording | None = None
+    title: str,
+    trajectories: Sequence[ConfigurationTrajectory],
+    recording: Recording | None = None,
+    goal: Array | None = None,
 ) -> AnimationData:
-    """Animate model trajectories and the recorded motion. The first trajectory sets the times and joints.
+    """Animate model trajectories, the recorded motion and a `goal` (3,). The first trajectory sets times and joints.
 
     The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames.
     """
     t = _frame_times(trajectories[0].t)
     motions = [_model_motion(entry, t, entry._q_at(t)) for entry in trajectories]
+    if goal is not None:
+        motions.insert(0, _AnimatedMotion("goal", (), np.tile(goal, (len(t), 1, 1)), {"goal": 0}))
     if recording is not None:
         motions.append(_measured_motion(trajectories[0], recording, t))
     return AnimationData(title, t, tuple(motions))
@@ -328,9 +334,14 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     for group in recording.points:
         near = np.ceil(np.interp(t, group.t, np.arange(len(group.t))) - 0.5).astype(int)
         apart, period = np.abs(group.t[near] - t) - _TIME_TOLERANCE, max(_spacing(group.t), _spacing(t))
+        after = np.searchsorted(group.t, t).clip(max=len(group.t) - 1)
+        is_ordinary = group.t[after] - group.t[after - 1] <= _MAX_ORDINARY_GAP * _spacing(group.t)
         for i, name in enumerate(group.names):
             own = np.where((apart <= period / 2)[:, None], group.position[near, i], np.nan)
             now = (apart <= _spacing(t) / 2) & np.isfinite(own).all(axis=1)
+            # a frame between two measurements compares the model with the motion between them
+            between = np.stack([np.interp(t, group.t, column) for column in group.position[:, i].T], axis=1)
+            own = np.where((now & is_ordinary)[:, None] & np.isfinite(between), between, own)
             fresh[name] = now | fresh.get(name, False)
             seen[name] = own if name not in seen else np.where(np.isfinite(seen[name]), seen[name], own)
     indices = {name: places.shape[1] + i for i, name in enumerate(seen)}

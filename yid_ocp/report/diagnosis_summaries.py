@@ -40,7 +40,10 @@ _MAX_RUN_DIFFERENCE = 2  # between two runs, from which on a parameter is named 
 def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     verdict = result["verdict"].replace("_", " ")
-    yield SummaryStatement(f"Verdict: {verdict}. {result['summary']}", "verdict")
+    found, _, advice = result["summary"].partition(" Next experiment: ")
+    gap, _, cause = found.partition(". ")
+    parts = (f"Verdict: {verdict}. {gap.removesuffix('.')}.", cause, f"Next experiment: {advice}" if advice else "")
+    yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
     for channel, error in before["rmse"].items():
@@ -55,14 +58,16 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
             rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
     yield SummaryTable(rows, "Where")
-    rows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
+    rows = [("event", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "its unit")]
     for own in result.get("events", ()):
         peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
         impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
-        rows.append((own["channel"], own["recording"], *times, peak, impulse, f"{own['unit']}, {own['unit']} s"))
+        rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
+    yield "refitted candidates come first; closure alone is the part of the held-out gap that a refit with one closes"
+    yield "the others follow by score: their significance before a refit; p is the probability of it by noise alone"
     left = len(result["which"]) - _MAX_CANDIDATES
     yield f"{left} more candidates are in result.json" if left > 0 else ""
     yield f"not detectable in these recordings: {', '.join(result['unseen'])}" if result.get("unseen") else ""
@@ -96,7 +101,7 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         for name, own in entry["parameters"].items():
             unit = "" if own["unit"] == "1" else f" {own['unit']}"
             if own["value"] is not None and own["std"] is not None:
-                values.append(f"{name} = {own['value']:.3g} ± {own['std']:.2g}{unit}")
+                values.append(f"{name} = {value_and_uncertainty_text(own['value'], own['std'], least_digits=3)}{unit}")
             elif own["value"] is not None:
                 values.append(f"{name} = {own['value']:.3g}{unit}" if entry["closure"] is None else f"{name} unknown")
         closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
@@ -289,6 +294,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "What it took")
+    yield "cost compares methods; chi2 compares each with noise, by the degrees of freedom at its own estimate"
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
@@ -362,9 +368,9 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "run", "differs from the others", "p", "most in", "model explains it", ""
+    yield "run", "chi2 from the others", "degrees of freedom", "p", "most in", "model explains it", ""
     for entry in history["runs"]:
-        apart = (f"chi2 {entry['chi2']:.3g} of {entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
+        apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
         yield entry["name"], *apart, "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
 
 

@@ -29,12 +29,12 @@ _SEQUENTIAL_COLORSCALE = ((0.0, _BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
 _ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # of a figure with rows [px]
-_TOP_MARGIN, _BOTTOM_MARGIN = 64, 44  # [px]
+_TOP_MARGIN, _BOTTOM_MARGIN = 70, 44  # [px]
 _SHADE = {"fillcolor": _GRID_COLOR, "opacity": 0.7, "line": {"width": 0}, "layer": "below"}
-_AXIS_STYLE = {"gridcolor": _GRID_COLOR, "zeroline": False, "linecolor": _GRID_COLOR}
-_POWERS = {"type": "log", "exponentformat": "power"}
+_AXIS_STYLE = {"gridcolor": _GRID_COLOR, "zeroline": False, "linecolor": _GRID_COLOR, "automargin": True}
+_AXIS_STYLE |= {"exponentformat": "power"}
 _LAYOUT: dict[str, Any] = {
-    "margin": {"l": 70, "r": 20, "t": 30, "b": 45},
+    "margin": {"l": 70, "r": 20, "t": 56, "b": 45},  # the legend stands below the toolbar
     "paper_bgcolor": "rgba(0,0,0,0)",
     "plot_bgcolor": "rgba(0,0,0,0)",
     "font": {"family": "system-ui, sans-serif", "size": 13, "color": _TEXT_COLOR},
@@ -54,6 +54,7 @@ def _line_color(i: int) -> str:
 def figure_html(figure: _Figure) -> str:
     """Convert a figure to an HTML element. The page's script draws it in light or dark colors."""
     told = json.dumps(_plotly_json(figure), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    told = told.replace("^2", "²").replace("^3", "³")
     script = f'<script type="application/json">{told}</script>'
     return f'<div class="plot" style="height:{figure["layout"]["height"]}px">{script}</div>'
 
@@ -69,7 +70,8 @@ def _plotly_json(value: Any) -> Any:
 
 def _styled_figure(height: int, x: str, y: str) -> _Figure:
     """A figure with height [px], axis titles, and the report's colors and fonts."""
-    axes = {f"{name}axis": {"title": {"text": title}, **_AXIS_STYLE} for name, title in (("x", x), ("y", y))}
+    titles = {"x": {"text": x, "standoff": 6}, "y": {"text": y, "standoff": 6}}
+    axes = {f"{name}axis": {"title": title, **_AXIS_STYLE} for name, title in titles.items()}
     return {"data": [], "layout": {**_LAYOUT, "height": height, **axes, "shapes": [], "annotations": []}}
 
 
@@ -91,10 +93,10 @@ def _add_line(figure: _Figure, axis: str, value: float, **line: Any) -> None:
     figure["layout"]["shapes"].append({"type": "line", **at, f"{other}ref": f"{other} domain", "line": line})
 
 
-def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]], later_dash: str = "solid") -> _Figure:
-    """Add one line with markers per name and (x, y), each in its own color; `later_dash` once colors repeat."""
+def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]]) -> _Figure:
+    """Add one line with markers per name and (x, y), each in its own color, dashed once colors repeat."""
     for i, (name, (x, y)) in enumerate(curves):
-        line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_PALETTE) else later_dash}
+        line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_PALETTE) else "dash"}
         if len(x):
             _add_trace(figure, x=list(x), y=list(y), mode="lines+markers", name=name, line=line)
     return figure
@@ -102,8 +104,8 @@ def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]], later_das
 
 def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> _Figure:
     """Plot the cost of every accepted iterate, with one curve for each intermediate horizon."""
-    figure = _styled_figure(320, "accepted point", "cost")
-    _set_axis(figure, "yaxis", **_POWERS)
+    figure = _styled_figure(340, "accepted point", "cost")
+    _set_axis(figure, "yaxis", type="log")
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
     spans = zip([0, *ends], ends, strict=False)
     return _add_curves(figure, ((notes[i] or "whole recordings", (range(i, j), costs[i:j])) for i, j in spans))
@@ -120,6 +122,7 @@ class TimePlotData:
     band_half_height: float | None = None  # half the height of a shaded band about zero; None: no band
     marked_intervals: Sequence[tuple[float, float]] = ()
     is_low_row: bool = False
+    dots_name: str = "measured"
 
 
 def channel_prediction_and_residual_plot_data(
@@ -173,7 +176,7 @@ def time_plots_figure(
         axes[f"yaxis{number}"] = {"anchor": f"x{number}", "domain": domain, "nticks": 4, **_AXIS_STYLE}
         at = {"type": "scatter", "xaxis": f"x{number}", "yaxis": f"y{number}"}
         dot = {"color": dots, "size": 3 if len(curve.t) > 60 else 6}
-        drawn = [("measured", curve.t, curve.measured, {"mode": "markers", "marker": dot})] if len(curve.t) else []
+        drawn = [(curve.dots_name, curve.t, curve.measured, {"mode": "markers", "marker": dot})] if len(curve.t) else []
         for name, (t, value) in curve.lines.items():
             # sparse measurements may have no neighbours
             mode = "lines+markers" if curve.is_low_row and len(t) <= 60 else "lines"
@@ -191,7 +194,7 @@ def time_plots_figure(
         # next to a low row, a rotated title would collide with the next title
         titles.append({**_axis_title(curve.axis_title, top), "font": {"size": 12}})
         top -= (height + _ROW_GAP) / inner
-    axes[f"xaxis{last}"]["title"] = {"text": "time [s]"}
+    axes[f"xaxis{last}"]["title"] = {"text": "time [s]", "standoff": 6}
     margin = {"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN}
     height = inner + _TOP_MARGIN + _BOTTOM_MARGIN
     legend, around = {**_LAYOUT["legend"], "y": 1 + 22 / inner}, {"shapes": shapes, "annotations": titles}
@@ -247,7 +250,7 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> _Figur
 def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
     """Plot each method's relative excess cost over wall time, from pairs (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
-    _set_axis(figure, "yaxis", **_POWERS)
+    _set_axis(figure, "yaxis", type="log")
     least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}
     excess = {name: (t, [max(c / least[name] - 1, 1e-9) for c in cost]) for name, (t, cost) in costs.items()}
     return _add_curves(figure, excess.items())
@@ -261,11 +264,13 @@ def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: S
 
 def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Figure:
     """Plot how much chi2 rises as the parameter moves away from the estimate (profile likelihood)."""
-    figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items(), "dash")
+    figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items())
     _add_line(figure, "y", level, color=_TEXT_COLOR, dash="dot")
     at = {"x": 1, "xref": "x domain", "xanchor": "right", "y": level, "yref": "y", "yanchor": "bottom"}
     figure["layout"]["annotations"].append({"text": "95 %", "showarrow": False, **at})
-    _set_axis(figure, "xaxis", type="log", range=[-1.0, 1.0])
+    points = [point for own in curves.values() for point in zip(*own, strict=True)]
+    reach = min(max((abs(np.log10(x)) for x, rise in points if x > 0 and 0 < rise <= 2.5 * level), default=1.0), 1.0)
+    _set_axis(figure, "xaxis", type="log", range=[-reach, reach])
     return _set_axis(figure, "yaxis", range=[-0.2, 2.5 * level])
 
 
@@ -309,7 +314,8 @@ def parameter_values_by_source_figure(
     """Plot values ± 2 std from several sources: a row for each name, a color for each source (default: palette)."""
     sources = list(dict.fromkeys([*(colors or ()), *(source for row in rows.values() for source in row)]))
     names = list(rows)
-    figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), axis, "")
+    figure = _styled_figure(136 + max(36, 14 * len(sources)) * len(names), axis, "")
+    figure["layout"]["showlegend"] = True
     spread = 0.6 / max(len(sources), 1)
     for i, source in enumerate(sources):
         own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
@@ -323,17 +329,17 @@ def parameter_values_by_source_figure(
     numbers = [value for row in rows.values() for value, _ in row.values()]
     low, high = min([0.0, *numbers]), max([0.0, *numbers])
     if numbers and min(numbers) > 0 and high > 30 * min(numbers):
-        _set_axis(figure, "xaxis", **_POWERS, dtick="D2" if high < 1e3 * min(numbers) else 1)
+        _set_axis(figure, "xaxis", type="log", dtick="D2" if high < 1e3 * min(numbers) else 1)
     else:
         # bars of undetermined parameters would compress all others
         _set_axis(figure, "xaxis", range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
     ends = [len(names) - 0.5, -0.5]
-    return _set_axis(figure, "yaxis", tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
+    return _set_axis(figure, "yaxis", tickvals=list(range(len(names))), ticktext=names, range=ends)
 
 
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
     """Plot a heat map (n, n) in per cent that shows how much of each row's effect the column's effect explains."""
-    figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
+    figure = _styled_figure(130 + 27 * len(names), "explained by [%]", "signature of")
     _add_trace(
         figure, "heatmap", x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False,
         xgap=1, ygap=1,
@@ -341,11 +347,10 @@ def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
         hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>",
         text=[[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values],
     )  # fmt: skip
-    every = {"type": "category", "tickmode": "array", "showgrid": False, "automargin": True}
-    for name in ("xaxis", "yaxis"):
-        figure["layout"][name]["title"]["standoff"] = 6
-    _set_axis(figure, "xaxis", tickangle=-40, tickvals=list(names), **every)
-    return _set_axis(figure, "yaxis", autorange="reversed", tickvals=list(names), **every)
+    every = {"type": "category", "tickmode": "array", "showgrid": False, "tickvals": list(names)}
+    _set_axis(figure, "xaxis", tickangle=0, ticktext=[str(i + 1) for i in range(len(names))], **every)
+    rows = [f"{name}  {i + 1}" for i, name in enumerate(names)]
+    return _set_axis(figure, "yaxis", autorange="reversed", ticktext=rows, **every)
 
 
 @dataclass(frozen=True)
@@ -375,13 +380,13 @@ def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str
         figure, "heatmap", x=edges.tolist(), y=list(range(len(rows))),
         z=[[v if np.isfinite(v) else None for v in row.tolist()] for row in _even(values)],
         text=[list(row.hover_texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
-        colorscale=_DIVERGING_COLORS, colorbar=bar,
+        colorscale=[*zip((0.0, 0.25, 0.5, 0.75, 1.0), _DIVERGING_COLORS, strict=True)], colorbar=bar,
     )  # fmt: skip
     figure["layout"] |= {"plot_bgcolor": _GRID_COLOR, "margin": {**_LAYOUT["margin"], "r": 150, "t": 40}}
     labels = [_axis_title(f"color: {axis}", 1)]
     _set_axis(figure, "xaxis", showgrid=False, range=[float(edges[0]), float(edges[-1])])
     ticks = {"tickvals": list(range(len(rows))), "ticktext": [row.name for row in rows], "tickfont": {"size": 11}}
-    _set_axis(figure, "yaxis", showgrid=False, range=[len(rows) - 0.5, -0.5], automargin=True, **ticks)
+    _set_axis(figure, "yaxis", showgrid=False, range=[len(rows) - 0.5, -0.5], **ticks)
     groups = [row.group for row in rows]
     for group in dict.fromkeys(groups):
         own = [i for i, entry in enumerate(groups) if entry == group]
@@ -407,8 +412,8 @@ def gap_closure_and_screening_figure(
     """
     done = {name: closure for name, (closure, _) in entries.items() if closure}
     last, names = "2" if done else "", list(entries)[::-1]
-    figure = _styled_figure(100 + 28 * len(entries), predicted, "")
-    rows = {"type": "category", "categoryarray": names, "categoryorder": "array", "automargin": True}
+    figure = _styled_figure(126 + 28 * len(entries), predicted, "")
+    rows = {"type": "category", "categoryarray": names, "categoryorder": "array"}
     _set_axis(figure, "yaxis", **rows, range=[-0.6, len(entries) - 0.4])
     bars = {"x": [decrease for _, decrease in entries.values()], "y": list(entries), "orientation": "h", "width": 0.55}
     bars |= {"xaxis": f"x{last}", "yaxis": f"y{last}", "marker": {"color": LINE_PALETTE[1]}}
@@ -424,7 +429,8 @@ def gap_closure_and_screening_figure(
         _add_trace(figure, **points, mode="markers", marker=marker, showlegend=False, xaxis="x", yaxis="y")
         # a worse prediction has no lower limit of closure
         left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6
-        layout["xaxis"] = {"title": {"text": closed}, **_AXIS_STYLE, "range": [left, 108], "domain": [0, 0.46]}
+        title = {"text": closed, "standoff": 6}
+        layout["xaxis"] = {"title": title, **_AXIS_STYLE, "range": [left, 108], "domain": [0, 0.46]}
         _add_line(figure, "x", 0, color=_TEXT_COLOR, width=1)
         texts = {name: f"◀ {value:.0f}" for name, (value, *_) in done.items() if value < left}
         at = {"x": left, "xanchor": "left", "xref": "x", "yref": "y", "showarrow": False}

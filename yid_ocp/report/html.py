@@ -20,13 +20,15 @@ from yid_ocp.integrator.compiler import private_cache_folder
 from yid_ocp.report.figures import figure_html
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import CodeBlock, SummaryTable
+from yid_ocp.solvers.base import Status
 
 log = logging.getLogger(__name__)
 _SHARED_SCRIPT_LEVELS = 2
 """Levels above a page that are searched for a shared script: a batch is two levels above the pages of its runs."""
 _WRAP_LENGTH = 24  # characters from which the cells of a column are wrapped
+_STATE_WORDS = {*VERDICT_TABLE_TEXTS.values(), *(status.value for status in Status)}  # in a column of numbers
 _NUMBER = re.compile(
-    r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"
+    r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz| times)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"
 )
 
 
@@ -115,6 +117,7 @@ def _column_classes(table: SummaryTable) -> list[str]:
     kinds: list[str] = []
     for _, *cells in zip(*table.rows, strict=True):
         wide = max(map(len, cells), default=0) > _WRAP_LENGTH
-        kind = "number" if all(map(_NUMBER.match, cells)) else "long" if wide else "text"
+        numbers = [bool(_NUMBER.match(cell)) for cell in cells if cell and cell not in _STATE_WORDS]
+        kind = "number" if numbers and all(numbers) else "long" if wide else "text"
         kinds.append(kind if any(cells) else "")
     return kinds

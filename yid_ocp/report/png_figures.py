@@ -118,7 +118,7 @@ def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern
 
 
 def _inches(count: int) -> float:
-    return 2.2 + float(np.clip(0.085 * count, 1.2, 11.0))
+    return 2.2 + float(np.clip(0.11 * count, 1.2, 14.0))
 
 
 def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
@@ -141,7 +141,7 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
         for block in (block for block in named if block is not blocks[0]):
             line(block.start - 0.5, color=_BLOCK_EDGE_COLOR, linewidth=0.7)
         places, names = _ticks(labels, blocks)
-        axis.set_ticks(places, labels=names, fontsize=5.5)
+        axis.set_ticks(places, labels=names, fontsize=7)
         axis.set_tick_params(length=2)
         middles = [0.5 * (block.start + block.stop - 1) for block in named]
         side.set_ticks(middles, labels=[block.name for block in named], fontsize=8, color=_BLOCK_EDGE_COLOR)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text
+from yid_ocp.display import abbreviated_names_text, count_with_noun
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
@@ -79,11 +79,11 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         if result["fit"]["explains"]:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
     if use := result.get("to_use"):
-        yield "to use these numbers (± is one standard deviation, all that is counted in it):"
+        yield "to use these numbers (± is one standard deviation):"
         lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
         yield CodeBlock("\n".join(lines))
     yield result.get("safeguard", "")
-    ended = f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
+    ended = f"{result['status']}: {result['message']}; {result['iterations']} iterations, {result['seconds']:.1f} s"
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
 
 
@@ -160,12 +160,12 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         by_noise = "" if noise is None else format_error_value_and_unit(noise, unit)[0]
         rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
-    legend = "; ".join(f"{name}: {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
+    legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     for entry in result["held_out"]:
         if "message" in entry:
             yield f"held-out recording {entry['recording']} could not be predicted: {entry['message']}"
     yield SummaryTable(rows, "Errors on held-out recordings, never touched by the fit")
-    yield f"without a model: {legend}" if legend else ""
+    yield f"guesses without a model: {legend}" if legend else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -226,8 +226,9 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield "intervals of parameters are computed on request: --intervals NAME,NAME or --intervals all"
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
-        rows = [("change", "found", "gain [nat]", "")]
-        for entry in [asked["base"], *asked["singles"], *asked["smallest"]]:
+        rows = [("change", "found", "gain [nat]", "note")]
+        changes = {own["words"]: own for own in (asked["base"], *asked["singles"], *asked["smallest"])}
+        for entry in changes.values():
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
             rows.append((entry["words"], f"{entry['identifiable']} of {len(parameters)}", gain, entry["message"]))
         yield SummaryTable(rows, "What another experiment would identify")
@@ -249,7 +250,7 @@ def _relative(value: float | None) -> str:
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
+    rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "note")]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
         note = ("warranted" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
@@ -295,7 +296,7 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         if lost := result["from"]["uncertainty_unknown"]:
             yield f"not counted, as their uncertainty is not known: {', '.join(lost)}"
     elif result["from"]["run"] is None:
-        yield "the parameters are those of the configuration, so its uncertainty is unknown"
+        yield "the parameters are those of the configuration, so the uncertainty of the place is unknown"
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -327,7 +328,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     model = result["model"]
     driven = f"{model['nu']} driven, {model['nc']} prescribed"
-    yield f"model: {model['n']} coordinates, {model['m']} constraints, {driven}, {model['ntheta']} parameters"
+    size = [count_with_noun(model[key], noun) for key, noun in (("n", "coordinate"), ("m", "constraint"))]
+    yield f"model: {', '.join(size)}, {driven}, {count_with_noun(model['ntheta'], 'parameter')}"
     yield from (entry["words"] for entry in result["mechanics"].values() if entry["agrees"])
     rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
     rests = []
@@ -369,7 +371,8 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
         known = noise.get(f"{name}{part}")
         if known is not None and known["std"] is not None:
             words = " ".join(format_error_value_and_unit(known["std"], known["unit"]))
-            words += f", offset {known['bias_std']:.3g}" if known.get("bias_std") else ""
+            offset = " ".join(format_error_value_and_unit(known.get("bias_std"), known["unit"]))
+            words += f", offset {offset}" if known.get("bias_std") else ""
             said.append(words + (" (estimated)" if known.get("estimated") else ""))
     return "; ".join(said)
 

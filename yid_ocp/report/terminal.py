@@ -131,13 +131,6 @@ def misfit_summary_blocks(
 
     A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 %.
     """
-    worse = fit.get("worse_than_guess", ())
-    for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
-        sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
-        text = f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} ({entry['baseline']})"
-        yield SummaryStatement(f"worse than a guess without a model: {text}", "conclusion")
-    left = len(worse) - MAX_CHANNELS_SHOWN_SINGLY
-    yield SummaryStatement(f"and so for {left} more channels, in result.json" if left > 0 else "", "conclusion")
     if not fit["explains"]:
         yield SummaryStatement(goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
         doubted = {name: entry for name, entry in parameters.items() if entry["verdict"] == "not_trusted"}
@@ -150,9 +143,15 @@ def misfit_summary_blocks(
                     known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "no value is known to within 10 %, because each ± includes the misfit"
+            none = "no value is known to within 10 % with the misfit in its ±"
             said = f"values known to within 10 % with the misfit in their ±, if no missing effect biases them: {shown}"
             yield SummaryStatement(said if known else none, "conclusion")
+    texts, worse = list[str](), fit.get("worse_than_guess", ())
+    for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
+        sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
+        texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} ({entry['baseline']})")
+    texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
+    yield SummaryStatement(f"worse than a guess without a model: {'; '.join(texts)}" if texts else "", "verdict")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
@@ -185,9 +184,10 @@ def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
 
 
 def bound_range_text(entry: Mapping[str, Any], digits: int) -> str:
-    """Format the range between the bounds of a parameter, such as "0 to inf". Missing bounds are `-inf` and `inf`."""
-    ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
-    return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
+    """Format the range between the bounds of a parameter, such as "0 to 5", "from 0", "up to 5" or "none"."""
+    lower, upper = ("" if entry[key] is None else f"{entry[key]:.{digits}g}" for key in ("lower", "upper"))
+    one_sided = f"from {lower}" if lower else f"up to {upper}" if upper else "none"
+    return f"{lower} to {upper}" if lower and upper else one_sided
 
 
 def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:

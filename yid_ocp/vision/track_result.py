@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import PointGroup, Recording, validated_recording
+from yid_ocp.display import count_with_noun
 from yid_ocp.files import atomic_write, make_folder
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import CloudSkeleton
@@ -155,8 +156,9 @@ def _pictures(stages: FrameProcessingStages) -> list[_Picture]:
         made.append(_Picture("filtered", f"{len(near)} points of the object", [(near, _BLUE, 1.5)]))
     if near is not None and skeleton is not None:
         faint, nodes, edges = (near, _GREY, 0.4), (skeleton.nodes, _ORANGE, 14.0), skeleton.nodes[skeleton.edges]
-        made.append(_Picture("skeleton", f"{len(skeleton.nodes)} nodes of the walk", [faint, nodes]))
-        title = f"{len(edges)} edges, {len(set(skeleton.component_of_node.tolist()))} connected parts"
+        made.append(_Picture("skeleton", f"{len(skeleton.nodes)} nodes of the skeleton", [faint, nodes]))
+        parts = count_with_noun(len(set(skeleton.component_of_node.tolist())), "connected part")
+        title = f"{count_with_noun(len(edges), 'edge')}, {parts}"
         made.append(_Picture("graph", title, [nodes], list(edges), _BLUE))
         if fit is not None:
             title = f"fitted shape, {1e3 * fit.mean_distance:.1f} mm off on average"

@@ -67,7 +67,8 @@ def run_plan(
         told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(run, found)
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]
         planned = ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)
-        scene = animation_of_trajectories("planned", [planned])
+        goal = found.target_position if isinstance(found, TargetMotionPlan) else None
+        scene = animation_of_trajectories("planned", [planned], goal=goal)
         shown: dict[str, Any] = {"animations": [scene], "section_data": {"plan": found}}
         written = folder.write_result_and_report(run, progress, _motion_result(run, found, source) | told, **shown)
     return CommandOutcome(folder.path, written, found, found.is_successful)

@@ -264,7 +264,8 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
         raise ConfigError(what, where=twice[0], allowed="every run once", hint=hint)
     if len(paths) == 2 and _have_same_recordings(paths):
         return _overlay_runs(paths, out, progress)
-    estimates = [read_estimates(path) for path in paths]
+    labels = [path.name if len({own.name for own in paths}) == len(paths) else str(path) for path in paths]
+    estimates = [replace(read_estimates(path), run_name=label) for path, label in zip(paths, labels, strict=True)]
     require_runs_of_one_model(paths)
     progress.begin_stage(f"comparing {len(paths)} runs")
     told = run_drift_and_outliers_to_dict(assess_drift_and_outlier_runs(estimates))

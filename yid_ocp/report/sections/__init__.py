@@ -26,7 +26,8 @@ class ReportData:
     """The input data of a report: `result` (content of result.json) and, if available, problem, solution and others.
 
     `animations` replaces the animations made from `problem`, `solution` and `held_out`. `section_data` holds other data
-    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn.
+    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn. `noise_fraction` is
+    the part of the stated standard deviations of `problem` that is noise.
     """
 
     name: str
@@ -37,6 +38,7 @@ class ReportData:
     held_out: Sequence[PredictedEpisodeOrFailure] = ()
     animations: Sequence[AnimationData] = ()
     robot: str | None = None
+    noise_fraction: float = 1.0
     section_data: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -75,7 +77,7 @@ def draw_figure_per_unit(
     grouped: dict[str, dict[str, _Row]] = {}
     for name, unit, row in rows:
         grouped.setdefault(unit, {})[name] = row
-    return [("", draw(own, unit)) for unit, own in grouped.items()]
+    return [("", draw(own, "" if unit == "1" else unit)) for unit, own in grouped.items()]
 
 
 def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:

@@ -13,6 +13,7 @@ from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
 from yid_ocp.inference.null_test import channels_with_residual_indices
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, z_scores_of_smoothed_unknowns
+from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
@@ -28,7 +29,7 @@ _MAX_CHANNELS = 3  # held-out channels
 _NOMINAL_LABEL, _EXTENDED_LABEL = "nominal model", "with the effects"
 _MODEL_COLORS = {_NOMINAL_LABEL: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
 _EVENT_COLORS = {"event": figures.AFTER_COLOR} | dict.fromkeys(
-    ("allowed", "allowed, other side"), figures.MEASURED_COLOR
+    ("upper limit of the model error", "lower limit of the model error"), figures.MEASURED_COLOR
 )
 _TitledFigures = list[tuple[str, Any]]
 _Chapter = tuple[str, Sequence[str], _TitledFigures]
@@ -72,7 +73,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
-        change = f"goes from {first:.3g} to {last:.3g} (one is noise alone)"
+        change = f"goes from {first:.3g} to {last:.3g} (1 = noise alone)"
         sentences.append(f"With {names}, chi² per degree of freedom {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
@@ -80,8 +81,10 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
-        level = f"chi² per degree of freedom is {first:.3g} (one is noise alone)"
-        sentences.append(f"No effect is named, so no error is shown after it; {level}.")
+        level = f"chi² per degree of freedom is {first:.3g} (1 = noise alone)"
+        sentences.append(f"No effect is accepted, so the figure has the nominal model alone; {level}.")
+        tried = " and ".join(entry.effect.label for entry in finding.selected_effects)
+        sentences.append(f"The table above has the errors with {tried}, which was not accepted." if tried else "")
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
@@ -91,7 +94,7 @@ def _figures_by_model(
     colors = {nominal_label: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
     colors["noise alone"] = figures.MEASURED_COLOR
     draw = figures.parameter_values_by_source_figure
-    return draw_figure_per_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]", colors))
+    return draw_figure_per_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]".removesuffix(" []"), colors))
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
@@ -148,7 +151,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     axis = "value in its standard deviations"
 
     def said(j: int, k: int) -> str:
-        return f"{mean[j, k]:.3g} ± {std[j, k]:.2g} {units[k]}"
+        factor, shown = scale_and_unit_with_metres_as_mm(units[k])
+        return f"{value_and_uncertainty_text(factor * mean[j, k], factor * std[j, k], least_digits=3)} {shown}"
 
     if np.any(np.isfinite(values)):
         j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
@@ -168,7 +172,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     for k in kept:
         spans = [f"{edges[j]:.2f} to {edges[j + 1]:.2f} s" for j in range(len(mean))]
         texts = [f"{names[k]}, {span}: {said(j, k)}" for j, span in enumerate(spans)]
-        about = f"{groups[k].location} {groups[k].kind} [{units[k]}]"
+        kind = "torque" if groups[k].kind == "force" and units[k] == "N m" else groups[k].kind
+        about = f"{groups[k].location} {kind} [{scale_and_unit_with_metres_as_mm(units[k])[1]}]"
         rows.append(TimeHeatMapRow(names[k], about, values[:, k], texts))
     return figures.time_heat_map_figure(edges, rows, axis), sentence
 
@@ -180,7 +185,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     if not events:
         return None
     sentences = [
-        "Points: the force in addition to model and recording. Grey lines: the error that a correct model may have. "
+        "Points: force or torque beyond the model, estimated from the recording. Grey: error that a correct model has. "
         "Shaded: windows of events, with their shape as a line. Events are excluded from the results below "
         "where possible."
         if events.force_estimates
@@ -195,7 +200,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         courses = (shape, force.assumed_model_error, -force.assumed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
-        plot = TimePlotData(title, lines, force.t, force.max_likelihood_force, marked_intervals=spans)
+        plot = TimePlotData(title, lines, force.t, force.max_likelihood_force, None, spans, dots_name="estimated")
         by_recording.setdefault(force.recording, []).append(plot)
     return "Brief disturbances", sentences, _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
 
@@ -226,7 +231,10 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     absolute = "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
     unit = "as a fraction of the excess over noise" if percent else absolute
     promise = f"redicted decrease of the fitted misfit by each, to first order, {unit}."
-    sentences = [f"P{promise}", "No predicted decrease is large enough for a refit."]
+    refitted = ", ".join(own.effects[0].label for own in finding.single_effect_models)
+    why = ", because they show no gap beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
+    unmeasured = f"Refitted: {refitted}. Held-out motions do not measure what a refit closes{why}."
+    sentences = [f"P{promise}", unmeasured if refitted else "No predicted decrease is large enough for a refit."]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
         best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
@@ -236,7 +244,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
             f"Right: p{promise}",
         ]
     # room for one word on a narrow screen
-    axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
+    axes = ("closed [%]", "promised [%]" if percent else "promised")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return title, sentences, [("", figures.gap_closure_and_screening_figure(entries, *axes))]
 
@@ -296,10 +304,11 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
+    none = f"No two signatures are similar in both directions; by the smaller percentage the closest are {said[0][1]}."
     sentences = [
         "Percentage of the row's signature that the column can reproduce, beyond the stiffnesses. These motions and "
         "sensors cannot distinguish a pair with 100 %, for any residual.",
-        f"Similar signatures: {listed}." if close else f"No two signatures are similar; the closest are {said[0][1]}.",
+        f"Similar in both directions, with the smaller percentage: {listed}." if close else none,
     ]
     return "What could be mistaken for what", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
@@ -338,7 +347,7 @@ def _curves(
     what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
     sentences = [
         f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
-        "each the error, with two standard deviations of the noise shaded; a correct model stays inside."
+        "each the error, two standard deviations of the noise shaded; a correct model is inside 95 % of the time."
     ]
     return "Measured and predicted", sentences, shown
 
@@ -352,7 +361,7 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
         values = {"fitted without the effects": (before, std), _EXTENDED_LABEL: (after, entry["std"])}
         rows.append((name, entry["unit"], values))
         if abs(after - before) > 0.1 * max(abs(before), 1e-9):
-            text = f"{name} goes from {before:.3g} to {after:.3g} {entry['unit']}"
+            text = f"{name} goes from {before:.3g} to {after:.3g} {entry['unit']}".removesuffix(" 1")
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
     shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ import numpy as np
 from yid_ocp.analysis.compare import MethodsComparisonResult
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, Recording
-from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, VERDICT_TABLE_TEXTS
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -99,7 +100,7 @@ def _provenance(findings: ReportData) -> Mapping[str, Any] | None:
 @register_report_section("pictures", 50, "Pictures")
 def _image_files(findings: ReportData) -> Mapping[str, Any] | None:
     files = findings.section_data.get("pictures", ())
-    shown = [(path.name, base64.b64encode(path.read_bytes()).decode("ascii")) for path in files]
+    shown = [(path.stem.replace("_", " "), base64.b64encode(path.read_bytes()).decode("ascii")) for path in files]
     return {"pictures": shown} if shown else None
 
 
@@ -112,7 +113,9 @@ def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
         for name, entry in result["parameters"].items():
             known = {r: own for r, own in entry["values"].items() if own.get("verdict") != "not_identifiable"}
             rows.append((name, entry["unit"], {run: (own["value"], own["std"]) for run, own in known.items()}))
-    return draw_figure_per_unit(rows, figures.parameter_values_by_source_figure)
+    runs = dict.fromkeys(run for entry in result.get("parameters", {}).values() for run in entry["values"])
+    colors = dict(zip(runs, itertools.cycle(figures.LINE_PALETTE), strict=False))
+    return draw_figure_per_unit(rows, partial(figures.parameter_values_by_source_figure, colors=colors))
 
 
 @register_report_section("methods", 10, "Methods")
@@ -140,15 +143,17 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
     result = findings.result
     if result.get("format") != "yid-identifiability/1":
         return None
-    curves = {}
+    curves: dict[str, dict[str, tuple[list[float], list[float]]]] = {}  # by verdict, with a range of its own
     for name, profile in result["profiles"].items():
-        best = result["parameters"][name]["value"]
+        best, verdict = (result["parameters"][name][key] for key in ("value", "verdict"))
         if best > 0:
-            curves[name] = ([value / best for value in profile["values"]], profile["delta_chi2"])
-    figure = figures.profile_likelihood_figure(curves, CHI2_95_TWO_SIDED) if curves else None
+            own = ([value / best for value in profile["values"]], profile["delta_chi2"])
+            curves.setdefault(VERDICT_TABLE_TEXTS[verdict], {})[name] = own
+    shown = {said: figures.profile_likelihood_figure(own, CHI2_95_TWO_SIDED) for said, own in curves.items()}
     asked, names = result["what_if"], list(result["parameters"])
-    changes = [] if asked is None else [asked["base"], *asked["singles"], *asked["smallest"]]
-    return {"figure": figure, "changes": changes, "names": names} if figure is not None or changes else None
+    tried = [] if asked is None else [asked["base"], *asked["singles"], *asked["smallest"]]
+    changes = {entry["words"]: entry for entry in tried}
+    return {"figures": shown, "changes": changes, "names": names} if shown or changes else None
 
 
 @register_report_section("friction", 10, "Friction torque of the data and of the law")
@@ -168,7 +173,8 @@ def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     system, names = found.simulator.step.system, found.joint_names
     if (where := found.point_trajectories.get(findings.result.get("point"))) is not None:
         lines, tolerance = _lines(found.t, "xyz", 1e3 * (where - found.target_position)), findings.result["tolerance"]
-        yield "", lines_over_time_figure(TimePlotData("from the place [mm]", lines, band_half_height=1e3 * tolerance))
+        title = "from the place, its tolerance shaded [mm]"
+        yield "", lines_over_time_figure(TimePlotData(title, lines, band_half_height=1e3 * tolerance))
     for words, channel, values in (
         ("joints, from the start", "position", found.joint_positions - found.joint_positions[0]),
         ("velocity", "velocity", found.joint_velocities),
@@ -227,22 +233,22 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
     scenes = [entry for entry in scenes if len(entry.t) > 1]
     text = json.dumps(animations_to_dict(scenes[:_MAX_ANIMATIONS], findings.robot), separators=(",", ":"))
     both = any(
-        motion.name == "measured" and motion.point_indices and len(entry.motions) > 1
+        motion.name == "measured" and any({*motion.point_indices} & {*own.point_indices} for own in others)
         for entry in scenes
-        for motion in entry.motions
+        for *others, motion in (entry.motions,)
     )
     return {"scenes": text.replace("<", "\\u003c"), "both": both} if scenes else None
 
 
 @register_report_section("fit", 20, "How well it fits")
 def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
-    found = []
+    found, share = [], findings.noise_fraction
     whitened: dict[str, list[Array]] = {}
     for own in _predicted_episodes(findings):
-        found += [(f"{name} in {own.episode.name} ({own.role})", curves) for name, curves in _fitted_curves(own)]
+        found += [(f"{name} in {own.episode.name} ({own.role})", curves) for name, curves in _fitted_curves(own, share)]
         for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
             if own.role == _ESTIMATED:
-                ratio = (predicted - samples.value) / samples.std
+                ratio = (predicted - samples.value) / (share * samples.std)
                 whitened.setdefault(samples.sensor.group_name, []).append(ratio[np.isfinite(ratio)])
     if not found:
         return None
@@ -266,11 +272,12 @@ def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
             curves.append(TimePlotData(f"{name} [{first.unit}]", lines, first.t, first.measured[:, i]))
             band = 2 * factor * float(np.nanmedian(first.noise_std[:, i]))
             difference = {f"{other} minus {own}": (first.t, factor * apart[:, i])}
-            curves.append(TimePlotData(f"difference [{shown}]", difference, band_half_height=band, is_low_row=True))
+            title = f"difference, two stated standard deviations shaded [{shown}]"
+            curves.append(TimePlotData(title, difference, band_half_height=band, is_low_row=True))
         yield f"{first.channel} in {first.recording}", figures.time_plots_figure(curves, figures.MEASURED_COLOR)
 
 
-def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotData]]]:
+def _fitted_curves(own: _PredictedEpisode, noise_fraction: float) -> Iterator[tuple[str, list[TimePlotData]]]:
     """Title and curves of each point, or of all joints of a group together."""
     grid = own.episode.grid
     for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
@@ -286,7 +293,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
             curves: list[TimePlotData] = []
             for i in columns:
                 name = sensor.output_names[i].rsplit(".", 1)[1]
-                told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
+                told = (t, samples.value[:, i], noise_fraction * samples.std[:, i], {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
                 curves += figures.channel_prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
             yield title, curves
@@ -309,3 +316,5 @@ def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
             lines = _lines(group.t, names, group.position.reshape(len(group.t), -1))
             figure = lines_over_time_figure(TimePlotData("position [m]", lines))
             yield f"Points: {group.name} of {recording.name}", figure
+    if (left := len(findings.section_data.get("recordings", ())) - len(recordings)) > 0:
+        yield f"{left} more recordings are not drawn.", None

@@ -26,6 +26,7 @@ function fitted({ data, layout }, width) {
   for (const name of Object.keys(layout).filter((key) => /^[xy]axis/.test(key))) {
     const listed = layout[name].categoryarray || layout[name].tickvals || layout[name].type === "category";
     const size = listed && (layout[name].tickvals || []).length > 10 ? 8 : 10;
+    if (layout[name].dtick === "D2") layout[name].dtick = 1; // a tick for every power of ten has room
     layout[name] = { ...layout[name], nticks: listed ? 0 : layout[name].nticks || 5, tickfont: { ...layout[name].tickfont, size } };
   }
   // what stands beside a figure has no room

@@ -1,5 +1,5 @@
 // the arm and the object in motion: sticks and points on a plain canvas, which needs no graphics card
-const PALETTE = { measured: ["#6b7783", "#98a5b0"], other: [["#0b6e99", "#4fb3dc"], ["#c2571a", "#f2955a"], ["#5b8c2a", "#9acb62"]] };
+const PALETTE = { measured: ["#6b7783", "#98a5b0"], points: ["#b3261e", "#ffd166"], other: [["#0b6e99", "#4fb3dc"], ["#c2571a", "#f2955a"], ["#5b8c2a", "#9acb62"]] };
 
 class Viewer {
   constructor(box) {
@@ -40,7 +40,10 @@ class Viewer {
     if (this.scenes.length > 1) select("recording", this.scenes.map((scene, i) => [scene.title, i]), 0, (i) => this.choose(Number(i)));
     select("speed", [["speed ×¼", 0.25], ["speed ×1", 1], ["speed ×4", 4]], 1, (value) => (this.speed = Number(value)));
     const motions = this.scenes.flatMap((scene) => scene.motions);
-    const both = motions.some((m) => m.name === "measured") && motions.some((m) => m.name !== "measured" && Object.keys(m.points).length);
+    const both = this.scenes.some((scene) => {
+      const measured = scene.motions.find((motion) => motion.name === "measured");
+      return measured && scene.motions.some((motion) => motion !== measured && Object.keys(motion.points).some((name) => name in measured.points));
+    });
     if (both) select("errors", [["errors ×1", 1], ["errors ×5", 5], ["errors ×20", 20]], 1, (value) => { this.factor = Number(value); this.paint(); });
     this.marks = {};
     for (const name of new Set(motions.map((motion) => motion.name))) {
@@ -69,7 +72,11 @@ class Viewer {
     return name === "measured" ? PALETTE.measured[dark] : PALETTE.other[(others.length - 1 - others.indexOf(name)) % 3][dark];
   }
 
-  swatches() { for (const [name, mark] of Object.entries(this.marks)) mark.style.background = this.color(name); }
+  // the recorded arm is a thin line, measured points are what one looks for
+  swatches() {
+    const dotted = this.scenes.some((scene) => scene.motions.some((motion) => motion.name === "measured" && Object.keys(motion.points).length));
+    for (const [name, mark] of Object.entries(this.marks)) mark.style.background = name === "measured" && dotted ? PALETTE.points[darkness.matches ? 1 : 0] : this.color(name);
+  }
 
   choose(i) {
     this.scene = this.scenes[i];
@@ -180,7 +187,9 @@ class Viewer {
         const [p, q] = [see(from), see(to)], wide = clothed && !own ? 3 : Math.max(own ? 2 : 1.5, (own ? radius : Math.min(radius, 0.08 * this.reach)) * (p[3] + q[3]));
         // the recorded arm is seen through the meshes of the predicted one
         const near = clothed && !own ? 10 * this.reach : 0;
-        strokes.push([(p[2] + q[2]) / 2 - near, () => this.stick(pen, p, q, wide, own || ghost ? color : this.softer(color, card), ghost)]);
+        // an earlier model is seen where it differs from the last one: the colors of both would mix to grey
+        const behind = ghost && motion.name !== "measured" ? 10 * this.reach : 0;
+        strokes.push([(p[2] + q[2]) / 2 - near + behind, () => this.stick(pen, p, q, wide, own || ghost ? color : this.softer(color, card), ghost)]);
       }
     }
     const measured = shown.find((motion) => motion.name === "measured");
@@ -285,7 +294,7 @@ class Viewer {
   }
 
   points(pen, see, measured, predicted, ink) {
-    const at = this.places(measured), color = darkness.matches ? "#ffd166" : "#b3261e", found = [];
+    const at = this.places(measured), color = PALETTE.points[darkness.matches ? 1 : 0], found = [];
     for (const [i, [name, k]] of Object.entries(measured.points).entries()) {
       const place = at(k);
       if (!place) continue;
