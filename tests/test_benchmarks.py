@@ -104,15 +104,6 @@ def test_a_group_has_four_hundred_values_of_the_right_size_and_spread(coverage):
     assert [coverage.in_band(total, 40) for total in (16.0, 17.0, 76.0, 77.0)] == [False, True, True, False]
 
 
-def test_what_is_not_as_it_should_be_is_said(coverage):
-    assert coverage.shortcomings({"white_0.1": drawn(coverage, 1.0, 200)}) == []
-    bad = coverage.shortcomings({"white_0.1": [*drawn(coverage, 2.0, 200), coverage.Twin(error="no motion")]})
-    assert bad[0] == "white_0.1: 1 of 201 twins have no estimate"
-    assert bad[1:3] == [f"white_0.1: {name} lies outside its band" for name in ("T1.bend", "T2.bend")]
-    assert "rms 1.99, 67.0 % covered" in bad[3]
-    assert "too few to judge" in coverage.shortcomings({"white_0.1": drawn(coverage, 1.0, 10)})[0]
-
-
 def test_errors_that_nobody_states_must_not_pass_for_findings(coverage):
     warned, silent = (
         twin(coverage, {"T1.bend": 9.0}, **{"verdict": "not_trusted", "diagnose": True, **more})
@@ -180,26 +171,6 @@ def test_injected_pushes_of_a_real_double_pendulum_are_found(events):
 @pytest.fixture(scope="module")
 def alarms(benchmark_module, coverage):
     return benchmark_module("false_alarms", coverage=coverage)
-
-
-def diagnosed(alarms, verdict: str, named: tuple[str, ...] = (), rivals: tuple[str, ...] = ()) -> Any:
-    numbers = dict.fromkeys(("chi2_per_dof", "held_out_chi2_per_dof", "p_value", "held_out_p_value", "seconds"), 1.0)
-    return alarms.Twin({"verdict": verdict, "named": list(named), "rivals": [list(rivals)], "best": [], **numbers})
-
-
-def test_a_clean_twin_has_no_gap_and_another_one_its_effect(alarms):
-    calm, maxwell = diagnosed(alarms, "no_gap"), "kelvin_voigt@T1"
-    named, rival = diagnosed(alarms, "effect", (maxwell,)), diagnosed(alarms, "confusable", ("a@b",), ("a@b", maxwell))
-    clean, damped = alarms.KINDS["one_arm"], alarms.KINDS["damped_trunk"]
-    alarm, fallen = diagnosed(alarms, "unknown"), alarms.Twin(error="it fell")
-    assert [twin.right(clean) for twin in (calm, alarm, fallen)] == [1, 0, 0]
-    assert [twin.right(damped) for twin in (named, rival, diagnosed(alarms, "effect", ("a@b",)), calm)] == [1, 1, 0, 0]
-    few = {"one_arm": [calm] * 28 + [alarm] * 2, "two_arms": [calm] * 29 + [alarm]}
-    assert alarms.shortcomings(few) == []
-    [said] = alarms.shortcomings({**few, "two_arms": [calm] * 28 + [alarm] * 2})
-    assert said == "4 of 60 clean twins are not called so"
-    missed = {"damped_trunk": [calm] * 2 + [named] * 8}
-    assert alarms.shortcomings(missed) == ["damped_trunk: the effect is named in 8 of 10 twins"]
 
 
 @pytest.mark.slow

@@ -205,7 +205,6 @@ def test_a_parameter_may_leave_its_range_by_a_factor_or_a_width(expected, within
 
 
 def test_a_value_that_may_as_well_lie_within_is_not_out_of_its_range():
-    """By two standard deviations."""
     of = effect("wide@x", amplitude(), shape("s", expected=(0.1, 1.0), lower=-math.inf))
     for std, plausible in ((0.1, False), (0.54, False), (0.56, True), (math.inf, True)):
         found = fit([of], loss(1.0, 1.0), values={"wide@x.a": 1.0, "wide@x.s": 3.0}, std={"wide@x.s": std})

@@ -222,7 +222,6 @@ class TestFailures:
         assert np.all(np.isnan(rollout.multipliers[7:]))
 
     def test_a_system_without_unknowns(self, urdf_folder, use_compiler):
-        """Everything prescribed: a step is an evaluation."""
         robot = read_urdf(urdf_folder / "double_pendulum.urdf")
         system = System.build(robot, prescribed=["shoulder", "elbow"])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
