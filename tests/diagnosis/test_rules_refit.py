@@ -31,7 +31,7 @@ FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=
 A, S = "friction@elbow.a", "friction@elbow.s"
 CERTAIN = np.zeros((1, 1))
 TWO_RECORDINGS = SimpleNamespace(
-    problem=SimpleNamespace(episodes=["first", "second"]),
+    problem=SimpleNamespace(episodes=["first", "second"], system=SimpleNamespace(effects=range(200))),
     restricted_to_effects=lambda group: [effect.label for effect in group],
 )
 

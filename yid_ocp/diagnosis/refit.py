@@ -43,7 +43,7 @@ _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter 
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
-_MIN_REFITS_FOR_OWN_STEP = 4  # of one recording, from which a step of their own candidates pays for its compilation
+_MIN_LEFT_OUT_FOR_OWN_STEP = 800  # candidates, times refits, times recordings, which repay a step's compilation
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -206,9 +206,11 @@ class RefitContext:
 
     def _problem_of_round(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
         """The problem with the effects of the first round that has all the given ones, or with all candidates."""
+        problem = self.problem.problem
         for own, count in self.rounds:
-            is_worth_a_step = count * len(self.problem.problem.episodes) >= _MIN_REFITS_FOR_OWN_STEP
-            if is_worth_a_step and {effect.label for effect in effects} <= {effect.label for effect in own}:
+            left_out = count * len(problem.episodes) * (len(problem.system.effects) - len(own))
+            has_all = {effect.label for effect in effects} <= {effect.label for effect in own}
+            if has_all and left_out >= _MIN_LEFT_OUT_FOR_OWN_STEP:
                 return self.problem.restricted_to_effects(own)
         return self.problem
 
