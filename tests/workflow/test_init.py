@@ -221,7 +221,8 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
-    assert "use: true looks for friction and payload of the arm" in text
+    assert "a free effect effort_offset reports it" in text
+    assert "#   {effort_sampling_kind: sample}: the recordings do not say" in text
     assert "# friction: {law: coulomb}" in text
     looked = text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:")
     Path("friction.yaml").write_text(looked)

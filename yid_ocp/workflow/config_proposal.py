@@ -102,6 +102,7 @@ class ProposedConfigChoices:
     firmware_gain: float | None  # usual proportional gain, if the motor is known and no recording states one
     has_object: bool  # false for an arm alone
     torque_bias_std: Mapping[str, float]  # default by joint [N m]; empty if the recording states it or has no effort
+    is_effort_sampling_kind_unknown: bool  # whether efforts are recorded without it
     urdf_joint_damping: Mapping[str, float]  # above 0, by joint [N m s/rad]
     urdf_joint_friction: Mapping[str, float]  # above 0, by joint [N m]
 
@@ -195,6 +196,7 @@ def propose_config_choices(
         *_motor_and_gain(robot, mode, recordings),
         bool(branches),
         _torque_bias_std(tree, recorded, joints),
+        recorded.effort is not None and recorded.effort_kind is None,
         {name: value for name, value in positive_urdf_joint_dynamics(robot, "damping").items() if name in joints},
         {name: value for name, value in positive_urdf_joint_dynamics(robot, "friction").items() if name in joints},
     )

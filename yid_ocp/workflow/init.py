@@ -330,7 +330,9 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
             if told_by_points:
                 entries = ["use: false", *entries]
                 said = "use: true looks for friction and payload of the arm; bias_std allows a constant error of each "
-                said += "torque (a guess: 1 % of the effort limit), which `solve` then reports"
+                said += (
+                    "torque (a guess: 1 % of the effort limit); in its place, a free effect effort_offset reports it"
+                )
         is_mounted = places and "." in group
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
             why = "torques with noise move the arms: set mode: prescribed to use it"
