@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.stats
-from small_problems import PENDULUM, joints, pendulum_step, recording
+from small_problems import PENDULUM, joints, pendulum_step, recording, seen
 
 from yid_ocp.analysis.friction_law_comparison import (
     CrossValidatedFrictionLawFit,
@@ -200,12 +200,20 @@ def dry(urdf_folder) -> EstimationProblem:
     return EstimationProblem(step, [*found, recording(off, name="drop")], names, None, known)
 
 
-def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_torques(dry):
+def test_kinds_go_by_name_and_a_true_law_predicts_each_from_the_others_and_shows_in_the_torques(dry, monkeypatch):
     assert recording_names_by_name_stem(dry) == {"slow": ("slow_1", "slow_2"), "fast": ("fast_1",), "turn": ("turn_1",)}
-    driven = dry.with_episodes(dry.episodes[:-1], ())
+    driven, folds, search = dry.with_episodes(dry.episodes[:-1], ()), [], GaussNewton.minimize_cost
+
+    def searched(self, problem, start, callback):
+        folds.append(tuple({e.name for e in group} for group in (problem.episodes, problem.held_out)))
+        return search(self, problem, start, callback)
+
     solution = solve(driven, GaussNewton(), restarts=False)
+    monkeypatch.setattr(GaussNewton, "minimize_cost", searched)
     fit = cross_validate_over_motion_kinds("coulomb", driven, solution, recording_names_by_name_stem(driven))
-    assert set(fit.left_out_errors) == {"slow_1", "slow_2", "fast_1", "turn_1"}
+    names = {"slow_1", "slow_2", "fast_1", "turn_1"}
+    assert folds == [(names - own, own) for own in ({"slow_1", "slow_2"}, {"fast_1"}, {"turn_1"})]
+    assert (set(fit.left_out_errors), fit.unit) == (names, "rad")
     assert all(error < 1.3e-3 for error in fit.left_out_errors.values())
     assert fit.parameters["joint_coulomb@shoulder.tau_c"].value == pytest.approx(1.2, abs=0.05)
     [cloud] = measured_and_predicted_friction_torques(driven, solution, ["joint_coulomb@shoulder.tau_c"])
@@ -217,18 +225,20 @@ def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_
     assert np.median(cloud.predicted[moving] * np.sign(cloud.speed[moving])) == pytest.approx(1.2, abs=0.05)
 
 
-def test_a_kind_of_motion_is_predicted_from_the_others_alone(dry, monkeypatch):
-    driven, folds, search = dry.with_episodes(dry.episodes[:-1], ()), [], GaussNewton.minimize_cost
-
-    def searched(self, problem, start, callback):
-        folds.append(tuple({e.name for e in group} for group in (problem.episodes, problem.held_out)))
-        return search(self, problem, start, callback)
-
-    solution = solve(driven, GaussNewton(), restarts=False)
-    monkeypatch.setattr(GaussNewton, "minimize_cost", searched)
-    cross_validate_over_motion_kinds("coulomb", driven, solution, recording_names_by_name_stem(driven))
-    names = {"slow_1", "slow_2", "fast_1", "turn_1"}
-    assert folds == [(names - own, own) for own in ({"slow_1", "slow_2"}, {"fast_1"}, {"turn_1"})]
+def test_laws_of_an_arm_that_moves_as_measured_are_judged_by_its_efforts(urdf_folder):
+    step, made = pendulum_step(urdf_folder, [("joint_coulomb", "elbow", {})], prescribed=PENDULUM), []
+    law, t = "joint_coulomb@elbow.tau_c", 0.01 * np.arange(201)
+    for seed, rate in enumerate((4.0, 5.0)):
+        angle, known = 0.4 * np.sin(rate * t[:, None] + [0.0, 1.0]), {"effort_std": 0.01, "effort_kind": "sample"}
+        group = joints(PENDULUM, t, angle, effort=0 * angle, position_std=0.0, **known)
+        problem = EstimationProblem(step, [recording(group)], [law], None, {law: 0.4})
+        drawn = problem.simulate_synthetic_recording(seed=seed)
+        moved = replace(drawn.joints, effort=drawn.joints.effort + 0.3, effort_bias_std=1.0)
+        far = seen(["tip"], t, np.full((201, 1, 3), 9.0), std=np.full((201, 1, 3), 1e-3))
+        made.append(recording(moved, far, name=f"run {seed}"))
+    problem, kinds = EstimationProblem(step, made, [law]), {"one": ("run 0",), "other": ("run 1",)}
+    fit = cross_validate_over_motion_kinds("coulomb", problem, solve(problem, restarts=False), kinds)
+    assert (fit.unit, fit.left_out_errors) == ("std", pytest.approx({"run 0": 1.1, "run 1": 1.1}, abs=0.2))
 
 
 def test_the_command_says_which_law_a_real_servo_warrants(cli, repository, shared, tmp_path: Path) -> None:

@@ -234,9 +234,9 @@ def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendul
     with h5py.File(tmp_path / "untold.h5", "r+") as file:
         del file["joints"].attrs["effort_kind"]
     result = carried_out("check", pendulum, settings=["recordings.estimate=[untold.h5]"]).result
-    [said] = [text for text in result["warnings"] if "effort_kind" in text]
+    [said] = [text for text in result["warnings"] if "effort_sampling_kind" in text]
     assert said.startswith("untold: ")
-    assert said.endswith("it is taken as a sample")
+    assert said.endswith("it is taken as a sample (set sensors.joints.effort.effort_sampling_kind)")
 
 
 def test_check_refines_links_and_time_step(carried_out, written):

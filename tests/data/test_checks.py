@@ -72,6 +72,11 @@ def test_steps_as_large_as_the_stated_noise_and_a_rest_on_one_of_them_are_not_in
     assert causes(coarse) == causes(changed(coarse, position_std=None)) == set()
     rest, still = column(POSITION, 1, lambda x: 0 * x + 0.3), column(VELOCITY, 1, lambda v: 0 * v)
     assert causes(changed(RECORDING, position=rest, velocity=still, position_std=None)) == set()
+    # a constant command holds a joint that stands
+    first = np.arange(len(EFFORT)) < 300
+    held = changed(RECORDING, effort=column(EFFORT, 1, lambda x: np.where(first, 1.7, x)), velocity=None)
+    stands = column(POSITION, 1, lambda x: np.where(first, STD * NOISE[:, 1], x))
+    assert ("stuck" in causes(held), "stuck" in causes(changed(held, position=stands))) == (True, False)
 
 
 @pytest.mark.parametrize("step", [1e-4, 2 * np.pi / 4096])

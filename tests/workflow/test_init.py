@@ -213,7 +213,7 @@ def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     assert "effort_offset@roll.offset" in item.parameters
 
 
-def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
+def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, effort=True))
     assert run.sensors["joints.effort"].use is False
     assert not run.model.effects
@@ -221,15 +221,23 @@ def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
-    assert "use: true looks for friction and payload of the arm" in text
+    assert "a free effect effort_offset reports it" in text
+    assert "#   {effort_sampling_kind: sample}: the recordings do not say" in text
     assert "# friction: {law: coulomb}" in text
     looked = text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:")
     Path("friction.yaml").write_text(looked)
     asked = load_config("friction.yaml")
     assert "joint_coulomb@roll.tau_c" in build_system(asked).parameters
-    stated = moved(SHORT, effort=True)
+    # damping of the URDF is proposed, friction only said
+    stated, urdf = moved(SHORT, effort=True), Path("wrist.urdf").read_text()
+    dry = '<dynamics damping="0.4" friction="0.8"/></joint>'
+    Path("wrist.urdf").write_text(urdf[: (end := urdf.rindex("</joint>"))] + urdf[end:].replace("</joint>", dry, 1))
     known = proposed(replace(stated, joints=replace(stated.joints, effort_bias_std=0.2)))
     assert known.sensors["joints.effort"].bias_std is None
+    text = Path("run.yaml").read_text()
+    assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
+    assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
+    assert "damping of the joints: {pitch: 0.4} N m s/rad, as the URDF states" in capsys.readouterr().out
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:

@@ -12,9 +12,12 @@ from yid_ocp.arrays import Array
 from yid_ocp.effects.law import torque_law_argument_along_rollout
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.evaluation import whitened_prediction_residual
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
+from yid_ocp.sensors.joints import JointSensor
 from yid_ocp.solvers import GaussNewton, Solution
 
 _MAX_FOLD_ITERATIONS = 15
@@ -27,8 +30,8 @@ class CrossValidatedFrictionLawFit:
     """A friction law fitted to all recordings, with its prediction errors on recordings left out of the fit.
 
     `left_out_errors` holds the root mean square prediction error of each recording by a fit without the recordings of
-    its kind of motion (NaN if the fit failed). The errors are in the channels' unit, or in standard deviations if units
-    differ.
+    its kind of motion (NaN if the fit failed). Only what friction changes counts: angles of driven joints [rad] or, in
+    standard deviations and without constant errors of the sensors, efforts of prescribed joints.
     """
 
     law: str
@@ -56,7 +59,8 @@ def cross_validate_over_motion_kinds(
 ) -> CrossValidatedFrictionLawFit:
     """Fit a friction law without each kind of motion in turn, to get its prediction errors for the omitted kind."""
     errors: dict[str, float] = {}
-    units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
+    units = {e.measurements[i].sensor.unit for e in problem.episodes for i in _indices_of_sensors_of_friction(e)}
+    is_whitened = units != {"rad"}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
     for own in kinds.values():
         inside, outside = ([pair for pair in pairs if (pair[0].name in own) == out] for out in (False, True))
@@ -68,13 +72,27 @@ def cross_validate_over_motion_kinds(
             if isinstance(outcome, str):
                 errors[episode.name] = float("nan")
                 continue
-            parts = channel_predictions(episode, outcome)
-            scale = [np.ones_like(p.predicted_minus_measured) if len(units) == 1 else p.noise_std for p in parts]
-            squares = [np.sum((p.predicted_minus_measured / s) ** 2, axis=1) for p, s in zip(parts, scale, strict=True)]
+            kept = _indices_of_sensors_of_friction(episode)
+            own_episode = replace(episode, measurements=tuple(episode.measurements[i] for i in kept))
+            outcome = replace(outcome, predicted_outputs=tuple(outcome.predicted_outputs[i] for i in kept))
+            if is_whitened:
+                squares = [whitened_prediction_residual(own_episode, None, outcome, np.inf).residual ** 2]
+            else:
+                differences = [p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)]
+                squares = [np.sum(difference**2, axis=1) for difference in differences]
             errors[episode.name] = float(np.sqrt(np.nanmean(np.concatenate(squares))))
-    unit = units.pop() if len(units) == 1 else "std"
+    unit = "std" if is_whitened else "rad"
     free = {name: entry for name, entry in solution.parameters.items() if name in problem.free}
     return CrossValidatedFrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
+
+
+def _indices_of_sensors_of_friction(episode: Episode) -> Sequence[int]:
+    """Find the sensors that friction changes: angles of driven and efforts of prescribed joints; without any, all.
+
+    Points on an object that a prescribed arm moves have the same error for all laws, which would hide theirs.
+    """
+    found = [i for i, own in enumerate(episode.measurements) if isinstance(own.sensor, JointSensor)]
+    return found or range(len(episode.measurements))
 
 
 def mean_and_std_error_over_motion_kinds(

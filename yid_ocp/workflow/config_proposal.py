@@ -17,7 +17,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChan
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
+from yid_ocp.model.urdf import positive_urdf_joint_dynamics, read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import RecordedChannelSpec, channel_kinds_of_sensor_group
@@ -102,6 +102,9 @@ class ProposedConfigChoices:
     firmware_gain: float | None  # usual proportional gain, if the motor is known and no recording states one
     has_object: bool  # false for an arm alone
     torque_bias_std: Mapping[str, float]  # default by joint [N m]; empty if the recording states it or has no effort
+    is_effort_sampling_kind_unknown: bool  # whether efforts are recorded without it
+    urdf_joint_damping: Mapping[str, float]  # above 0, by joint [N m s/rad]
+    urdf_joint_friction: Mapping[str, float]  # above 0, by joint [N m]
 
     @property
     def is_identified_from_efforts_only(self) -> bool:
@@ -193,6 +196,9 @@ def propose_config_choices(
         *_motor_and_gain(robot, mode, recordings),
         bool(branches),
         _torque_bias_std(tree, recorded, joints),
+        recorded.effort is not None and recorded.effort_kind is None,
+        {name: value for name, value in positive_urdf_joint_dynamics(robot, "damping").items() if name in joints},
+        {name: value for name, value in positive_urdf_joint_dynamics(robot, "friction").items() if name in joints},
     )
 
 

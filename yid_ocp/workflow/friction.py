@@ -45,7 +45,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         problems = friction_law_comparison.problems_with_common_samples(problems)
         for (law, settings), problem in zip(by_law.items(), problems, strict=True):
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
-            solution = solve(problem, run.solver, restarts=False)
+            solution = solve(problem, run.solver, restarts=not problem.system.driven)
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
                 continue

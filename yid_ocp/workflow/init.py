@@ -181,6 +181,9 @@ def _summary_lines(
         f"mode: {proposal.arm_mode}: {proposal.arm_mode_reason}",
         f"start: {proposal.initial_state}: {proposal.initial_state_reason}",
     ]
+    damping, friction = (_value(own) for own in (proposal.urdf_joint_damping, proposal.urdf_joint_friction))
+    lines += [f"damping of the joints: {damping} N m s/rad, as the URDF states"] * bool(proposal.urdf_joint_damping)
+    lines += [f"not used: friction of the URDF, {friction} N m"] * bool(proposal.urdf_joint_friction)
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
@@ -327,7 +330,9 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
             if told_by_points:
                 entries = ["use: false", *entries]
                 said = "use: true looks for friction and payload of the arm; bias_std allows a constant error of each "
-                said += "torque (a guess: 1 % of the effort limit), which `solve` then reports"
+                said += (
+                    "torque (a guess: 1 % of the effort limit); in its place, a free effect effort_offset reports it"
+                )
         is_mounted = places and "." in group
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
             why = "torques with noise move the arms: set mode: prescribed to use it"
