@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis.events import ForceOrFaultEvent
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.parallel import WorkerConfig
 
@@ -104,16 +103,6 @@ def test_a_group_has_four_hundred_values_of_the_right_size_and_spread(coverage):
     assert [coverage.in_band(total, 40) for total in (16.0, 17.0, 76.0, 77.0)] == [False, True, True, False]
 
 
-def test_errors_that_nobody_states_must_not_pass_for_findings(coverage):
-    warned, silent = (
-        twin(coverage, {"T1.bend": 9.0}, **{"verdict": "not_trusted", "diagnose": True, **more})
-        for more in ({}, {"diagnose": False})
-    )
-    for count, said in ((37, True), (38, False)):
-        lines = coverage.shortcomings({"offsets_unstated": [warned] * count + [silent] * (40 - count)})
-        assert any(f"{count} of 40 twins warn" in line for line in lines) is said
-
-
 @pytest.mark.slow
 def test_standard_deviations_of_a_few_twins(coverage, tmp_path):
     """Six twins of a cell that holds: all z values together lie within the 99.9 % band of chi-squared."""
@@ -134,24 +123,6 @@ def test_standard_deviations_of_a_few_twins(coverage, tmp_path):
 @pytest.fixture(scope="module")
 def events(benchmark_module):
     return benchmark_module("events")
-
-
-def event(begin: float, peak: float, joint: str = "elbow", recording: str = "run_pushed_01") -> ForceOrFaultEvent:
-    return ForceOrFaultEvent(recording, joint, joint, "force", begin, begin + 0.5, peak, 0.25 * peak, 0.01, "N m")
-
-
-LABEL = {"joint": "elbow", "t_from": 1.0, "t_to": 1.5, "peak": 0.6, "impulse": 0.12}
-
-
-def test_what_is_found_what_is_false_and_what_stands_apart(events):
-    tried = (event(1.2, 0.4), event(1.2, -0.4), event(1.6, 0.4), event(1.2, 0.4, "shoulder"))
-    assert [events.matches(entry, LABEL) for entry in tried] == [True, False, False, False]
-    labels = {"run_pushed_01": [LABEL, LABEL | {"t_from": 7.0, "t_to": 7.5}]}
-    found = [event(1.1, 0.4), event(2.5, 0.5), event(5.0, 0.5), event(2.5, 0.5, recording="run_calm_01")]
-    score = events.scored(found, {"run_pushed_01": 6.0}, labels, ("elbow", 2.3, 3.2))
-    assert (score.labels, score.found, score.false, score.false_calm, score.apart) == (1, 1, 2, 1, 1)
-    assert (score.recall, score.precision, score.shortcomings) == (1.0, pytest.approx(1 / 3), ["precision 0.33"])
-    assert events.scored(found[:1], {}, labels).shortcomings == ["recall 0.50"]
 
 
 @pytest.mark.slow
