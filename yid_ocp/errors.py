@@ -117,7 +117,8 @@ def _shortened(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"
 
 
-_MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none is similar, and listed otherwise
+# names listed in full where none is similar; characters of a list given in full in any case; names listed otherwise
+_MAX_LISTED_NAMES, _MAX_LISTED_CHARACTERS, _N_NEAREST_NAMES = 40, 240, 8
 
 
 def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str = "") -> dict[str, str]:
@@ -152,7 +153,7 @@ def nearest_name_question(name: str, names: Iterable[str]) -> str:
 
 def _listed(name: str, names: Sequence[str]) -> str:
     close = _close(name, names, _N_NEAREST_NAMES)
-    if len(names) <= _N_NEAREST_NAMES or (not close and len(names) <= _MAX_LISTED_NAMES):
+    if len(", ".join(names)) <= _MAX_LISTED_CHARACTERS or (not close and len(names) <= _MAX_LISTED_NAMES):
         return ", ".join(names)
     shown = [*close, *(entry for entry in names if entry not in close)][:_N_NEAREST_NAMES]
     return f"{', '.join(shown)} and {len(names) - _N_NEAREST_NAMES} more"

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from yid_ocp.errors import DataError, OutputError
+from yid_ocp.errors import DataError, OutputError, nearest_name_question
 
 _DataclassType = TypeVar("_DataclassType")
 
@@ -43,7 +43,9 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         what = "there is no such file" if absent else f"the file cannot be read ({os_error_reason(error)})"
         if isinstance(error, ValueError):
             what, allowed = "the path has a null character", "a path without null characters"
-        raise DataError(what, where=str(path), allowed=allowed, hint="check the path") from error
+        near = os.listdir(path.parent) if absent and os.access(path.parent, os.R_OK) else ()
+        hint = nearest_name_question(path.name, near) or "check the path"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
     if not readable:
         hint = "chmod it, or copy it to a folder of your own"
         raise DataError("the file cannot be read (Permission denied)", where=str(path), allowed=allowed, hint=hint)

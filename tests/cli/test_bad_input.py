@@ -153,6 +153,10 @@ def test_a_grasp_of_an_unknown_frame(cli, tmp_path, monkeypatch, repository):
     config = repository / "configs" / "single_arm_no_vision.yaml"
     done = cli("solve", config, "--set", "model.grasp.left.holder_frame=left_griper")
     assert_refused(done, "there is no frame 'left_griper'", "did you mean 'left_gripper'?")
+    done = cli("solve", config, "--set", "model.object.mount.parent_frame=left_griper")
+    assert_refused(done, "there is no frame 'left_griper'", "where: --set model.object.mount.parent_frame")
+    frame = "model.frames={mark: {parent_frame: 'T:25%'}}"
+    assert_refused(cli("solve", config, "--set", frame), "no frame 'T:25%'", "did you mean 'T3:40%'?")
     assert_refused(cli("solve", config, "--set", "model.object={kind: z}"), "there is no kind 'z'", "y, segments")
 
 

@@ -236,7 +236,7 @@ def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendul
     result = carried_out("check", pendulum, settings=["recordings.estimate=[untold.h5]"]).result
     [said] = [text for text in result["warnings"] if "effort_sampling_kind" in text]
     assert said.startswith("untold: ")
-    assert said.endswith("it is taken as a sample (set sensors.joints.effort.effort_sampling_kind)")
+    assert said.endswith("they are taken as samples")
 
 
 def test_check_refines_links_and_time_step(carried_out, written):

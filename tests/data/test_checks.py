@@ -129,6 +129,7 @@ FAULTS = {
     "a late camera": (timed(lambda t: t, lambda t: t + 3.0), {"clock_offset"}),
     "an early camera": (timed(lambda t: t, lambda t: t - 3.0), {"clock_offset"}),
     "degrees": (changed(RECORDING, position=np.degrees(POSITION), position_std=np.degrees(STD)), {"degrees"}),
+    "degrees per second": (changed(RECORDING, velocity=np.degrees(VELOCITY)), {"degrees"}),
     "one angle too large": (turned(1, lambda x: 20 * x), {"angle_scale", "noise"}),
     "one angle turned": (turned(1, lambda x: -x), {"angle_sign"}),
     "two angles exchanged": (changed(RECORDING, position=POSITION[:, [1, 0, 2]]), {"swapped_joints"}),

@@ -249,4 +249,5 @@ def test_names_are_listed_once_and_long_lists_are_cut():
     assert said["hint"] == "did you mean 'joint_7'?"
     assert said["allowed"].startswith("joint_7, ")
     assert said["allowed"].endswith(" and 22 more")
+    assert unknown_name_error_arguments("joint_7x", many[:9])["allowed"] == ", ".join(many[:9])
     assert unknown_name_error_arguments("zzz", more)["allowed"] == ", ".join(more[:8]) + " and 62 more"

@@ -284,6 +284,7 @@ def test_a_diagnosis_leaves_a_run_folder(carried_out, pendulum):
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
+        ("diagnosis.candidates=[joint_colomb@elbow]", "where: --set diagnosis.candidates"),
         ("diagnosis.candidates=[kelvin_voigt]", "kelvin_voigt is not possible for this model"),
         ("diagnosis.noise_fraction_of_stated_std=0.1", "set sensors.joints.effort.std"),
     ],

@@ -93,7 +93,7 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     assert {name: said.parent_frame for name, said in run.model.frames.items()} == {"m1": "cable:50%", "m2": "w_cable"}
     assert not run.sensors["points"].frame_by_recorded_name, "a point has the name of its frame"
     # white noise from differences of a smooth motion, within a fifth
-    assert run.sensors["points"].std == pytest.approx(2e-4, rel=0.2)
+    assert run.sensors["points"].std == pytest.approx(2e-4, rel=0.08)
     assert run.sensors["joints.position"].std == pytest.approx(1e-4, rel=0.2)
     system = build_system(run)
     assert system.prescribed == ("roll", "pitch")
@@ -115,7 +115,6 @@ def test_the_first_lines_of_the_readme_run_as_printed(bench: Path, repository: P
     recording = moved(np.arange(0, 2, 1 / RATE))
     (bench / "my_robot.urdf").write_text(URDF)
     joints, [points] = recording.joints, recording.points
-    assert joints is not None
     table = np.column_stack([joints.t, joints.position])
     np.savetxt("joints.csv", table, header="time,q_roll,q_pitch", comments="", delimiter=",")
     table = np.column_stack([points.t, points.position.reshape(len(points.t), -1)])
@@ -123,7 +122,6 @@ def test_the_first_lines_of_the_readme_run_as_printed(bench: Path, repository: P
     np.savetxt("mocap.csv", table, header=header, comments="", delimiter=",")
     text = (repository / "README.md").read_text(encoding="utf-8")
     commands = re.search(r"```text\n(yid-ocp import .*?)```", text, re.S)
-    assert commands is not None
     lines = [line.split()[1:] for line in commands[1].splitlines()]
     assert [words[0] for words in lines] == ["import", "init", "check", "solve", "diagnose"]
     for words in lines[:2]:  # the others run a configuration
@@ -132,9 +130,7 @@ def test_the_first_lines_of_the_readme_run_as_printed(bench: Path, repository: P
     build_system(load_config("run.yaml"))
 
 
-def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
-    bench: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_page_shows_what_was_guessed_before_the_fit(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Arm, unbent object and markers in motion, markers under the names of their frames, so that lines join the two."""
     assert init(*CABLE) == 0
     assert "picture of the guesses: run.html" in capsys.readouterr().out
@@ -145,10 +141,8 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
     assert set(measured["points"]) <= set(model["points"])
     # a straight stick that is seen where it is: points and frames meet all the time
     for name, at in measured["points"].items():
-        seen, told = (
-            np.array([row[3 * k : 3 * k + 3] for row in own["places"]], float)
-            for own, k in ((measured, at), (model, model["points"][name]))
-        )
+        both = ((measured, at), (model, model["points"][name]))
+        seen, told = (np.array([row[3 * k : 3 * k + 3] for row in own["places"]], float) for own, k in both)
         assert np.nanmax(np.abs(seen - told)) < 30  # tenths of a millimetre
     # a page that already exists is not written over
     Path("run.yaml").unlink()
@@ -157,19 +151,15 @@ def test_a_page_shows_what_was_guessed_before_anything_is_fitted(
 
 
 def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None:
-    names = [f"run_{i}.h5" for i in range(4)]
-    for i, name in enumerate(names):
+    for i, name in enumerate(names := [f"run_{i}.h5" for i in range(4)]):
         write_recording(moved(SHORT, seed=i), bench / name)
     assert init(*CABLE, files=names) == 0
     recordings = load_config("run.yaml").recordings
-    assert [Path(p).name for p in recordings.estimate] == names[:3]
-    assert [Path(p).name for p in recordings.held_out] == names[3:]
+    assert [Path(p).name for p in (*recordings.estimate, "|", *recordings.held_out)] == [*names[:3], "|", *names[3:]]
     write_recording(moved(np.arange(0, 6, 1 / RATE), rest=(3.4, 4.4)), bench / "long.h5")
     assert init(*CABLE, "--replace", files=["long.h5"]) == 0
     recordings = load_config("run.yaml").recordings
     first, second = (read_recording(path) for path in (*recordings.estimate, *recordings.held_out))
-    assert first.joints is not None
-    assert second.joints is not None
     assert 3.4 < second.joints.t[0] < 4.4
     assert first.joints.t[-1] == pytest.approx(second.joints.t[0], abs=1.1 / RATE)
     assert np.abs(np.diff(second.joints.position[:10], axis=0)).max() < 1e-3
@@ -185,7 +175,6 @@ def test_the_low_pass_lies_above_motion_that_exceeds_the_noise_of_the_encoders(b
     t = np.arange(0, 4, 1 / RATE)
     assert proposed(moved(t, moving=True)).problem.path_cutoff == 10.0
     shaken = moved(t, moving=True)
-    assert shaken.joints is not None
     # of 0.7 times the noise's size
     angles = shaken.joints.position + 1e-4 * np.sin(2 * np.pi * 14 * t)[:, None]
     assert proposed(replace(shaken, joints=replace(shaken.joints, position=angles))).problem.path_cutoff == 20.0
@@ -221,13 +210,10 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
-    assert "a free effect effort_offset reports it" in text
+    assert "a free effect effort_offset instead reports it" in text
     assert "#   {effort_sampling_kind: sample}: the recordings do not say" in text
-    assert "# friction: {law: coulomb}" in text
-    looked = text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:")
-    Path("friction.yaml").write_text(looked)
-    asked = load_config("friction.yaml")
-    assert "joint_coulomb@roll.tau_c" in build_system(asked).parameters
+    Path("friction.yaml").write_text(text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:"))
+    assert "joint_coulomb@roll.tau_c" in build_system(load_config("friction.yaml")).parameters
     # damping of the URDF is proposed, friction only said
     stated, urdf = moved(SHORT, effort=True), Path("wrist.urdf").read_text()
     dry = '<dynamics damping="0.4" friction="0.8"/></joint>'
@@ -237,7 +223,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     text = Path("run.yaml").read_text()
     assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
-    assert "damping of the joints: {pitch: 0.4} N m s/rad, as the URDF states" in capsys.readouterr().out
+    assert "damping: {pitch: 0.4} N m s/rad, as the URDF states" in capsys.readouterr().out
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:
@@ -249,22 +235,17 @@ def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> Non
     assert run.sensors["joints.effort"].use is False
     assert run.sensors["wrist.force"].std == pytest.approx(0.1, rel=0.2)
     assert run.sensors["wrist.torque"].std is None
-    assert (
-        run.sensors["wrist.force"].frame_by_recorded_name
-        == run.sensors["wrist.torque"].frame_by_recorded_name
-        == {"ft": "hub"}
-    )
+    frames = [run.sensors[f"wrist.{quantity}"].frame_by_recorded_name for quantity in ("force", "torque")]
+    assert frames == [{"ft": "hub"}] * 2
     assert run.sensors["imu.angular_velocity"].use is False
 
 
 def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = moved(SHORT)
-    assert made.joints is not None
     commands = np.vstack([made.joints.position[6:], np.tile(made.joints.position[-1:], (6, 1))])
     run = proposed(replace(made, joints=replace(made.joints, position_command=commands)))
     assert "mode: servo: commanded positions were recorded" in capsys.readouterr().out
-    assert run.model.arms.mode == "servo"
-    assert run.model.arms.servo.command_interpolation == "held"
+    assert (run.model.arms.mode, run.model.arms.servo.command_interpolation) == ("servo", "held")
     system = build_system(run)
     assert set(system.servos) == set(system.driven) == {"roll", "pitch"}
     free = {name for name in free_parameter_names(run, system.parameters) if not name.startswith(("m1.", "m2."))}
@@ -286,7 +267,6 @@ def lerobot_dataset(folder: Path, joints: JointGroup) -> Path:
     (folder / "meta").mkdir(parents=True)
     (folder / "meta" / "info.json").write_text(json.dumps(info | {"total_episodes": 1}))
     (folder / "data" / "chunk-000").mkdir(parents=True)
-    assert joints.position_command is not None
     both = {"observation.state": joints.position, "action": joints.position_command}
     columns: dict[str, Any] = {name: np.degrees(x).astype(np.float32).tolist() for name, x in both.items()}
     columns |= {"frame_index": list(range(len(joints.t))), "episode_index": [0] * len(joints.t)}
@@ -296,19 +276,16 @@ def lerobot_dataset(folder: Path, joints: JointGroup) -> Path:
 
 def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, repository: Path) -> None:
     made = read_recording(repository / "configs" / "recordings" / "so101_1.h5")
-    assert made.joints is not None
     lerobot_dataset(bench / "arm", made.joints)
     assert main(["init", "package:so101", "arm", "--units", "deg", "--out", "run.yaml"]) == 0
     run = load_config("run.yaml")
     assert run.model.arms.servo.motor == MotorKindAndPreset("dc", "sts3215")
-    assert run.model.friction is not None
     assert (run.model.friction.law, run.model.friction.joints) == ("load", made.joint_names[:5])  # the gripper is shut
     assert run.parameters["*.servo_gain_factor"].initial == 16
     assert main(["solve", "run.yaml", "--out", "solved", "--set", "output.write_report=false"]) == 0
     result = json.loads(Path("solved/result.json").read_text())
     assert result["fit"]["explains"]
-    for name in ("mass", "mx", "my", "mz"):
-        key = f"payload@gripper_frame_link.{name}"
+    for key in (f"payload@gripper_frame_link.{name}" for name in ("mass", "mx", "my", "mz")):
         entry = result["parameters"][key]
         assert abs(entry["value"] - made.true_parameters[key]) < 2 * entry["std"]
     # a recording that states the firmware's gain needs none in the file
@@ -326,12 +303,8 @@ def pushed_pendulum(folder: Path, phases: Sequence[float], name: str) -> None:
     model.appendBodyToJoint(2, pin.Inertia(0.3, np.array([0.0, 0.05, -0.4]), np.zeros((3, 3))), pin.SE3.Identity())
     model.armature = np.array([0.05, 0.02])
     waves = [(0.6, 2.1), (0.4, 5.3)]
-    q, v, a = (
-        np.stack(
-            [sum(A * w**k * np.sin(w * t + p + j + k * np.pi / 2) for A, w in waves) for j, p in enumerate(phases)], 1
-        )
-        for k in range(3)
-    )
+    starts = np.array(phases) + np.arange(len(phases))
+    q, v, a = (sum(A * w**k * np.sin(w * t[:, None] + starts + k * np.pi / 2) for A, w in waves) for k in range(3))
     data = model.createData()
     turns = np.stack([np.cos(q), np.sin(q)], axis=2).reshape(len(t), 4)  # of joints without limits
     torque = np.array([pin.rnea(model, data, *row) for row in zip(turns, v, a, strict=True)])
@@ -340,14 +313,13 @@ def pushed_pendulum(folder: Path, phases: Sequence[float], name: str) -> None:
     write_recording(Recording(JointGroup(names, t, q, effort=torque), name=name), folder / f"{name}.h5")
 
 
-def test_an_arm_alone_with_efforts_is_identified_as_written(bench: Path) -> None:
+def test_an_arm_alone_with_efforts_is_identified_as_written(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an object the arm's friction, rotors, zeros of sensors and payload are free, and found."""
     for name, phases in {"first": (0.0, 1.0), "second": (2.0, 0.5)}.items():
         pushed_pendulum(bench, phases, name)
     assert main(["init", "default:double_pendulum.urdf", "first.h5", "second.h5", "--out", "run.yaml"]) == 0
-    run = load_config("run.yaml")
-    assert run.model.object is None
-    assert run.model.arms.mode == "prescribed"
+    model = load_config("run.yaml").model
+    assert (model.object, model.arms.mode) == (None, "prescribed")
     assert main(["solve", "run.yaml", "--out", "solved", "--set", "output.write_report=false"]) == 0
     found = json.loads(Path("solved/result.json").read_text())["parameters"]
     [payload] = [name.removesuffix(".mass") for name in found if name.startswith("payload@") and name.endswith(".mass")]
@@ -356,14 +328,16 @@ def test_an_arm_alone_with_efforts_is_identified_as_written(bench: Path) -> None
     for name, value in truth.items():
         assert found[name]["free"], name
         assert abs(found[name]["value"] - value) < max(4 * found[name]["std"], 0.03 * abs(value)), name
+    # fits of friction laws leave wrong minima
+    monkeypatch.setattr("yid_ocp.workflow.friction.solve", lambda *_, restarts: pytest.fail(f"restarts: {restarts}"))
+    with pytest.raises(pytest.fail.Exception, match="restarts: True"):
+        main(["friction", "run.yaml", "--out", "laws"])
 
 
 def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
     assert main(["check", "run.yaml", "--out", "checked", "--set", "model.arms.mode=servo"]) == 2
-    said = capsys.readouterr().err
-    for words in ("follow commanded positions", "joints/position_command", "prescribed"):
-        assert words in said
+    assert re.search("(?s)follow commanded positions.*joints/position_command.*prescribed", capsys.readouterr().err)
 
 
 def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
@@ -411,7 +385,6 @@ def test_late_markers_are_placed_by_where_they_are_while_the_arm_rests(late: flo
 
 def test_a_file_of_another_tool_is_imported_along(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = moved(SHORT)
-    assert recording.joints is not None
     columns = ["t,r,p,ax,ay,az"]
     for t, q, x in zip(recording.joints.t, recording.joints.position, recording.points[0].position, strict=True):
         columns.append(",".join(repr(float(v)) for v in (t, *np.degrees(q), *(1e3 * x[1]))))
@@ -420,7 +393,6 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path, capsys: pytest.Ca
     assert init(*CABLE, *flags, "--points", "tip=cable:100%", files=["bag.csv"]) == 0
     run = load_config("run.yaml")
     made = read_recording(run.recordings.estimate[0])
-    assert made.joints is not None
     assert np.allclose(made.joints.position, recording.joints.position)
     assert made.point_names == ("cable:100%",)
     # the section repeats the import
@@ -449,6 +421,7 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "branch on nothing": (("--object", "tree", "--branch", "a@b=1,1,1"), "grows on 'b', which", "--branch"),
     "branches of one name": ((*TREE, "--branch", "a=1,1,1"), "two branches are called 'a'", "--branch"),
     "negative length": ((*CABLE, "--length", "-1"), "the length is -1", "--length"),
+    "grams": ((*CABLE, "--mass", "50"), "'cable' has 2e+06 kg/m^3", "--mass"),
     "too many links": ((*CABLE, "--links", "99"), "99 links", "--links"),
     "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
@@ -463,9 +436,7 @@ def test_what_is_missing_is_named_and_nothing_is_written(case, bench, capsys) ->
     before = sorted(bench.iterdir())
     assert init(*words) == 2
     told = capsys.readouterr().err
-    assert said in told
-    assert where in told
-    assert sorted(bench.iterdir()) == before
+    assert (said in told, where in told, sorted(bench.iterdir())) == (True, True, before)
 
 
 def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -475,12 +446,11 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))
     assert init(*CABLE, files=["bag.csv"]) == 2
     told = capsys.readouterr().err
-    assert "none of the recorded joints is in the URDF: shoulder" in told
+    assert re.search("(?s)none of the recorded joints is in the URDF: shoulder.*--joints shoulder=roll", told)
     (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
     write_recording(moved(SHORT), bench / "one.h5")
     assert init(*CABLE, files=["one.h5", "bag.csv"]) == 2
     assert "the recording lacks joint 'pitch' of one" in capsys.readouterr().err
-    assert "--joints shoulder=roll" in told
     assert not (bench / "bag.h5").exists()
     (bench / "run.yaml").write_text("kept: true\n")
     assert init(*CABLE) == 2

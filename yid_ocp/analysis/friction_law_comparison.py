@@ -12,8 +12,8 @@ from yid_ocp.arrays import Array
 from yid_ocp.effects.law import torque_law_argument_along_rollout
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import whitened_prediction_residual
+from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
@@ -59,8 +59,8 @@ def cross_validate_over_motion_kinds(
 ) -> CrossValidatedFrictionLawFit:
     """Fit a friction law without each kind of motion in turn, to get its prediction errors for the omitted kind."""
     errors: dict[str, float] = {}
-    units = {e.measurements[i].sensor.unit for e in problem.episodes for i in _indices_of_sensors_of_friction(e)}
-    is_whitened = units != {"rad"}
+    used = (e.measurements for e in problem.episodes)
+    is_whitened = {own[i].sensor.unit for own in used for i in _indices_of_sensors_of_friction(own)} != {"rad"}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
     for own in kinds.values():
         inside, outside = ([pair for pair in pairs if (pair[0].name in own) == out] for out in (False, True))
@@ -72,27 +72,25 @@ def cross_validate_over_motion_kinds(
             if isinstance(outcome, str):
                 errors[episode.name] = float("nan")
                 continue
-            kept = _indices_of_sensors_of_friction(episode)
+            kept = _indices_of_sensors_of_friction(episode.measurements)
             own_episode = replace(episode, measurements=tuple(episode.measurements[i] for i in kept))
             outcome = replace(outcome, predicted_outputs=tuple(outcome.predicted_outputs[i] for i in kept))
             if is_whitened:
-                squares = [whitened_prediction_residual(own_episode, None, outcome, np.inf).residual ** 2]
+                rows = whitened_prediction_residual(own_episode, None, outcome, np.inf).residual
             else:
-                differences = [p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)]
-                squares = [np.sum(difference**2, axis=1) for difference in differences]
-            errors[episode.name] = float(np.sqrt(np.nanmean(np.concatenate(squares))))
-    unit = "std" if is_whitened else "rad"
+                rows = np.vstack([p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)])
+            errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
     free = {name: entry for name, entry in solution.parameters.items() if name in problem.free}
+    unit = "std" if is_whitened else "rad"
     return CrossValidatedFrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
 
 
-def _indices_of_sensors_of_friction(episode: Episode) -> Sequence[int]:
+def _indices_of_sensors_of_friction(samples: Sequence[SensorMeasurements]) -> Sequence[int]:
     """Find the sensors that friction changes: angles of driven and efforts of prescribed joints; without any, all.
 
     Points on an object that a prescribed arm moves have the same error for all laws, which would hide theirs.
     """
-    found = [i for i, own in enumerate(episode.measurements) if isinstance(own.sensor, JointSensor)]
-    return found or range(len(episode.measurements))
+    return [i for i, own in enumerate(samples) if isinstance(own.sensor, JointSensor)] or range(len(samples))
 
 
 def mean_and_std_error_over_motion_kinds(

@@ -20,7 +20,6 @@ from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, NOISE_ESTIMATE_DIFFE
 
 _MAX_REPEATED_FRACTION = 0.1  # fraction of samples that may repeat the previous one
 _MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # change next to a rest over smallest and median change
-_MAX_STANDSTILL_RANGE = 10.0  # range of an angle that stands, in stds of its noise: 1 std is 0.3 counts
 _MIN_NOISE_FRACTION = 1e-2  # fraction of the stated noise below which a channel was computed
 _MAX_SAMPLE_PERIOD = 0.02  # longest period at which arm motion counts as slow [s]
 
@@ -59,7 +58,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         rests = [run for run in runs if run[2] <= unseen and _comes_to_rest(values, *run[:2])]
         if joints is not None and quantity == "effort":  # a command that holds a joint still is constant
             angle = joints.position[:, joints.names.index(name)]
-            most = _MAX_STANDSTILL_RANGE * seen_noise_std(t, angle)
+            most = 10 * seen_noise_std(t, angle)  # range of noise, or three counts
             rests = [run for run in runs if run in rests or np.ptp(angle[run[0] : run[1] + 1]) <= most]
         if len(rests) == len(runs):
             continue

@@ -234,6 +234,8 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
         advice = f"multiply times by {typical:.3g}, or find what is wrong with velocities"
         if abs(typical / math.degrees(1.0) - 1) < 0.1:
             cause, channel, advice = "degrees", "position", "convert angles to radians"
+        elif abs(typical * math.degrees(1.0) - 1) < 0.1:
+            cause, channel, advice = "degrees", "velocity", "convert velocities to radians per second"
         what = f"all angles turn {typical:.3g} times as fast as the recorded velocities say"
         ratio_beyond = max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio
         yield Issue(cause, what, "not_trusted", ratio_beyond, advice, "", "joints", channel)

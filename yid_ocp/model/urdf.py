@@ -213,12 +213,13 @@ def _parsed(file: Path) -> SimpleNamespace:
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 
 
-def positive_urdf_joint_dynamics(robot: str | Path, key: Literal["damping", "friction"]) -> dict[str, float]:
+def urdf_joint_dynamics(robot: str | Path, key: str) -> dict[str, float]:
     """Return each joint's `damping` [N m s/rad] or `friction` [N m] that a URDF states, where it is above 0."""
-    file = urdf_path_from_robot_name(robot)
-    joints = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot().findall("joint")
-    said = {joint.attrib["name"]: part.get(key, "0") for joint in joints for part in joint.findall("dynamics")}
-    values = {name: _numbers(text, 1, f"joint '{name}': dynamics {key}", str(file))[0] for name, text in said.items()}
+    root = ElementTree.parse(check_input_file(urdf_path_from_robot_name(robot), MAX_TEXT_BYTES)).getroot()
+    said = {
+        joint.attrib["name"]: part.get(key, "0") for joint in root.findall("joint") for part in joint.iter("dynamics")
+    }
+    values = {name: _numbers(text, 1, f"joint '{name}': dynamics {key}", str(robot))[0] for name, text in said.items()}
     return {name: value for name, value in values.items() if value > 0}
 
 

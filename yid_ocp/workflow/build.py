@@ -82,6 +82,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         raise run.config_error(what, "model", allowed=allowed, hint="set model.robot or model.object")
     with add_setting_location_to_errors(run, "model", "frames"):
         carrier, items = _with_extra_frames(run, robot, [item for item, *_ in objects])
+    with add_setting_location_to_errors(run, "model", "object", "mount", "parent_frame"):
+        _ = [carrier.frame(frame) for _, frame, _ in objects if carrier is not None and frame]
     with add_setting_location_to_errors(run, "model"):
         system = System.build(
             carrier,
@@ -394,6 +396,7 @@ def _with_extra_frames(
             tree = Mechanism("world", (), {}) if carrier is None else carrier
             if parent is not None and not tree.has_frame(parent):
                 known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
+                known += [f"{segment}:40%" for item in made for segment in item.mechanism.link_chains]
                 raise unknown_name_error(run, "frame", parent, known, *where, "parent_frame")
         pose = np.eye(4) if said.use_recorded_straight_position else transform_from_xyz_rpy(said.xyz, said.rpy)
         tree = tree.with_added_frame(name, parent, pose)

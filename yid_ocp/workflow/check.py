@@ -122,9 +122,8 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
-            said = "nothing says whether joints/effort is a sample, a mean or a command"
-            said += f"; it is taken as a {arm.effort_sampling_kind_or_default}"
-            warnings.append(f"{episode.name}: {said} (set sensors.joints.effort.effort_sampling_kind)")
+            said = "set sensors.joints.effort.effort_sampling_kind: nothing says if efforts are samples or commands"
+            warnings.append(f"{episode.name}: {said}; they are taken as {arm.effort_sampling_kind_or_default}s")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None

@@ -17,7 +17,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChan
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import positive_urdf_joint_dynamics, read_urdf, urdf_path_from_robot_name
+from yid_ocp.model.urdf import read_urdf, urdf_joint_dynamics, urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import RecordedChannelSpec, channel_kinds_of_sensor_group
@@ -197,8 +197,7 @@ def propose_config_choices(
         bool(branches),
         _torque_bias_std(tree, recorded, joints),
         recorded.effort is not None and recorded.effort_kind is None,
-        {name: value for name, value in positive_urdf_joint_dynamics(robot, "damping").items() if name in joints},
-        {name: value for name, value in positive_urdf_joint_dynamics(robot, "friction").items() if name in joints},
+        *({n: x for n, x in urdf_joint_dynamics(robot, key).items() if n in joints} for key in ("damping", "friction")),
     )
 
 
@@ -500,14 +499,14 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
     if group.std is not None:
         return _GroupNoise(None, "m", _STATED_NOISE)
     slow = len(group.t) < 2 or 1.0 / mean_sample_rate(group.t) > _SLOW_SAMPLE_PERIOD
-    sizes = [0.0]
+    sizes: list[float] = []
     for i in range(len(group.names)):
         seen = np.isfinite(group.position[:, i]).all(axis=1)
         sizes += [seen_noise_std(group.t[seen], column) for column in group.position[seen, i].T]
-    if slow or max(sizes) <= 0:
+    if slow or not any(sizes):
         std = _CAMERA_STD if slow else _MARKER_STD
         return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")
-    return _GroupNoise(max(sizes), "m", _SEEN_NOISE)
+    return _GroupNoise(math.sqrt(math.fsum(x * x for x in sizes) / np.count_nonzero(sizes)), "m", _SEEN_NOISE)
 
 
 def _time_step(period: float) -> float:

@@ -21,6 +21,7 @@ from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefitStore, RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
@@ -35,7 +36,7 @@ from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, ani
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
-from yid_ocp.workflow import prediction_outputs, run_history
+from yid_ocp.workflow import prediction_outputs, run_history, run_inputs
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.plan import discrimination_plan_settings
@@ -72,6 +73,8 @@ def run_diagnose(
             folder.log_event("message", level="WARNING", source="baseline", text=said)
         run = run_history.settings_with_baseline_effects(run, runs)
         problem = build_problem(run, reference_recordings=without)
+        with run_inputs.add_setting_location_to_errors(run, "diagnosis", "candidates"):
+            make_candidate_effects(problem.system, [e.recording for e in problem.episodes], run.diagnosis.candidates)
         run_history.require_recordings_not_in_baseline(run, problem, runs, without)
         if runs:
             problem = add_baseline_prior(problem, pool_estimates_and_chi2(runs)[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import shlex
@@ -104,7 +105,14 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
     if given["branch"] and not template.has_branches:
         what, hint = f"a {word} has no branches", "set --object tree, or leave --branch out"
         raise ConfigError(what, where="--branch", allowed="with --object tree", hint=hint)
-    return template.build({name: value for name, value in given.items() if value}, links)
+    item = template.build({name: value for name, value in given.items() if value}, links)
+    for own in item.settings.segment_definitions():
+        width, height = own.cross_section_size or (math.sqrt(math.pi) * (own.radius or math.nan),) * 2
+        density = own.mass / (own.length * width * height)
+        if density < 5 or density > 20_000:
+            what, allowed = f"'{own.name}' has {density:.2g} kg/m^3", "5 kg/m^3 (foam) to 20000 kg/m^3 (tungsten)"
+            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint="give kg and m")
+    return item
 
 
 def _grasps(given: Sequence[str]) -> dict[str, str]:
@@ -181,9 +189,8 @@ def _summary_lines(
         f"mode: {proposal.arm_mode}: {proposal.arm_mode_reason}",
         f"start: {proposal.initial_state}: {proposal.initial_state_reason}",
     ]
-    damping, friction = (_value(own) for own in (proposal.urdf_joint_damping, proposal.urdf_joint_friction))
-    lines += [f"damping of the joints: {damping} N m s/rad, as the URDF states"] * bool(proposal.urdf_joint_damping)
-    lines += [f"not used: friction of the URDF, {friction} N m"] * bool(proposal.urdf_joint_friction)
+    damping = _value(proposal.urdf_joint_damping)
+    lines += [f"damping: {damping} N m s/rad, as the URDF states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
@@ -330,9 +337,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
             if told_by_points:
                 entries = ["use: false", *entries]
                 said = "use: true looks for friction and payload of the arm; bias_std allows a constant error of each "
-                said += (
-                    "torque (a guess: 1 % of the effort limit); in its place, a free effect effort_offset reports it"
-                )
+                said += "torque (a guess: 1 % of the effort limit); a free effect effort_offset instead reports it"
         is_mounted = places and "." in group
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
             why = "torques with noise move the arms: set mode: prescribed to use it"

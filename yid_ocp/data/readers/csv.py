@@ -428,5 +428,8 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
             what, skip = f"there is no column for {meaning[0]} of '{meaning[1]}'", base.SKIP_COLUMN_KEYWORD
             allowed = "every channel for all joints, position always; x, y and z of every point and every sensor"
             hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
+            names = [name for _, name in meanings]  # a misspelt one has a single column
+            lone = [name for name in names if names.count(name) == 1 and name != meaning[1]]
+            hint = nearest_name_question(meaning[1], lone) or hint
             raise DataError(what, where=where, allowed=allowed, hint=hint)
     return table[:, [places[meaning] for meaning in wanted]]
