@@ -15,8 +15,8 @@ BEGIN, END = "<!-- peers: begin -->", "<!-- peers: end -->"
 HELD_OUT = {"springs": (1e3, "mm"), "servo": (1.0, "rad")}  # scale and unit; torques elsewhere
 MARKERS = "osD^v<>PX*"
 HEADER = (
-    "tool", "confident estimates", "largest error of these", "confident but wrong", "intervals that contain the truth",
-    "held out", "CPU [s]", "lines",
+    "tool", "confident estimates", "median of the largest error", "confident but wrong",
+    "intervals that contain the truth", "held out", "CPU [s]", "lines",
 )  # fmt: skip
 MADE_BY = {
     "MuJoCo": "recordings by MuJoCo",

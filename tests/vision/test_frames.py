@@ -234,8 +234,8 @@ def test_points_are_read(read, kind):
 
 
 WRONG = {
-    "no ply": (b"plx\n", "has no head"),
-    "no end": (ply_head("ascii")[:-12], "has no head"),
+    "no ply": (b"plx\n", "has no header"),
+    "no end": (ply_head("ascii")[:-12], "has no header"),
     "no format": (ply_head("ascii").replace(b"format ascii 1.0\n", b"") + TEXT, "its header has no format"),
     "another format": (ply_head("ascii").replace(b"ascii", b"utf") + TEXT, "header has the line 'format utf 1.0'"),
     "another type": (ply_head("ascii").replace(b"float", b"flaot", 1) + TEXT, "header has the line 'property flaot x'"),

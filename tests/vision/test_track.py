@@ -146,7 +146,7 @@ BAD = {
     "the cloud has no finite points": lambda points: points[:0],
     "the cloud has no finite points:": lambda points: np.full_like(points, np.nan),
     "not in metres": lambda points: 1000 * points,
-    "no point lies where the object can be": lambda points: points + np.array([30.0, 0.0, 0.0]),
+    "no point lies where the object can reach": lambda points: points + np.array([30.0, 0.0, 0.0]),
     "too few points of the object": lambda points: points[:60],
     "an end is not where its gripper is": lambda points: points * [1.0, 1.0, 1.05],
     "the cloud is empty or cannot be read": lambda points: unreadable(),

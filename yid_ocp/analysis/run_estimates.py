@@ -84,7 +84,7 @@ class _RunOutlierTest:
 
 @dataclass(frozen=True)
 class DriftAndOutlierTests:
-    """The results of tests for parameter drift and for outliers among several runs. `chi2` covers all differences."""
+    """Tests of several runs for drifting parameters and deviating runs. `chi2` is of all differences between runs."""
 
     run_names: tuple[str, ...]
     parameter_drift_tests: tuple[_ParameterDriftTest, ...]

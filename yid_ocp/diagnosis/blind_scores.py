@@ -551,7 +551,7 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     time step) are not repeated. `DataError` if another version recorded the case.
     """
     if data.get("format") != _EVIDENCE_FORMAT:
-        what, hint = f"the evidence has the format '{data.get('format')}'", "record the cases again with this version"
+        what, hint = f"another version made this evidence (format '{data.get('format')}')", "record the cases again"
         raise DataError(what, where="evidence in the recorded answer of a case", allowed=_EVIDENCE_FORMAT, hint=hint)
     known = {entry.name for entry in fields(Thresholds)}
     kept = {name: value for name, value in data["thresholds"].items() if name in known}

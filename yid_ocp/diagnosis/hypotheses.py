@@ -265,7 +265,7 @@ class AllCandidatesProblem:
     def relinearize_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Linearise the held-out filters at the fitted values. `own`: from `with_effects_and_relinearized_filters`."""
+        """Return `own`, from `with_effects_and_relinearized_filters`, with its held-out filters linearised at `at`."""
         if not own.has_process_noise:
             return own
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))

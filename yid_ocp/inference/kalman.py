@@ -199,7 +199,7 @@ class FixedGainKalmanFilter:
         given = [None if a is None else np.ascontiguousarray(a) for a in inputs or (None, None)]
         columns: list[NDArray[Any] | None] = [np.array(state.shape[1:], np.int32), rows, state, seen, *given]
         if not library.yid_kalman_columns(_addresses(steps), _addresses(columns), ctypes.c_int(not inputs)):
-            raise out_of_memory_error("the work on one step of a filter", 4 * state.nbytes)
+            raise out_of_memory_error("one step of a Kalman filter", 4 * state.nbytes)
         return rows, state
 
 
@@ -240,5 +240,5 @@ def kalman_steps_and_covariance(
     arrays: list[NDArray[Any] | None] = [size, np.array(row_start, np.int32), moves, decay, variance, observation]
     arrays += [white, projected, covariance]
     if not library.yid_kalman_steps(_addresses(arrays)):
-        raise out_of_memory_error("the work on one step of a filter", 4 * covariance.nbytes)
+        raise out_of_memory_error("one step of a Kalman filter", 4 * covariance.nbytes)
     return found, covariance

@@ -216,7 +216,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def size_limited_damped_step(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Compute the damped least-squares step (nx,) in which no unknown moves by more than its value or typical size."""
+    """Compute the damped least-squares step (nx,), per unknown at most the larger of its value and its typical size."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)

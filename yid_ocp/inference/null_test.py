@@ -131,7 +131,7 @@ def residual_chi2_null_test(
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Include further independent errors in a whitened residual r (nr,), and return (I + F F')^(-1/2) r.
+    """Whiten r (nr,), the argument `residual` of covariance I, for further independent errors: (I + F F')^(-1/2) r.
 
     Column j of F (nr, k), the argument `spread`, is the change of the residual for one standard deviation of error j.
     Columns that are not finite are ignored.

@@ -105,7 +105,7 @@ class _March:
     abandoned: bool = False
 
     def ask(self, request: _Request) -> list[Any]:
-        """Wait for the answers to a request, and let another item run meanwhile."""
+        """Hand in a request for `answer_until_done` and return its answers; meanwhile another item may run."""
         self.running.release()
         try:
             with self.changed:

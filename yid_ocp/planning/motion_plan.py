@@ -46,7 +46,7 @@ class ParameterCovarianceBeforePlan:
 class TargetMotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
-    The motion can be simulated with a shorter time step than the time step of the given step.
+    Its time step is shorter than that of the given step if the planner had to halve it for accuracy.
     """
 
     target_point: str

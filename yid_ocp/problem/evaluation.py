@@ -298,7 +298,7 @@ def check_no_known_value_of_free_parameters(episodes: Iterable[Episode], free: S
         known = {*episode.known_parameters, *getattr(episode.fixed_initial_state, "fitted_parameters", ())}
         if found := [name for name in free if name in known]:
             what = f"{found[0]} is free, but this recording has a known value of it"
-            allowed, hint = "parameters that are free or known", f"set parameters.{found[0]}.free: false"
+            allowed, hint = "parameters that are either free or known", f"set parameters.{found[0]}.free: false"
             raise ConfigError(what, where=f"recording '{episode.name}'", allowed=allowed, hint=hint)
 
 

@@ -283,7 +283,7 @@ def recording_with_sensor_error(
     joints = recording.joints
     assert joints is not None
     if joints.effort is None:
-        allowed, hint = "arms that are driven by torques", "leave the effect out"
+        allowed, hint = "recordings with efforts of the joints", "leave the effect out"
         raise ModelError("the recording has no efforts", where=f"{kind}@{location}", allowed=allowed, hint=hint)
     if kind == "effort_delay":
         effort = joints.effort.copy()

@@ -363,7 +363,7 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
         numbers |= {"stiffness": [terms.stiffness], "springref": [terms.constant_force / terms.stiffness]}
     if terms.cubic_stiffness:
         if terms.constant_force:
-            what, allowed = f"the spring at '{joint.name}' has a cubic part", "no cubic part with a rest angle"
+            what, allowed = f"the spring at '{joint.name}' has a cubic part and a rest angle", "only one of them"
             hint = "leave the cubic part or the rest angle out"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         numbers["stiffness"] = [terms.stiffness, 0.0, terms.cubic_stiffness]

@@ -305,7 +305,7 @@ class _Calibrator:
         presence = seen_occluded_and_seen_through_surface_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= _MIN_ARM_COVERAGE * free:
-            seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
+            seen = f"points are seen behind {100 * presence.through / max(free, 1e-9):.0f} % of the arm's surface"
             hint = "check the specified pose, the robot's description and which recording belongs to the frames"
             raise _UntoldError(f"{seen}, for every camera pose and clock offset tried", hint)
         covariance = cost(state).state_covariance(self.precision)

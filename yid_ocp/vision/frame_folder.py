@@ -130,7 +130,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
     head, end, body = path.read_bytes().partition(b"end_header")
     line, _, body = body.partition(b"\n")
     if not end or len(head) > _MAX_HEADER_BYTES or line.strip() or not head.startswith(b"ply"):
-        raise _damaged(path, "it has no head")
+        raise _damaged(path, "it has no header from 'ply' to 'end_header'")
     order, elements = _head(path, head.decode("latin-1"))
     for name, count, columns in elements:
         if name == "vertex":

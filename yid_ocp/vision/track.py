@@ -270,7 +270,7 @@ class FrameTracker:
         q = self._configuration_at_rest(float(state.stamps_to_joint_clock(self.sequence.stamps[index])))
         inside = self.object_region.membership_test_at(q, calibration.camera_position)(points)
         if not inside.any():
-            raise DataError("no point lies where the object can be: check the camera's pose")
+            raise DataError("no point lies where the object can reach: check the camera's pose")
         if filters.object_colours and self.sequence.load_colours is not None:
             colours = self.sequence.load_colours(index)
             if colours is None:
@@ -317,7 +317,7 @@ class FrameTracker:
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def align_root_ends_and_mark_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
-        """Choose the object's root end and drop outlying frames. Returns the frames and a note on the choice."""
+        """Choose which end is the root; mark outlying frames as dropped. Returns all frames and a note on the root."""
         rooted, note = frame_selection.align_root_ends(frames, self.options)
         return frame_selection.mark_outlying_frames_as_dropped(rooted, self.options), note
 
@@ -342,7 +342,7 @@ class FrameTracker:
         )
 
     def find_foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
-        """Find foreign objects in the fitted frames."""
+        """Find things near the object that are neither it nor the robot, each followed over the fitted frames."""
         fitted = [(frame.joint_time, frame.shape_fit) for frame in frames if frame.shape_fit is not None]
         if not fitted:
             return ()

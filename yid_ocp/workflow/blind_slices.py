@@ -54,7 +54,7 @@ def score_joined_slices(
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
         part = read_input_json(path)
         if part.get("format") != _SLICE_FORMAT:
-            what, hint = "this is not a slice of an ensemble", "give a folder of `yid-ocp blind`, or its slice.json"
+            what, hint = "the file is no part of a blind test", "give a folder of `yid-ocp blind`, or its slice.json"
             raise DataError(what, where=str(path), allowed=f"the format {_SLICE_FORMAT}", hint=hint)
         _, digest = blind.labels_json_and_sha256(_labels(part))
         if digest != part["labels_sha256"] or _ensemble_sha256(part) != part["ensemble_sha256"]:

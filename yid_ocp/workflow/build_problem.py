@@ -260,7 +260,7 @@ def _check_recordings(
         doubts += _excitation(run, arm, free, kept[0])
     _raise_for_issues(run, doubts)
     if not kept[0]:
-        hint = "; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump"))
+        hint = "record again: " + "; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump"))
         what, allowed = "no part of the recordings is long enough between gaps", "a recording without gaps"
         raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(doubts)

@@ -126,7 +126,7 @@ class CableTopology:
 
 @dataclass(frozen=True)
 class InitialObjectSettings:
-    """An object from the command line of `init`, with initial values of its free parameters."""
+    """An object that the command line of `init` describes, with initial values of its free parameters."""
 
     settings: ObjectBuilder  # without its mount
     start_values: Mapping[str, tuple[float, str]]  # initial value of each free parameter, with a comment
@@ -177,7 +177,7 @@ def parse_comma_separated_numbers(text: str, count: int, flag: str) -> list[floa
 def initial_parameters_with_comments(
     segments: Sequence[FlexibleSegment], rigidity_ratio: float
 ) -> dict[str, tuple[float, str]]:
-    """Return the initial bending rigidity, `rigidity_ratio` x weight x length^2, and damping of each segment."""
+    """Return start values by name, with comments: rigidity (`rigidity_ratio` x weight x length^2) and its damping."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
