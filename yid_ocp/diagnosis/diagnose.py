@@ -346,8 +346,8 @@ def _fitted_nominal_model(
 ) -> RefittedModel:
     """The nominal model fitted from a start, with whitening fixed there. Raises `SolverError` if it fails."""
     problem = search.problem.with_whitening_linearized_at(start)
-    # a gap may move parameters so far that the solver's equilibrium is not found again from there
     nominal = problem.restricted_to_effects(())
+    # a gap may move parameters so far that the solver's equilibrium is not found again from there
     for own in (start, {}):
         if fit := refit_with_effects(nominal, (), own, search.store, name, search.thresholds):
             return reevaluate_refit_with_all_candidates(problem, fit)

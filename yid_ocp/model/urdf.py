@@ -213,14 +213,18 @@ def _parsed(file: Path) -> SimpleNamespace:
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 
 
-def urdf_joint_dynamics(robot: str | Path, key: str) -> dict[str, float]:
-    """Return each joint's `damping` [N m s/rad] or `friction` [N m] that a URDF states, where it is above 0."""
+def urdf_joint_dynamics(robot: str | Path) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the damping [N m s/rad] and the friction [N m] by joint that a URDF states, where they are above 0."""
     root = ElementTree.parse(check_input_file(urdf_path_from_robot_name(robot), MAX_TEXT_BYTES)).getroot()
-    said = {
-        joint.attrib["name"]: part.get(key, "0") for joint in root.findall("joint") for part in joint.iter("dynamics")
-    }
-    values = {name: _numbers(text, 1, f"joint '{name}': dynamics {key}", str(robot))[0] for name, text in said.items()}
-    return {name: value for name, value in values.items() if value > 0}
+    parts = [(joint.attrib["name"], part) for joint in root.findall("joint") for part in joint.iter("dynamics")]
+
+    def stated(key: str) -> dict[str, float]:
+        texts = {name: part.get(key, "0") for name, part in parts}
+        where = {name: f"joint '{name}': dynamics {key}" for name in texts}
+        values = {name: _numbers(text, 1, where[name], str(robot))[0] for name, text in texts.items()}
+        return {name: value for name, value in values.items() if value > 0}
+
+    return stated("damping"), stated("friction")
 
 
 def _read_inertial(element: ElementTree.Element | None) -> SimpleNamespace | None:

@@ -197,7 +197,7 @@ def propose_config_choices(
         bool(branches),
         _torque_bias_std(tree, recorded, joints),
         recorded.effort is not None and recorded.effort_kind is None,
-        *({n: x for n, x in urdf_joint_dynamics(robot, key).items() if n in joints} for key in ("damping", "friction")),
+        *({name: value for name, value in own.items() if name in joints} for own in urdf_joint_dynamics(robot)),
     )
 
 
