@@ -18,11 +18,11 @@ from yid_ocp.options import Option, describe_type, mapping_value_type, options_b
 HEAD = """\
 # Settings
 
-This page lists every key of a configuration file. NAME is a name of yours or of the model. Units are SI, in brackets.
-`needed` keys have no default; an empty default is `null`. Any key can be set on the command line, as in
-`--set problem.time_step=0.005`. With `--set`, a section changes only the keys that it names, and `{}` clears it. How to
-choose links, time step and split: [choosing.md](../howto/choosing.md). Recordings and their units:
-[recordings.md](recordings.md). This page is generated from the code; CONTRIBUTING.md has the command.
+This page lists every key of a configuration file. NAME is a name that you choose, or a name in the model. Units are SI,
+in brackets. Default `needed`: you must set the key. Empty default: `null`. Any key can be set on the command line, as
+in `--set problem.time_step=0.005`. With `--set`, a section changes only the keys that it names, and `{}` clears it.
+Links and time step: [choosing.md](../howto/choosing.md); held-out recordings: [held_out.md](../howto/held_out.md);
+units of recordings: [recordings.md](recordings.md). Generated from the code; CONTRIBUTING.md has the command.
 """
 
 
