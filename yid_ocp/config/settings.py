@@ -416,7 +416,7 @@ class RunSettings:
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
     plugins: Annotated[
-        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are executed")
+        tuple[_FilePath, ...], OptionInfo("Python files to execute, which register effects, sensors or report sections")
     ] = ()
     model: Annotated[_ModelSettings, OptionInfo("the mechanical model")] = _ModelSettings()
     recordings: Annotated[RecordingsSettings, OptionInfo("recordings for estimation and test")] = RecordingsSettings()
