@@ -157,7 +157,7 @@ HEAD = "quantity,unit,at,torque,std\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a,b\n1,2\n", "not a table of a law"),
+        ("a,b\n1,2\n", "not a table of a torque law"),
         (HEAD + "angle,rad,0,x,1\n", "line 2"),
         (HEAD + "".join(f"speed,rad/s,{x},0,0\n" for x in range(5)), "the law depends on angle"),
         (HEAD + "".join(f"angle,rad,{x},0,0\n" for x in (0, 1, 3, 4)), "evenly spaced"),

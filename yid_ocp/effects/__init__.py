@@ -1,6 +1,6 @@
-"""The library of effects that the nominal model lacks, with their possible locations. A new kind is one file.
+"""The library of effects, which are mechanisms and sensor errors that the nominal model lacks.
 
-The class of a kind states its equation, quantities, units, bounds and ranges. `docs/howto/extending.md` adds a kind.
+The class of a kind states its equation, parameters, units and bounds. To add a kind, see `docs/howto/extending.md`.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ for _family in iter_modules(__path__):
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """Create an effect of the given kind at a location. `System.with_effects` adds it to a system.
+    """Create an effect of the given kind at a location of `system`. `System.with_effects` then adds it to the system.
 
-    Its parameters are named `kind@location.parameter`. `values` holds non-neutral values by parameter; a compliance may
-    be given as its `stiffness`. Raises `ConfigError` for an unknown kind or parameter, or a value outside its bounds.
-    Raises `ModelError` if the kind cannot act at this location of the system.
+    Its parameters are named `kind@location.parameter`. `values`, by `parameter`, replaces neutral values; a compliance
+    may be given as `stiffness`. Raises `ConfigError` for an unknown kind or parameter or a value outside its bounds,
+    and `ModelError` if the kind cannot act at this location of the system.
     """
     places = EFFECTS[kind].possible_locations(system)
     # a payload or point mass may be at any frame, including frames of the arm that are not in `system.point_frames`
@@ -42,12 +42,12 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
 
 def signal_kinds_required_by_any_effect() -> frozenset[str]:
-    """Return the kinds of recorded signals that effects can need, such as `joints.effort`. Plug-ins are included."""
+    """Return the kinds of recorded signals, such as `joints.effort`, that some effect (also of a plug-in) requires."""
     return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
 
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
-    """List all effect kinds and locations that the system allows and the recorded signals can reveal.
+    """List the pairs of effect kind and location that the system allows and the recorded signals can reveal.
 
     `system` does not contain the candidate effects. `recorded_sensors` lists the recorded signals: names in
     `signal_kinds_required_by_any_effect`, sensors on a frame such as `wrist:FRAME`, and `points:GROUP` for points with
@@ -57,7 +57,7 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
     for name in sorted(name for name in present - known if ":" not in name):
         said = unknown_name_error_arguments(name, sorted(known))
-        raise ModelError(f"there is no kind of sensor '{name}'", where="recorded_sensors", **said)
+        raise ModelError(f"there is no kind of recorded signal '{name}'", where="argument recorded_sensors", **said)
     unseen = set() if "joints.effort" in present else set(system.prescribed)
     found = []
     for kind in EFFECTS:

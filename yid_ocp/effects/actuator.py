@@ -1,7 +1,7 @@
 """Effects between a motor and its recorded signals, such as backlash, encoder offsets and delays.
 
-Inputs of the model (torques and angles of driven joints, angles of prescribed joints) go through
-`true_value_from_reading`, compared efforts of prescribed joints through `reading_from_true_value`.
+`true_value_from_reading` corrects the recorded inputs of the model (torques and angles of driven joints, angles of
+prescribed joints). `reading_from_true_value` predicts the recorded efforts of prescribed joints.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _geared_joints(system: System) -> tuple[str, ...]:
 
 
 def _limit_definition(lowest: float, unit: str, text: str) -> ParameterDefinition:
-    """Definition of tightness = limit^-16, reported as limit in `unit`, at least `lowest`."""
+    """Definition of the parameter `tightness` = limit^-16. Reports show the limit, at least `lowest`, in `unit`."""
     highest, inverse = lowest**-TORQUE_SATURATION_EXPONENT, f"({unit})^-16"
     words = f"{text}, to the power -16"
     tightness = ParameterDefinition("tightness", inverse, 0.0, 0.0, highest, (0.0, highest), words)
@@ -59,14 +59,14 @@ def _effort_arms(system: System) -> tuple[str, ...]:
 
 
 class _DistortedReading(EffectBase):
-    """An additive error of the reading of one joint."""
+    """The base class of additive errors of one joint's recorded angle or effort."""
 
     quantity: ClassVar[str] = "joints.position"
     required_sensors = frozenset({"joints.position"})
     possible_locations = _effort_joints
 
     def _error(self, effort: ca.SX) -> ca.SX:
-        """Measured minus true value at an effort: the joint's modelled effort if available, else the recorded one."""
+        """Measured minus true value, as a function of the joint's effort (modelled if available, else recorded)."""
         raise NotImplementedError
 
     def _is_own(self, channel: str) -> bool:
@@ -83,7 +83,7 @@ class _DistortedReading(EffectBase):
 
 @EFFECTS.register("encoder_offset")
 class _EncoderOffset(_DistortedReading):
-    """Constant offset of the measured angle. Prescribed path, initial state and tracked angles are corrected for it."""
+    """Constant offset of a joint's measured angle. Prescribed, initial and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
     required_excitation = "its orientation to gravity"
@@ -96,7 +96,7 @@ class _EncoderOffset(_DistortedReading):
 
 @EFFECTS.register("series_elasticity")
 class _SeriesElasticity(_DistortedReading):
-    """Elastic gear with the encoder on the motor side. The measured angle is q + effort/stiffness."""
+    """Elastic gear with the encoder on the motor side. At joint angle q, the measured angle is q + effort/stiffness."""
 
     equation = "measured angle = q + effort/stiffness"
     required_excitation = "how hard it pulls at its ends"
@@ -159,7 +159,7 @@ class Backlash(_DistortedReading):
 
 
 class _DistortedEffort(_DistortedReading):
-    """An error of a joint's recorded effort."""
+    """The base class of errors of one joint's recorded effort."""
 
     quantity = "joints.effort"
     required_excitation = "its orientation to gravity"
@@ -170,7 +170,7 @@ class _DistortedEffort(_DistortedReading):
 class _EffortGain(_DistortedEffort):
     """Scale error of a joint's effort: measured effort = scale x true effort. A negative scale is a flipped sign.
 
-    The internal parameter is 1/scale, which multiplies a recorded torque, so that a driven joint's value can pass zero.
+    The internal parameter is 1/scale. It multiplies the recorded torque of a driven joint and may pass through zero.
     """
 
     equation = "measured effort = scale x true"
@@ -214,22 +214,22 @@ class _EffortOffset(_DistortedEffort):
 
 
 class _LateTorque(EffectBase):
-    """Torque that acts after its record. For a prescribed joint, the measured effort is early by the same time."""
+    """The base class of torques that act later than recorded. At a prescribed joint, the recorded effort is early."""
 
     required_excitation = "when it is read"
     required_sensors = frozenset({"joints.effort"})
 
     def _lateness(self, channel: str, joints: tuple[str, ...], size: ca.SX) -> ca.SX:
-        """`size` for a driving torque of one of the joints, -`size` for their measured efforts, else zero."""
+        """`size` if the channel is a driving torque of the joints, -`size` if it is their recorded effort, else 0."""
         signs = {f"{name}.{joint}": sign for name, sign in (("torque", 1), ("joints.effort", -1)) for joint in joints}
         return signs.get(channel, 0) * size
 
 
 @EFFECTS.register("effort_delay")
 class _EffortDelay(_LateTorque):
-    """Delay of a joint's torque: the torque that acts at time t was recorded at t - delay.
+    """Delay of an arm's torques: the torque that acts at time t was recorded at t - delay.
 
-    At a prescribed arm, the effort recorded at t belongs to the motion at t + delay; negative: it is recorded late.
+    At prescribed joints, the effort recorded at t belongs to the motion at t + delay (negative if recorded late).
     """
 
     equation = "the torque that acts at t was recorded at t - delay"
@@ -264,7 +264,7 @@ class _EffortLag(_LateTorque):
 
 
 class _ServoChange(EffectBase):
-    """A position servo that differs from its data sheet."""
+    """The base class of differences between a position servo and its nominal model."""
 
     required_excitation = "how hard it accelerates"
     required_sensors = frozenset({"joints.position"})
@@ -280,7 +280,7 @@ class _ServoChange(EffectBase):
 
 @EFFECTS.register("servo_gain")
 class _ServoGain(_ServoChange):
-    """Scale factor on a servo's requested torque, for a gain, supply voltage or motor other than in the model."""
+    """Scale factor on a servo's gain and, for an ideal motor, on its damping. Gain, voltage or motor are different."""
 
     equation = "demand = scale (gain (u - q) - damping v)"
     declared_parameters = (
@@ -359,7 +359,7 @@ class _ServoDelay(_ServoChange):
 class _ServoSaturation(_ServoChange):
     """Additional smooth torque limit of a servo, with torque = demand / (1 + |demand/limit|^16)^(1/16).
 
-    The internal parameter is limit^-16, added to the model's own; at zero (no limit) its derivative is nonzero.
+    The internal parameter, limit^-16, is added to that of the model. Zero means no further limit.
     """
 
     equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"

@@ -36,8 +36,8 @@ class ParameterDefinition:
     prior_range: tuple[float, float]  # range (low, high) that an engineer would expect
     description: str
     is_shape_parameter: bool = False  # without influence while amplitudes are neutral (a relaxation time)
-    # `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or for a factor that
-    # is infinite where its sign changes; p in value = reported value^-p
+    # name and unit, such as `stiffness N m/rad`, of the reciprocal that reports show instead of the value, if any; p in
+    # value = reported value^-p
     reported_reciprocal: str = ""
     reciprocal_power: int = 1
     # factor on bounds and range at a location; 1 if absent
@@ -106,7 +106,7 @@ class EffectBase(Effect):
 
     @property
     def max_abs_initial_internal_coordinates(self) -> Mapping[str, float]:
-        """The largest absolute initial value of each internal coordinate whose initial value is estimated."""
+        """The bound on the absolute initial value of each internal coordinate whose initial value is estimated."""
         return {}
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
@@ -138,7 +138,7 @@ class EffectBase(Effect):
 
     @property
     def sticking_speed(self) -> float:
-        """The joint speed below which this friction can hold the joint against any torque up to the friction limit."""
+        """The joint speed [rad/s] below which this friction can hold the joint. It is 0 if it cannot hold a joint."""
         return 0.0
 
     @property
@@ -183,13 +183,13 @@ def make_effect_unchecked(kind: str, location: str, system: System, values: Mapp
     for name, value in values.items():
         if name not in names:
             said = unknown_name_error_arguments(name, names)
-            raise ConfigError(f"the effect {kind} has no quantity '{name}'", where=label, **said)
+            raise ConfigError(f"the effect {kind} has no parameter '{name}'", where=label, **said)
         definition = names[name]
         if name != definition.name:
             signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]
             if not (value > 0 or (signed and value < 0)):
-                allowed = f"{'a number other than zero' if signed else 'a positive number'} {unit}"
-                raise ConfigError(f"{name} = {value}", where=label, allowed=allowed)
+                allowed = f"{'a number other than zero' if signed else 'a positive number'} [{unit}]"
+                raise ConfigError(f"{name} = {value} is not possible", where=label, allowed=allowed)
             value = definition.internal_from_reported_value(value)
         given[definition.name] = float(value)
     entries = (
@@ -236,7 +236,7 @@ def grasp_names(system: System) -> tuple[str, ...]:
 
 
 def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
-    """Return the joint names of each arm. Arms are named by grasp, else joint prefix (left, right), else `gripper`."""
+    """Return the joint names of each arm. An arm is named after its grasp, else `left` or `right`, else `gripper`."""
     joints, tree = arm_joint_names(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
@@ -274,7 +274,7 @@ def effort_limit_ratio_to_baxter(system: System, joint: str) -> float:
 
 
 def frame_names_at_arm_link_ends(system: System) -> tuple[str, ...]:
-    """Return the names of frames at the ends of the arm links, without fixed or coincident points."""
+    """Return the names of frames at the ends of the arm links, without fixed frames and without coincident ones."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
     if not own:
@@ -342,7 +342,7 @@ def elastic_joints_of_segment(system: System, segment: str) -> tuple[ElasticJoin
 def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
-    """Define a joint parameter that is neutral at zero. `upper` and `expected` are scaled by the effort limit."""
+    """Define a joint parameter that is neutral at 0. `effort_limit_ratio_to_baxter` scales `upper` and `expected`."""
     prior, scale = (0.0, expected), effort_limit_ratio_to_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
@@ -365,7 +365,7 @@ def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.S
 def system_with_changed_bodies(
     system: System, joints: Collection[str], change: Callable[[tuple[Inertia, ...]], Iterable[Inertia]]
 ) -> System:
-    """Return the system after `change` is applied to the rigid bodies of the named joints."""
+    """Return a copy of the system in which `change` was applied to the rigid bodies of the named joints."""
     tree = system.mechanism
     changed = tuple(replace(j, bodies=tuple(change(j.bodies))) if j.name in joints else j for j in tree.joints)
     return replace(system, mechanism=replace(tree, joints=changed))

@@ -35,7 +35,7 @@ class _CarriedBody(NamedTuple):
 
 
 def _carried_body(system: System, joint: int) -> _CarriedBody:
-    """Nominal mass properties of one joint's child bodies in its frame; zero mass at its origin without bodies."""
+    """Nominal mass properties of the bodies on a joint's moving side, in its frame. Without bodies the mass is zero."""
     whole = merge_bodies([replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies])
     if whole is None:
         return _CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
@@ -162,7 +162,7 @@ class Payload(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Define mass and first moments of the payload. The mass is at least -`_MAX_REMOVED_MASS_FRACTION` x link's."""
+        """Define the payload's mass and moments. It removes at most `_MAX_REMOVED_MASS_FRACTION` of the link's mass."""
         upper, expected = _bearable(system, location)
         lower = -_MAX_REMOVED_MASS_FRACTION * _carried_body(system, system.mechanism.frame(location).joint_index).mass
         far, near = (_MAX_PAYLOAD_DISTANCE * mass for mass in (upper, expected))
@@ -183,7 +183,7 @@ class Payload(EffectBase):
     def parameters_as_reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
-        """Return the mass and limited first moments for reports. Moments at their limit have no standard deviation."""
+        """Return the mass and the limited first moments for reports. Moments at their limit have the std NaN."""
         found = super().parameters_as_reported(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
@@ -229,7 +229,7 @@ def _spread(mass: ca.SX, first: ca.SX, link: _CarriedBody) -> ca.SX:
 
 
 def _bearable(system: System, frame: str) -> tuple[float, float]:
-    """Upper bound and expected maximum of a mass at a frame [kg]."""
+    """Upper bound, and largest expected value, of an added mass at a frame [kg]."""
     tree = system.mechanism
     joint = tree.frame(frame).joint_index
     if base.segment_name_of_frame(system, frame) is not None:

@@ -16,7 +16,7 @@ from yid_ocp.model.system import Effect, EffectStepTerms, MidpointStateSymbols, 
 SIGN_SMOOTHING_SPEED = 0.02
 """v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
 TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED = 1e-3
-"""v_s of joints driven by torques, which would creep by mm before they break loose with a larger one [rad/s]."""
+"""v_s of joints driven by torques [rad/s]. With a larger v_s they would creep by mm before they break loose."""
 _LOAD_SIGN_SMOOTHING_SPEED = 0.005  # for load-dependent friction, which must hold its load at rest [rad/s]
 _SMOOTHING_TORQUE = 1e-3  # smoothing range of |torque| [N m]
 _ABS_SMOOTHING_ANGLE = 1e-7  # smoothing range of |d| in Dahl's law, angle per step [rad]
@@ -45,7 +45,7 @@ class _JointFriction(EffectBase):
 
     @property
     def sticking_speed(self) -> float:
-        """Three times v_s, where tanh(v/v_s) is 0.995."""
+        """The speed 3 v_s [rad/s], at which tanh(v/v_s) is 0.995."""
         return 3 * self.sign_smoothing_speed
 
     def _sign(self, v: ca.SX) -> ca.SX:
@@ -62,14 +62,14 @@ class _JointFriction(EffectBase):
 
 
 def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
-    """Set the smoothing speed [rad/s] of a joint friction. Other effects, or all without `speed`, are unchanged."""
+    """Return a joint friction with the smoothing speed v_s = `speed` [rad/s]. Other effects are returned unchanged."""
     if speed is None or not isinstance(effect, _JointFriction):
         return effect
     return replace(effect, sign_smoothing_speed=speed)
 
 
 def effect_as_sharp_as_nominal_friction(effect: EffectBase, system: System) -> EffectBase:
-    """Return the effect; as a joint friction, it gets the lowest smoothing speed of the frictions at its joint."""
+    """Return a joint friction with the lowest smoothing speed of all at its joint. Other effects are unchanged."""
     if not isinstance(effect, _JointFriction):
         return effect
     known = (own for own in system.effects if isinstance(own, _JointFriction) and own.location == effect.location)

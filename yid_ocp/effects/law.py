@@ -22,7 +22,7 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import EffectStepTerms, MidpointStateSymbols, System
 
 TorqueLawQuantitiesName = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
-"""Quantities on which a law's torque depends: one, or two with a sum of functions."""
+"""Quantities on which a law's torque depends: one, or two. The torque is a sum of one function of each."""
 TORQUE_LAW_QUANTITY_UNITS: Mapping[str, str] = {
     "angle": "rad",
     "speed": "rad/s",
@@ -203,9 +203,9 @@ def torque_law_argument_along_rollout(
 def torque_law_from_tables(
     location: str, system: System, tables: Sequence[TorqueLawTable], torque_scale: float = math.inf
 ) -> TorqueLaw:
-    """Create a law at a joint or segment from its tables. `torque_scale` is the expected size of its torque [N m].
+    """Create a torque law at a joint or segment from one table for each quantity on which its torque depends.
 
-    Raises `ConfigError` if the location allows no law, or no law of these quantities.
+    The prior range of knot torques is ±`torque_scale` [N m]. Raises `ConfigError` if the location allows no such law.
     """
     label, possible = f"law@{location}", allowed_torque_law_quantity_names(system, location)
     if not possible:
@@ -228,7 +228,7 @@ def torque_law_from_tables(
 
 
 def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> tuple[TorqueLawTable, ...]:
-    """Read a law's tables from a CSV file in the format of `torque_law_tables_csv`.
+    """Read a law's tables, one for each quantity in `depends_on`, from a CSV file as `torque_law_tables_csv` makes it.
 
     Raises `DataError` if the file is malformed, its knots are not evenly spaced and increasing, or its quantities
     differ from `depends_on`.
@@ -237,7 +237,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
     hint = "write it like the file law.csv of `diagnose`"
     lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]
     if not lines or tuple(word.strip() for word in lines[0]) != _TABLE_COLUMNS:
-        raise DataError("this is not a table of a law", where=f"{path}, line 1", allowed=allowed, hint=hint)
+        raise DataError("the file is not a table of a torque law", where=f"{path}, line 1", allowed=allowed, hint=hint)
     rows: dict[str, list[list[float]]] = {}
     for number, words in enumerate(lines[1:], 2):
         try:
@@ -258,7 +258,8 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
         knots, torque, std = np.array(rows[quantity]).T
         gaps = np.diff(knots)
         if len(knots) < 4 or np.any(gaps <= 0) or np.ptp(gaps) > _SPACING_RTOL * float(np.mean(gaps)):
-            what, hint = f"the knots of {quantity} are not a grid", "interpolate the table at evenly spaced values"
+            what = f"the values `at` of the quantity {quantity} are too few, or not increasing and evenly spaced"
+            hint = "interpolate the table at evenly spaced values"
             raise DataError(what, where=str(path), allowed="four or more evenly spaced, increasing numbers", hint=hint)
         tables.append(TorqueLawTable(quantity, knots, torque, std))
     return tuple(tables)

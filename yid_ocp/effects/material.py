@@ -29,7 +29,7 @@ def _bending_stiffness(system: System, segment: str) -> float:
 
 
 class _SegmentEffect(EffectBase):
-    """An effect on every elastic joint of a segment."""
+    """The base class of effects on every elastic joint of a segment."""
 
     possible_locations = base.flexible_segment_names
 
@@ -39,7 +39,7 @@ class _SegmentEffect(EffectBase):
 
 
 class _SegmentMemory(_SegmentEffect):
-    """An effect with an internal coordinate for every elastic joint of a segment."""
+    """The base class of effects with one internal coordinate for every elastic joint of a segment."""
 
     required_excitation = "how long it is held"
 
@@ -49,7 +49,7 @@ class _SegmentMemory(_SegmentEffect):
 
 
 class _SpringChange(_SegmentEffect):
-    """An effect that changes the springs of a segment."""
+    """The base class of effects that change the springs of a segment."""
 
     required_excitation = "how far it bends"
 

@@ -40,7 +40,7 @@ def _branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
 
 
 class _JointInsertion(EffectBase):
-    """A massless two-axis rotational spring, relaxing in `_SPRING_RELAXATION_TIME`, at a rigid connection."""
+    """The base class of massless two-axis springs at rigid connections. They relax in `_SPRING_RELAXATION_TIME`."""
 
     required_excitation = "how hard it pulls at its ends"
     declared_parameters = (
@@ -102,7 +102,7 @@ class _JunctionCompliance(_JointInsertion):
 
 
 class _GraspChange(EffectBase):
-    """An effect that changes one grasp."""
+    """The base class of effects that change one grasp."""
 
     required_excitation = "how hard it pulls at its ends"
     possible_locations = base.grasp_names
@@ -166,7 +166,7 @@ class _GraspSlip(_GraspChange):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """The slipped distance `offset` along the tube."""
+        """The name `offset` of the slipped distance along the tube [m]."""
         return ("offset",)
 
     def _changes(self, grasp: Grasp) -> dict[str, Any]:

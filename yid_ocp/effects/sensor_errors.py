@@ -28,7 +28,7 @@ def _clock(system: System) -> tuple[str, ...]:
 
 
 class _CameraEffect(EffectBase):
-    """An error of the points that cameras see. Other sensors' readings are unchanged."""
+    """The base class of errors of points that cameras see. Readings of other sensors are unchanged."""
 
     required_excitation = "the camera's pose"
     required_sensors = frozenset({"camera"})
@@ -56,7 +56,7 @@ class _CameraTranslation(_CameraEffect):
 
 @EFFECTS.register("camera_rotation")
 class _CameraRotation(_CameraEffect):
-    """Seen points rotated about the camera's origin by Rz(rz) Ry(ry) Rx(rx) in world axes."""
+    """Rotation of the seen points about the camera's origin by Rz(rz) Ry(ry) Rx(rx), in world axes."""
 
     equation = "seen point = c + R (true - c)"
     declared_parameters = tuple(
@@ -70,7 +70,7 @@ class _CameraRotation(_CameraEffect):
 
 @EFFECTS.register("camera_scale")
 class _CameraScale(_CameraEffect):
-    """Depth error: the vector from the camera to the seen point is scaled, so that its pixel does not change."""
+    """Depth error: the vector from the camera to a point is scaled. The pixel of the point does not change."""
 
     equation = "seen point = c + scale (true - c)"
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "seen over true depth"),)
@@ -147,7 +147,7 @@ def _mounted(system: System) -> tuple[str, ...]:
 
 
 class _MountedSensorEffect(EffectBase):
-    """An error of a wrist sensor or an inertial unit, with the location `wrist:FRAME` or `imu:FRAME`."""
+    """The base class of errors of a wrist sensor or an inertial unit, at the location `wrist:FRAME` or `imu:FRAME`."""
 
     required_excitation = "its orientation to gravity"
     is_at_recorded_sensor = True
