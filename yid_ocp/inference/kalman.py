@@ -28,10 +28,10 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 @dataclass(frozen=True)
 class StateTransition:
-    """The linear transition of a filter's state in one step: s' = M (s, sum of parameter groups p_i), p' = f p."""
+    """The transition of a filter's state x = (s, p) in one step: s' = M (s, sum of the groups p_i of p), p' = f p."""
 
-    state_rows: Array  # M, shape (ns, ns + m)
-    decay: Array  # f, shape (nx - ns,), nx - ns = g m
+    state_rows: Array  # M, shape (ns, ns + m); s has ns entries and p has g groups of m parameters
+    decay: Array  # f, a factor for each parameter, shape (nx - ns,) = (g m,)
 
     @property
     def _shape(self) -> tuple[int, int]:
@@ -39,14 +39,14 @@ class StateTransition:
         return len(self.decay) // m if m else 0, m
 
     def propagate_state(self, columns: Array) -> Array:
-        """Propagate states over the step. Each column of the (nx, c) array is one state."""
+        """Return c states (nx, c) after the step, from the states `columns` (nx, c) before it."""
         ns, own = len(self.state_rows), columns[len(self.state_rows) :]
         if self._shape[0] != 1:
             columns = np.vstack([columns[:ns], own.reshape(*self._shape, own.shape[1]).sum(axis=0)])
         return np.vstack([self.state_rows @ columns, self.decay[:, None] * own])
 
     def _propagate_costate_back(self, costate: Array) -> Array:
-        """Costates (nx, c) before the step, from those after it, by the transposed map."""
+        """Costates (nx, c) before the step, from the costates (nx, c) after the step, by the transposed transition."""
         ns = len(self.state_rows)
         earlier = self.state_rows.T @ costate[:ns]
         apart = np.tile(earlier[ns:], (self._shape[0], 1)) + self.decay[:, None] * costate[ns:]
@@ -76,8 +76,8 @@ class KalmanStepMatrices:
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array]:
         """Compute smoothed measurement noise (r, c) and the costate (nx, c) before the step, backwards in time.
 
-        `white` are the normalized innovations and `costate` is the costate after the step. The smoothed state is the
-        filter's prediction + P costate, with the covariance P.
+        `white` (r, c) are the normalized innovations and `costate` (nx, c) is the costate after the step. The smoothed
+        state before the step is mean + P costate, with the filter's prediction (mean) and its covariance P.
         """
         pulled = self.transition._propagate_costate_back(costate)
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
@@ -121,9 +121,9 @@ def _library() -> ctypes.CDLL | None:
 
 @dataclass(frozen=True)
 class FixedGainKalmanFilter:
-    """A sequence of steps of a linear Kalman filter with fixed gains, in compiled code if possible.
+    """A sequence of k steps of a linear Kalman filter with fixed gains, in compiled code if possible.
 
-    The matrices of `KalmanStepMatrices` are stacked; the rows of step j begin at `row_start[j]`.
+    The r rows of the matrices of all steps (see `KalmanStepMatrices`) are stacked. Step j begins at row `row_start[j]`.
     """
 
     row_start: Sequence[int]
@@ -158,8 +158,8 @@ class FixedGainKalmanFilter:
         """Filter all steps, and return the normalized innovations (r, c) and the final state means (nx, c).
 
         With `keep_means`, the means before each step (k, nx, c) are returned too. `mean` is the mean before all steps,
-        `measured` (r, c) the measurements. `push` (k, m, c) is added to the parameters during a step's transition.
-        `shift` (k, nx - ns) is added to the parameters of the first column after the step.
+        `measured` (r, c) the measurements. `push` (k, m, c) is added to the sum of the parameter groups in the
+        transition of each step. `shift` (k, nx - ns) is added to the parameters of the first column after each step.
         """
         if (library := _library()) is not None:
             seen = np.empty((len(self.moves), *mean.shape)) if keep_means else None
@@ -175,9 +175,10 @@ class FixedGainKalmanFilter:
         return white, mean, np.array(before) if keep_means else None
 
     def smoothed_measurement_noise_and_costate(self, white: Array, costate: Array) -> tuple[Array, Array, Array]:
-        """Smooth all steps; return the noise (r, c), first costates (nx, c), and costates after each step (k, nx, c).
+        """Smooth all steps backwards in time. `costate` (nx, c) is the costate after the last step.
 
-        `white` are the normalized innovations, `costate` is the costate after the last step.
+        Returns the smoothed measurement noise (r, c), the costate before the first step (nx, c) and the costates after
+        each step (k, nx, c). `white` (r, c) are the normalized innovations.
         """
         seen = np.empty((len(self.moves), *costate.shape))
         if (library := _library()) is not None:
@@ -191,7 +192,7 @@ class FixedGainKalmanFilter:
     def _compiled_columns(
         self, library: ctypes.CDLL, rows: Array, state: Array, seen: Array | None, *inputs: Array | None
     ) -> tuple[Array, Array]:
-        """Rows and state after the recursion of the mean, with the inputs push and shift, or of the costate."""
+        """Rows and state after the compiled recursion of the mean (with `inputs` push and shift) or of the costate."""
         rows, state = rows.copy(), state.copy()
         size = np.array([*self.moves.shape, len(state), self.moves.shape[2] - self.noises], np.int32)
         steps: list[NDArray[Any] | None] = [size, np.array(self.row_start, np.int32), self.moves, self.decay, None]
@@ -204,7 +205,7 @@ class FixedGainKalmanFilter:
 
 
 def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_void_p]:
-    """A struct of the addresses of contiguous arrays, which the caller keeps alive; None is a null pointer."""
+    """A C struct of the addresses of contiguous arrays. The caller keeps the arrays alive. None is a null pointer."""
     return (ctypes.c_void_p * len(arrays))(*(None if array is None else array.ctypes.data for array in arrays))
 
 
@@ -217,10 +218,10 @@ def kalman_steps_and_covariance(
     decay: Array,
     variance: Array,
 ) -> tuple[FixedGainKalmanFilter, Array]:
-    """Compute k successive steps of a Kalman filter. Returns them and the state covariance (nx, nx) after the last.
+    """Compute k successive steps of a Kalman filter. Returns the steps and the state covariance (nx, nx) after them.
 
-    The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states.
-    `variance` (k, nx - ns) is the process noise of the parameters. Other arguments are as in `FixedGainKalmanFilter`.
+    The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states. After
+    each step, `variance` (k, nx - ns) adds to the parameters' variance. Other arguments: see `FixedGainKalmanFilter`.
     """
     count, library, covariance = np.diff(row_start), _library(), covariance.copy()
     white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)

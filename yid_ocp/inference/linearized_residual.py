@@ -23,7 +23,7 @@ from yid_ocp.problem.model_functions import ModelFunctions, NodeStateValues
 
 @dataclass(frozen=True)
 class NominalTrajectory:
-    """The trajectory of a recording about which the residual is linearized, with the measurements.
+    """The simulated trajectory of a recording about which its residual is linearized, with the measurements.
 
     Measurements are shifted by their delays to the times at which they were true. `initial_state_by_angles` and
     `initial_state_by_torque` (nx, nu) are derivatives of the initial state with respect to the driven joints' first
@@ -59,7 +59,7 @@ def nominal_trajectory_from_prediction(
 class ResidualDerivativesByStateAndEffort:
     """The derivatives of r residuals with respect to the states and efforts at the nodes around each sample.
 
-    Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
+    Residuals are in units of sensor noise. Each is interpolated between two nodes, and depends on two or four nodes.
     """
 
     node: IntArray  # first of each row's nodes, shape (r,)
@@ -89,8 +89,8 @@ class ResidualDerivativesByStateAndEffort:
             used = samples.evaluation_nodes
             if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
-                message = f"'{name}' measures velocities, accelerations or constraint forces"
-                allowed = "sensors of positions, while effort noise drives the arms"
+                message = f"sensor '{name}' measures velocities, accelerations or constraint forces"
+                allowed = "only sensors of positions, while recorded torques with noise drive the arms"
                 hint = f"set sensors.{name}.use: false, or model.arms.mode: prescribed"
                 raise DataError(message, where=f"sensors.{name}", allowed=allowed, hint=hint)
             # derivatives of each reading by the states and efforts of the previous node, its own and the next
@@ -134,7 +134,7 @@ class ResidualDerivativesByStateAndEffort:
         return ResidualDerivativesByStateAndEffort(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Compute residual derivatives (r, d) along d directions from derivatives of states and efforts at K nodes.
+        """Compute the residuals' derivatives (r, d) along d directions, from those of states and efforts at K nodes.
 
         `by_node` (K, nx, d) holds the derivatives of the states, `effort` (K, nc, d) the derivatives of the efforts.
         The K nodes begin with node `first`. A residual beyond them uses the last node.
@@ -149,7 +149,7 @@ class ResidualDerivativesByStateAndEffort:
         return found
 
     def residual_indices_by_first_node(self, last: int) -> list[IntArray]:
-        """Group the residual indices by their first node, with one array for each node from 0 to `last`."""
+        """Group the residual indices by first node. The result has one array for each node from 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
@@ -172,7 +172,7 @@ def residual_and_jacobian_without_weak_priors(
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
-    """Find the d in [lower, upper] that minimises |J d + r|^2 + mu c |d|^2. c is J's largest squared column norm."""
+    """Return d in [lower, upper] that minimises |J d + r|^2 + mu c |d|^2; c is the largest squared column norm of J."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
     small = np.zeros((count + 1, count + 1))
@@ -204,7 +204,7 @@ def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evalua
 
 
 def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
-    """Predict the largest cost reduction if no unknown moves by more than its size. Infinite without a Jacobian."""
+    """Predict the cost reduction by a nearly undamped `size_limited_damped_step`. It is infinite without a Jacobian."""
     if evaluation.jacobian is None:
         return math.inf
     if not len(x):
@@ -216,7 +216,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def size_limited_damped_step(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Compute the damped least-squares step (nx,), per unknown at most the larger of its value and its typical size."""
+    """Return the damped least-squares step d (nx,) within the bounds, with |d_i| <= max(|x_i|, typical size of x_i)."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
@@ -230,6 +230,6 @@ def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Arra
 
 
 def step_norm_in_stds(evaluation: Evaluation | None, moved: Array) -> float:
-    """Compute the norm |J d| of a step d (nx,), which bounds all |d_i| / std_i. It is infinite without a Jacobian."""
+    """Return the norm |J d| of a step d (nx,), an upper bound on all |d_i|/std_i. It is infinite without a Jacobian."""
     slopes = evaluation.jacobian if evaluation is not None and evaluation.ok else None
     return math.inf if slopes is None else float(np.linalg.norm(slopes @ moved))

@@ -60,7 +60,7 @@ class AssumedChannelNoiseLevel:
 
 @dataclass(frozen=True)
 class _ResidualWindow:
-    """Test of one channel in a time window [s]; flagged if its r'r is significant."""
+    """Test of one channel in a time window [s]. It is flagged if noise alone does not explain r'r in the window."""
 
     recording: str
     channel: str
@@ -112,10 +112,10 @@ def residual_chi2_null_test(
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
-    """Test whether a whitened residual (nr,) is only noise after a fit with `parameters` parameters.
+    """Test whether a whitened residual (nr,) is only noise after a fit of `parameters` parameters.
 
-    Rows that belong to no series (priors) are ignored, and so are parameters that their priors determine. `level` is
-    the false-discovery rate over time windows of length `window` [s].
+    Rows that belong to no channel in `series` (priors) are ignored. `parameters` does not count what priors determine.
+    `level` is the false-discovery rate over time windows of length `window` [s].
     """
     count = sum(len(s.residual_indices) for s in series)
     degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)
@@ -131,9 +131,9 @@ def residual_chi2_null_test(
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Whiten r (nr,), the argument `residual` of covariance I, for further independent errors: (I + F F')^(-1/2) r.
+    """Return (I + F F')^(-1/2) r, which whitens the residual r of covariance I for k further, independent errors.
 
-    Column j of F (nr, k), the argument `spread`, is the change of the residual for one standard deviation of error j.
+    r (nr,) is `residual`. F (nr, k) is `spread`; its column j is the change of r by one standard deviation of error j.
     Columns that are not finite are ignored.
     """
     columns, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
@@ -143,11 +143,11 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
 def encoder_noise_residual_covariance_factor(
     problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
 ) -> Array:
-    """Compute a factor F (nr, K) of the covariance F F' that encoder noise of prescribed arms adds to residuals.
+    """Compute a factor F (nr, K) of the covariance F F' that encoder noise of prescribed arms adds to the residual.
 
-    F F' is the covariance that this noise adds. A lightly damped object rings with it, which is neither white nor an
-    error of the model. `predicted` returns the residual of a problem with redrawn episodes, None where it fails; by
-    default that at the unknowns `x`. K is 0 where no prescribed joints move an object.
+    This noise makes a lightly damped object vibrate, which is neither white noise nor a model error. `predicted`
+    returns the residual of a problem, here with redrawn noise, or None if it fails; default: the residual at `x`. K is
+    0 if no prescribed joint moves an object, or no points are measured.
     """
 
     def evaluated(own: EstimationProblem) -> Array | None:
@@ -170,7 +170,7 @@ def encoder_noise_residual_covariance_factor(
 
 
 def episodes_with_added_path_noise(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
-    """Return recordings whose measured motion has one more random draw of encoder noise. Measurements stay."""
+    """Return the recordings with one more random draw of encoder noise in the prescribed motion, not in sensor data."""
     return [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
 
 
@@ -227,7 +227,7 @@ def _windows(
 
 
 def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """Mark the p-values that are significant at the false-discovery rate `level` among `tries` tests.
+    """Return which of the p-values are significant at the false-discovery rate `level` among `tries` tests.
 
     `p_values` may omit tests with large p-values. Benjamini and Hochberg (1995),
     doi:10.1111/j.2517-6161.1995.tb02031.x.

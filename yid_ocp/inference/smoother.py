@@ -73,15 +73,15 @@ class SmoothedUnknownsResult:
 
     smoothed_unknowns: tuple[SmoothedDisturbances, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # variance at the largest evidence [squared reference]
-    log_evidence_drop: dict[SmoothedUnknownGroup, float]  # fall of the log evidence without the group
+    log_evidence_drop: dict[SmoothedUnknownGroup, float]  # how much lower the log evidence is without the group
     detectable_std: dict[SmoothedUnknownGroup, float]  # smallest detectable size by the model alone [reference]
     chi2_before: float  # r'r after a refit of the free parameters, without (`after`: with) the unknowns
     chi2_after: float
     dof_before: float  # measurements minus the degrees of freedom of parameters (and unknowns)
     dof_after: float
-    # log evidence of forces and offsets ("plant"), biases ("sensor") and "both", relative to neither ("none", 0)
+    # log evidence with forces and offsets ("plant"), biases ("sensor") or "both", minus that with neither ("none")
     log_evidence: dict[str, float]
-    min_log_bayes_factor: float = DEFAULT_MIN_LOG_BAYES_FACTOR  # smallest significant rise
+    min_log_bayes_factor: float = DEFAULT_MIN_LOG_BAYES_FACTOR  # smallest significant rise of the log evidence
     # groups that could replace each selected group almost as well
     alternative_groups: Mapping[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]] = field(default_factory=dict)
 
@@ -105,7 +105,7 @@ class SmoothedUnknownsResult:
 
 
 class _Update(NamedTuple):
-    """One interval of the filter for the backward pass: prediction `mean`, covariance `p` and innovations."""
+    """One interval of the filter, kept for the backward pass: prediction `mean`, covariance `p` and innovations."""
 
     step: KalmanStepMatrices
     mean: Array
@@ -125,7 +125,7 @@ class _Filtered:
 
     @cached_property
     def error_steps(self) -> Sequence[tuple[Array, Array, Array, StateTransition]]:
-        """Of each interval: whitened observation; that of states and unknowns with variance, their gain and motion."""
+        """For each interval: whitened observation; its columns of nonzero variance, with their gain and transition."""
         found, ns = [], len(self.model.initial_state_std)
         kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(self.updates[0].p)[ns:] > 0)])
         for step in (update.step for update in self.updates):
@@ -202,7 +202,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
 
 @dataclass(frozen=True)
 class _State:
-    """All recordings at given variances, with the `shift` of the scaled free parameters and its covariance `spread`."""
+    """Result for all recordings at given variances: also `shift` of the scaled free parameters, covariance `spread`."""
 
     filtered: tuple[_Filtered, ...]
     recordings: tuple[_Smoothed, ...]
@@ -213,14 +213,14 @@ class _State:
     larger: dict[SmoothedUnknownGroup, tuple[float, float]] = field(default_factory=dict)
 
     def largest_evidences(self, sources: _Groups) -> list[tuple[float, float]]:
-        """`_largest_evidence` of several groups, each on top of these variances."""
+        """Result of `_largest_evidence` for each of several groups, added alone to the groups of these variances."""
         new = [source for source in sources if source not in self.larger]
         self.larger.update(zip(new, map_in_threads(partial(_largest_evidence, self.filtered), new), strict=True))
         return [self.larger[source] for source in sources]
 
 
 def _run(models: _Models, variance: _Variances) -> _State:
-    """Smooth all recordings at given variances; without smoothed unknowns if the filter is ill-conditioned."""
+    """Smooth all recordings at given variances. `recordings` is incomplete if a filter is ill-conditioned."""
 
     def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
         done = _forwards(model, model.prior_variances_of_unknowns(variance), True)
@@ -245,7 +245,7 @@ def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tupl
 
 
 def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
-    """|score|^2 of every group's unknowns and its expectation, for any variance."""
+    """For every group, |score|^2 of its unknowns and the expectation of this number (also for variance zero)."""
     found: dict[SmoothedUnknownGroup, tuple[float, float]] = {}
     for model, done in zip(models, state.recordings, strict=True):
         by_theta = done.score[:, :, 1:]
@@ -273,7 +273,7 @@ def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]
 def _selected(
     models: _Models, sources: _Groups, variance: _Variances, state: _State, least: float
 ) -> tuple[_Variances, _State]:
-    """Add the group that raises the evidence most, repeatedly, while the rise exceeds chance."""
+    """Repeatedly add the group that raises the log evidence most, while the rise is more than `least`."""
     while sum(v > 0 for v in variance.values()) < _MAX_GROUPS:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
@@ -291,7 +291,7 @@ def _selected(
 
 
 def _responses(base: _Filtered, chosen: IntArray) -> Array:
-    """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, J u)."""
+    """Innovations caused by disturbances of unit variance of the u chosen unknowns, (rows of all intervals, J u)."""
     model, updates = base.model, base.updates
     ns, count, u, first = len(model.initial_state_std), len(updates), len(chosen), 0
     # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown;
@@ -342,7 +342,7 @@ def select_and_smooth_unknowns(
 ) -> SmoothedUnknownsResult:
     """Select groups of unknown forces, offsets and biases that raise the log evidence at a fit `x`, and estimate them.
 
-    `least` is the smallest rise of the log evidence for which a group is selected (5: odds of 150 to 1).
+    A group is selected if the log evidence rises by more than `least` (5: odds of 150 to 1).
     """
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
@@ -373,7 +373,7 @@ def select_and_smooth_unknowns(
 def smooth_unknowns_about_fit(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float
 ) -> SmoothedUnknownsResult:
-    """Do `select_and_smooth_unknowns` with torque noise among the unknowns and without constant sensor errors."""
+    """Run `select_and_smooth_unknowns` with torque noise in the unknown forces, and constant sensor errors removed."""
     if problem.has_process_noise:
         problem = problem_with_sensor_noise_only(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
@@ -390,7 +390,7 @@ def smooth_unknowns_about_fit(
 def force_log_likelihood_coefficients(
     model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
-    """Return g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2 of one unknown with values f in J intervals.
+    """Return g (J,) and L (J, J) in the log likelihood g'f - f'L f / 2 of an unknown with values f (J,) in J intervals.
 
     `unknown` is the index of the unknown; f is in units of the unknown's reference standard deviation. Free parameters,
     states and all other unknowns are integrated out; `variance` gives the variances of their groups [squared
@@ -416,7 +416,7 @@ def force_log_likelihood_coefficients(
 
 
 def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedDisturbances:
-    """The unknowns of one recording, with the free parameters' own uncertainty."""
+    """The unknowns of one recording. Their standard deviations include the uncertainty of the free parameters."""
     smoothed, by_theta = done.mean[:, :, 0] - done.mean[:, :, 1:] @ state.shift, done.mean[:, :, 1:]
     spread = np.sqrt(np.maximum(done.covariance + np.sum((by_theta @ state.spread) * by_theta, axis=2), 0.0))
     named = model.unknown_names, model.unknown_groups, model.reference_std
@@ -442,7 +442,7 @@ def _explained(models: _Models, variance: _Variances, plain: _State, state: _Sta
 def _alternatives(
     models: _Models, variance: _Variances, nothing: _State, state: _State, least: float
 ) -> tuple[_Variances, dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
-    """Fall of the log evidence without each group, and the groups that could replace it; `nothing` has no group."""
+    """Fall of the log evidence without each selected group, and groups that could replace it. `nothing` has none."""
     drop, found = dict.fromkeys(variance, 0.0), {}
     for source in [s for s, v in variance.items() if v]:
         less = variance | {source: 0.0}
@@ -473,7 +473,7 @@ class GapLocation:
 
 
 def select_largest_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
-    """Select the first three locations with more than 10 % of the gap, or only the first location if there are none."""
+    """Return the first three locations in `where` with more than 10 % of the gap. If none has, return the first one."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
 
@@ -482,9 +482,9 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 
 
 def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tuple[GapLocation, ...]:
-    """Rank all locations by their share of the log evidence. At equal shares, observable locations come first.
+    """Return all locations in order of their share of the log evidence. At equal shares, observable ones come first.
 
-    The time windows of a location are those in which one of its unknowns is over three standard deviations from zero.
+    In the time windows of a location, one of its unknowns is more than three standard deviations from zero.
     """
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
@@ -504,7 +504,7 @@ def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tupl
 
 
 def smoothed_unknown_significance_mask(trace: SmoothedDisturbances, columns: Sequence[int]) -> BoolArray:
-    """Return a mask (J, columns) of the unknowns in `trace` over `SIGNIFICANT_Z` standard deviations from zero."""
+    """Return a mask (J, len(columns)): which unknowns are more than `SIGNIFICANT_Z` standard deviations from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > SIGNIFICANT_Z * std)
 
@@ -537,11 +537,11 @@ def gap_locations_from_effects_and_smoother(
     rest: Sequence[GapLocation],
     windows: tuple[tuple[float, float], ...],
 ) -> tuple[GapLocation, ...]:
-    """Assign the part of the gap that effects close to their locations, and the rest by the smoother's shares.
+    """Return the locations of the gap, in order of their shares, from accepted effects and the smoother.
 
-    `before` holds the locations found for the nominal model, `rest` those for the model with the effects. `closed` is
-    the part of the gap that the effects at each location close. `windows` are the time windows of locations at which
-    the smoother has no unknown (`world`, `clock`).
+    A location has the part of the gap that its effects close (`closed`, a fraction by location), plus its part of the
+    rest of the gap according to the smoother. `before` are the smoother's locations for the nominal model, `rest` those
+    for the model with the effects. `windows` are for locations without smoother unknowns (`world`, `clock`).
     """
     known = {place.location: place for place in before}
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
@@ -563,10 +563,10 @@ def gap_locations_from_effects_and_smoother(
 def z_scores_of_smoothed_unknowns(
     smoothed: SmoothedUnknownsResult, recording: int = 0
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Compute the z scores (J, nd) of nd smoothed unknowns in J intervals, posterior mean over standard deviation.
+    """Return the interval edges (J + 1,) [s], the names of nd smoothed unknowns, and their z scores (J, nd).
 
-    The result is the interval edges (J + 1,) [s], the names of the unknowns, and the scores. A score is NaN if the data
-    reduced the variance of the unknown by half or less.
+    A z score is the posterior mean over the standard deviation in an interval. It is NaN if the data reduced the
+    variance of the unknown by half or less. `recording` is the index of a recording.
     """
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])

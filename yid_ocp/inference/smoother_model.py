@@ -76,7 +76,7 @@ class _LinearizedEpisode(NamedTuple):
 
 
 class _SmootherUnknowns(NamedTuple):
-    """Unknown forces at coordinates, offsets of constraints, pushes on segments, biases of (samples, column)."""
+    """Unknowns of a recording, in order: forces on coordinates, offsets of constraints, pushes on segments, biases."""
 
     names: tuple[str, ...]
     sources: tuple[SmoothedUnknownGroup, ...]
@@ -88,12 +88,12 @@ class _SmootherUnknowns(NamedTuple):
 
     @property
     def loading(self) -> int:
-        """Number of unknowns with the same contribution to every step."""
+        """Number of unknown forces and offsets, which contribute equally to every step."""
         return len(self.forced) + len(self.grasped)
 
     @property
     def driving(self) -> int:
-        """Number of unknowns that move the state."""
+        """Number of unknowns that move the state: forces, offsets and pushes."""
         return self.loading + 3 * len(self.pushed)
 
 
@@ -161,7 +161,7 @@ def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str
 
 
 def _loads(course: _LinearizedEpisode) -> Array:
-    """Typical load of every coordinate, from its spring, motor or prescribed effort, (n,) [N m or N]."""
+    """Root mean square load of every coordinate, from its spring, motor or prescribed effort, (n,) [N m or N]."""
     system, rollout = course.system, course.nominal.rollout
     load = np.zeros(system.n_coordinates)
     q = rollout.state[:, : system.n_coordinates]
@@ -206,7 +206,7 @@ def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segme
 
 @dataclass(frozen=True)
 class _IntervalModel:
-    """Linear model of one interval: residual, transition of its initial state, input of the unknowns."""
+    """Linear model of one interval: residual, transition of the state from start to end, and input of the unknowns."""
 
     # whitened residual, then its derivative by the free parameters, both with the opposite sign, shape (r, 1 + ntheta)
     negative_residual_jacobian: Array

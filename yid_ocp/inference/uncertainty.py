@@ -44,7 +44,7 @@ _MIN_PRIOR_SHARE = 0.5  # of the largest deviation from a prior [stds], from whi
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """The result of a null test that tells whether a model explains the recordings to which it was fitted."""
+    """The result of the null test of a fit: does the model explain the recordings to which it was fitted?"""
 
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
@@ -56,8 +56,8 @@ class GoodnessOfFit:
 class ParameterEstimate:
     """The estimate of one parameter, with value, standard deviation, bounds and verdict.
 
-    The 95 % `interval` is given if the standard deviation does not describe the uncertainty: at a bound, where it is
-    one-sided, and for a cost that is not quadratic, where it is a profile-likelihood interval. None is an open end.
+    The 95 % `interval` is given if `std` does not describe the uncertainty. At a bound, the interval is one-sided. If
+    the cost is not quadratic, it is a profile-likelihood interval. An end that is None is open.
     """
 
     value: float
@@ -112,8 +112,8 @@ def assess_goodness_of_fit(
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
     """Compute the covariance (nx, nx) of the unknowns from data and stated priors, and chi2 per degree of freedom.
 
-    A direction without information gets the std 1e8 x the unknown's scale. The covariance is scaled by max(1, chi2);
-    a prior counts at least with its stated std, also if stated ones were scaled down (`stated_std_factor` below 1).
+    A direction without information has the std 1e8 x the unknown's scale. The covariance is multiplied by max(1, chi2).
+    If `stated_std_factor` is below 1, priors count here at least with the std that was stated, before this factor.
     """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
@@ -125,7 +125,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 
 
 def noise_only_covariance_sqrt(problem: EstimationProblem, evaluation: Evaluation) -> Array:
-    """Compute a factor F (nx, nx) of the covariance F F' from noise alone. F F' loses digits in weak directions."""
+    """Compute F (nx, nx) of the unknowns' covariance F F' from noise alone. F is precise in weak directions, too."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
     _, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
@@ -157,10 +157,10 @@ def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
 def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluation, covariance: Array) -> Array:
     """Covariance widened for model misfit, at least as large as the block-wise sandwich estimate.
 
-    The sandwich is A^-1 S A^-1 (White 1982, doi:10.2307/1912526). S is the covariance of the scores J' r, summed over
-    clusters of rows (Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136): time blocks of one recording with all
-    channels, because a misfit is correlated in time and across channels; single channels of recordings, if there are
-    enough, for constant errors such as a sensor offset; and whole recordings. The largest result counts.
+    The sandwich is A^-1 S A^-1 with A = J'J (White 1982, doi:10.2307/1912526). S is the covariance of the scores J' r,
+    summed over clusters of rows (Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136): time blocks of all
+    channels of a recording, as a misfit is correlated in time and across channels; channels of recordings, for constant
+    errors such as an offset; and recordings. Kinds with too few clusters are omitted. The largest variance counts.
     """
     if evaluation.jacobian is None or not len(covariance):
         return covariance
@@ -182,9 +182,9 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
 def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tuple[Array, Array]]) -> Array:
     """Covariance (nx, nx) of the sum of scores J' r over independent clusters of rows (J, r).
 
-    A fit follows a cluster that alone informs a direction, so its residual is too small. The sums are therefore divided
-    by (1 - h)^(1/2), where h is the cluster's part of the information (Bell, McCaffrey 2002). For few clusters,
-    Student's t also widens the intervals.
+    A fit follows a cluster that alone determines a direction, so that the cluster's residual is too small. Its score is
+    therefore divided by (1 - h)^(1/2), where h is the cluster's part of the information (Bell, McCaffrey 2002). A
+    factor from Student's t accounts for few clusters.
     """
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
@@ -226,7 +226,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
 
 
 def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
-    """Compute the covariance (nx, nx) of unknowns at a fit, with the misfit if the model does not explain the data."""
+    """Return the covariance (nx, nx) of the unknowns, widened for misfit if the fit does not explain the data."""
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, evaluation)
     return covariance if fit.explains else _misfit_sandwich_covariance(problem, evaluation, covariance)
 
@@ -234,8 +234,8 @@ def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation,
 def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array) -> Array:
     """Standard deviation of each unknown, (nx,). Those of poorly determined parameters are checked against the cost.
 
-    If the cost at the end of the 95 % interval is lower than predicted, the standard deviation follows from a parabola
-    through this point. It is infinite if the cost does not rise.
+    If the cost rises to less than half of its prediction at an end of the 95 % interval, the standard deviation is that
+    of a parabola through this point. It is very large if the cost does not rise.
     """
     spread = _std_from_covariance(covariance, x)
     lower, upper = problem.bounds
@@ -263,7 +263,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
 
 
 def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
-    """List the unknowns that are parameters, not initial states. Local parameters include the recording's name."""
+    """Return the names of unknowns that are parameters, not initial states. Local ones include a recording's name."""
     parameters = {*problem.shared_parameters, *problem.local_parameters}
     return tuple(name for name in problem.unknown_names if name.split("[")[0] in parameters)
 
@@ -277,7 +277,7 @@ def _std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Convert correlations `matrix` (n, n) and standard deviations `std` to the covariance data of result.json.
+    """Return the covariance data of result.json: `matrix` (n, n), a covariance, rescaled to the deviations `std` (n,).
 
     Parameters whose standard deviation is not finite and positive are left out.
     """
@@ -288,7 +288,7 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
 
 
 def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
-    """Compute the cost of the data (in noise units) and of the stated priors, without weak priors."""
+    """Return the cost r'r/2 of data (in units of noise) and stated priors, without weak priors."""
     rows = problem.residual_rows
     weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
     return (evaluation.cost - weak - stated) / problem.stated_rms_noise_of_data_residuals**2 + stated
@@ -328,12 +328,12 @@ def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str
 
 
 def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
-    """Add a 95 % profile-likelihood interval to an estimate, and make its std and verdict consistent with it.
+    """Return an estimate with a 95 % profile-likelihood interval, and with a std and verdict that agree with it.
 
     An open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
     `parameter_verdict`). With two open ends the verdict is not_identifiable. With one open end it is at best weak, and
-    std is infinite. Without open ends, half the wider side acts as the standard deviation: it decides the verdict, and
-    replaces std if std is less than half of it.
+    std is infinite. Without open ends, the distance from the value to the farther end, divided by 1.96, decides the
+    verdict. It replaces std if std is less than half of it.
     """
     low, high = interval
     if low is None and entry.value - entry.lower <= scale:
@@ -360,10 +360,10 @@ def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
 
 
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
-    """Return the typical magnitude of each free parameter, from priors, bounds, similar parameters or initial values.
+    """Return the typical magnitude of each free parameter, from priors, bounds, similar parameters or scales.
 
     It is the first of these that is available: the prior's standard deviation, half the distance of finite bounds, the
-    median of parameters of the same kind (such as `bend`) or unit, the scale of the unknown.
+    median of other parameters of the same kind (such as `bend`), or else unit, and the scale of the unknown.
     """
 
     def kind(name: str) -> str:
@@ -497,9 +497,9 @@ def interval_text(lower: float | None, upper: float | None) -> str:
 def priors_that_determine_unknown(data: Array, priors: Array, column: int) -> BoolArray:
     """Return a mask (nx,) of the unknowns whose priors determine the unknown `column`. All False if the data do.
 
-    `data` (n, nx) and `priors` (k, nx) are Jacobians of whitened residuals. An unknown is determined by priors if its
-    standard deviation without them is more than `_PRIOR_STD_RATIO` times as large. The others can then change with
-    it and leave the predictions as they are. The mask has those that this moves away from their priors most.
+    `data` (n, nx) and `priors` (k, nx) are Jacobians of whitened residuals. Priors determine an unknown if its standard
+    deviation is more than `_PRIOR_STD_RATIO` times as large without them. Other unknowns can then compensate a change
+    of the unknown in the predictions. The mask marks those that this moves farthest from their priors.
     """
     others = np.arange(data.shape[1]) != column
     found, whole = np.zeros(len(others), bool), np.vstack([data, priors])

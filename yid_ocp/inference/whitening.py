@@ -60,7 +60,7 @@ _TORQUE_BIAS_TOLERANCE = 0.05  # change of the offset in stated standard deviati
 
 
 class _FilterPart(NamedTuple):
-    """Consecutive steps of a frozen filter of (d, w, b)."""
+    """Consecutive steps of a filter of (d, w, b) with fixed gains."""
 
     first: int  # index of the first step
     rows: IntArray  # residual rows, in the order of the steps
@@ -69,7 +69,7 @@ class _FilterPart(NamedTuple):
     by_torque: Array  # derivatives of the rows by a known torque of their step, shape (r, nu)
 
     def fresh_noise(self, noise: Array) -> Array:
-        """Known noise (N, nu) that begins after each step, and zeros for the offsets, shape (k, 2 nu)."""
+        """The entry of `noise` (N, nu) for the sample that begins after each step, else zero, and zeros: (k, 2 nu)."""
         found = np.zeros_like(self.kalman.decay)
         behind = self.first + 1 + np.flatnonzero(self.kalman.decay[:, 0] == 0)
         found[behind - self.first - 1, : noise.shape[1]] = noise[behind]
@@ -86,7 +86,7 @@ class _SmoothedInputErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class WhiteningFilter:
-    """A Kalman filter that whitens the residual of a recording, linearized along one rollout."""
+    """A Kalman filter of state error d, torque noise w and torque offset b that whitens the residual of a recording."""
 
     filter_steps: tuple[_FilterPart, ...]  # all steps, and the last node
     input_error_model: TorqueAndAngleErrorModel  # includes the values of b and w at the linearisation
@@ -95,10 +95,10 @@ class WhiteningFilter:
     torque_bias_std: Array  # standard deviation of b after all measurements, shape (nu,) [N m]
 
     def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten residual columns (r, c), and estimate the constant torque errors (nu, c) [N m] from all rows.
+        """Whiten the columns `rows` (r, c), and estimate the constant torque errors (nu, c) [N m] from all rows.
 
         The first column of `rows` is a residual in units of sensor noise, all other columns are its derivatives. `push`
-        (N, nu, c) is the tracking filter's correction of the torque and the derivatives of this correction [N m].
+        (N, nu, c) holds the tracking filter's correction of the torque [N m] and its derivatives, in the same order.
         """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
@@ -141,7 +141,7 @@ class WhiteningFilter:
     def _updated(
         self, part: _FilterPart, mean: Array, own: Array, push: Array | None, white: Array | None = None
     ) -> tuple[Array, Array, Array | None]:
-        """Innovations of some steps and the mean after them; with torque noise `white` also the means before each."""
+        """Innovations of some steps, and the mean after them. With torque noise `white`, also the mean before each."""
         noise = self.input_error_model.torque_noise
         known = None
         if push is not None and part.first < len(push):
@@ -185,7 +185,7 @@ def _filter_steps(
     rows_of_node: Sequence[IntArray],
     covariance: Array,
 ) -> tuple[_FilterPart, Array]:
-    """Filter over all steps for the kept states, and the covariance after the last step."""
+    """Filter over all steps for the states at the indices `kept`, and the covariance after the last step."""
     (count, nu), ns, begun = course.rollout.torque.shape, len(kept), 0
     # a new w at each new sample, and the same b
     fresh = np.append(np.diff(errors.sample_of_step) != 0, False)[:, None]
@@ -234,7 +234,7 @@ def _filter_steps(
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ProcessNoiseWhitener) -> Array:
-    """Estimate the constant torque errors (nu,) [N m] of the driven joints from the prediction of a recording."""
+    """Estimate the constant errors (nu,) [N m] of a recording's torques from its prediction and whitening filter."""
     return _innovations_and_bias(episode, result, whitening)[1][:, 0]
 
 
@@ -244,7 +244,7 @@ def _innovations_and_bias(episode: Episode, result: EpisodePrediction, by: Proce
 
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:
-    """Residual of an episode in units of sensor noise, with constant sensor errors subtracted."""
+    """Residual of an episode in units of sensor noise, after subtraction of constant sensor and clock errors."""
     samples = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
     pairs = zip(samples, result.predicted_outputs, strict=True)
     return np.concatenate([own.residual_and_jacobian(y).residual for own, y in pairs])
@@ -283,7 +283,7 @@ def _whitened_episode(
 def _about_smoothed(
     predictor: EpisodePredictor, episode: Episode, theta: Array, result: EpisodePrediction, before: WhiteningFilter
 ) -> Episode:
-    """Episode with smoothed torque errors and, with encoders, the smoothed motion."""
+    """Episode with smoothed torque errors and, if encoders are measurements, a smoothed reference motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
     found = before._smooth_input_errors(_plain(episode, result), result.feedback_torque_and_sensitivity)
@@ -303,7 +303,7 @@ def _about_smoothed(
 def _behind_effects(
     predictor: EpisodePredictor, episode: Episode, theta: Array, errors: TorqueAndAngleErrorModel
 ) -> TorqueAndAngleErrorModel:
-    """The same errors with torque noise referred to the readings, which effects may multiply by a factor."""
+    """The errors, with torque noise converted to noise of the readings, because an effect may scale the readings."""
     corrections, nu = predictor.model_functions.input_corrections, errors.torque_noise.shape[1]
     read = errors.torque_noise
     if corrections.corrects_efforts:
@@ -326,13 +326,13 @@ def problem_with_whitening_at(
     rounds: int = 1,
     keep_weights: bool = False,
 ) -> EstimationProblem:
-    """Return a problem whose residuals are whitened by sensor and process noise, linearized at the unknowns `x`.
+    """Return a problem whose residuals are whitened by sensor noise and input noise, linearized at the unknowns `x`.
 
-    The problem itself is returned if it has no process noise, or if the rollout fails at `x`. If it is already
-    whitened, the new filter is linearized about the motion and torques that the old filter smooths. `rounds` is the
-    number of linearizations (2 at a fit). With `keep_weights`, the gains of known filters are kept, which suffices
-    after a step of a standard deviation. `equilibrium_guesses` are configurations from which the search for equilibria
-    starts. `predictions` of all recordings by this problem at `x`, if known, save rollouts.
+    `problem` itself is returned if it has no input noise, or if a rollout at `x` fails. If it has whitening filters,
+    the new ones are linearized about the motion and torques that these smooth. `rounds` is the number of
+    linearizations (2 at a fit). With `keep_weights`, the gains of existing filters are kept, which suffices after a
+    step of one standard deviation. The search for equilibria starts at `equilibrium_guesses`. `predictions` of all
+    recordings at `x`, if known, save rollouts.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
@@ -376,7 +376,7 @@ def problem_with_held_out_kalman_whitening(
 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """Linearize the whitening filters of the estimation recordings at the torque offsets of `x`. Weights stay fixed."""
+    """Return a problem with whitening filters at the torque offsets of `x` and the gains of the unknowns `frozen`."""
     parts = problem.unpack_episode_unknowns
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
@@ -386,7 +386,7 @@ def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, fr
 def problem_with_reestimated_held_out_torque_biases(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
-    """Estimate the torque offsets in held-out whitening filters again at the unknowns `x`. Gains stay fixed."""
+    """Return a problem with held-out whitening filters at the torque offsets of `x`, and the gains at `frozen`."""
     pairs = zip(problem.held_out_prediction_inputs(x), problem.held_out, strict=True)
     at = [(*own, problem.held_out_parameter_vector(frozen, held)) for own, held in pairs]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
@@ -394,7 +394,7 @@ def problem_with_reestimated_held_out_torque_biases(
 
 
 def problem_with_sensor_noise_only(problem: EstimationProblem) -> EstimationProblem:
-    """Whiten a problem by sensor noise, without the noise of recorded inputs. Estimated torque offsets are kept."""
+    """Return the problem with sensor noise but without noise of recorded inputs. Estimated torque offsets are kept."""
     return _with_errors(problem, lambda errors: errors.with_torque_bias_only)
 
 
@@ -413,9 +413,9 @@ def _with_errors(
 
 
 def torque_biases_and_stds_per_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-    """Estimate the constant torque errors (nu,) [N m] of each recording at `x`, and their standard deviations.
+    """Estimate the constant torque errors (nu,) [N m] of each recording at `x`, with their standard deviations.
 
-    An entry is None if torques are exact, or without a whitening filter (`problem_with_whitening_at`).
+    An entry is None if the recording has no whitening filter (`problem_with_whitening_at`), or if its rollout fails.
     """
     x = np.asarray(x, float)
     found: list[tuple[Array, Array] | None] = []
@@ -441,7 +441,7 @@ def _relinearized(
     known: Sequence[ProcessNoiseWhitener | None],
     at: Sequence[tuple[Episode, Array, Array, Array]],
 ) -> tuple[tuple[Episode, ...], tuple[WhiteningFilter | None, ...]]:
-    """Episodes and filters at the torque offsets of (episode, theta, offset), from filters linearised at a theta."""
+    """Episodes and filters at the torque offsets estimated for each entry (episode, theta, start, frozen theta)."""
     pairs = zip(map(_own_filter, known), at, strict=True)
     made = tuple(own and _settled(predictor, own, *told) for own, told in pairs)
     both = zip(episodes, made, strict=True)
@@ -481,7 +481,7 @@ def _settled(
 def max_torque_bias_change_in_stds(
     some: Sequence[ProcessNoiseWhitener | None], others: Sequence[ProcessNoiseWhitener | None]
 ) -> float:
-    """Return the largest difference in torque offset between two sets of filters, in stated standard deviations."""
+    """Return the largest difference of torque offsets between two lists of filters, in stated standard deviations."""
     return max((_apart(one, other) for one, other in zip(some, others, strict=True) if one and other), default=0.0)
 
 
