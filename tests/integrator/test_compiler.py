@@ -110,7 +110,7 @@ def test_a_cache_that_others_may_write_or_that_cannot_be_made_is_refused(cache, 
         cache.chmod(mode)
         with pytest.raises(OutputError) as caught:
             compiler.private_cache_folder()
-        assert all(word in str(caught.value) for word in (str(cache), "empty it", "chmod 700", "YID_OCP_CACHE"))
+        assert all(word in str(caught.value) for word in (str(cache), "delete its files", "chmod 700", "YID_OCP_CACHE"))
     (cache / "file").write_text("not a folder", encoding="utf-8")
     monkeypatch.setenv("YID_OCP_CACHE", str(cache / "file" / "cache"))
     with pytest.raises(OutputError, match="CC=none"):
@@ -207,7 +207,7 @@ def test_a_compiler_that_hangs_is_spoken_of_and_waited_for_once(cache, choose, t
     monkeypatch.setattr(compiler, "_HUNG_COMPILERS", set())
     assert [compiler.compile_and_load_library(SOURCE % i) for i in range(3)] == [None] * 3
     assert (tmp_path / "calls").read_text().split() == ["x"]
-    assert "has been at work for" in caplog.text
+    assert "it is stopped after" in caplog.text
 
 
 @needs_compiler
@@ -218,7 +218,7 @@ def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, choose, 
     choose(script=text)
     monkeypatch.setattr(compiler, "_COMPILE_TIMEOUT", 0.5)
     assert not compile_step(pendulum, 0.01).is_compiled
-    assert "going on without compiled code" in caplog.text
+    assert "continuing without compiled code" in caplog.text
     assert ("no space left" in caplog.text) == ("no space left" in text)
     assert list(cache.iterdir()) == []
 

@@ -24,8 +24,8 @@ _Indices = NDArray[np.int32]
 class StepFunctions:
     """The CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
 
-    Each is built when it is first used, because a cached kernel needs none of them. With constraint forces at the node,
-    the outputs for the midpoint and the end of the step are empty.
+    Each function is built when it is first used, because a cached kernel needs none. If constraint forces act at the
+    node, the outputs for the midpoint and the end of the step are empty.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class StepFunctions:
 
 
 def build_casadi_step_functions(equations: DiscreteEquations) -> StepFunctions:
-    """Build the CasADi functions of the stepping kernel. The bodies' Jacobians are formed from vectors per joint."""
+    """Build the CasADi functions of a step. The kernel forms the Jacobians of the bodies from vectors per joint."""
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
@@ -118,9 +118,7 @@ def _pairs(e: DiscreteEquations) -> ca.SX:
 
 
 def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Sparse derivatives without the bodies' part: residual and p1 by (unknowns, old, input), constraints by the
-    unknowns.
-    """
+    """Sparse Jacobians without the bodies' part: residual and p1 by (unknowns, old, input), constraints by unknowns."""
     unknown, old = ca.vertcat(e.q1, e.z1, e.lam), ca.vertcat(e.q0, e.z0)
     inputs = ca.vertcat(unknown, old, e.u)
     m, n = e.lam.numel(), e.q0.numel()
@@ -323,7 +321,7 @@ def nonzero_indices(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
 
 
 def _runs(entries: _Indices) -> list[int]:
-    """First and one past the last of every run of consecutive numbers."""
+    """First number and last number + 1 of every run of consecutive numbers, in one list."""
     result: list[int] = []
     for value in map(int, entries):
         if result and value == result[-1]:

@@ -42,7 +42,7 @@ MIN_STEPS_TO_COMPILE_BATCH = 50_000
 
 
 class _Struct(ctypes.Structure):
-    """A struct of `kernel.c`; what its pointers point to stays alive with it."""
+    """A struct of `kernel.c`. It keeps the arrays and structs alive to which its pointers point."""
 
     kept: object = None
 
@@ -87,7 +87,7 @@ def _filled(kind: type[_Struct], *values: object) -> _Struct:
 
 
 def _along(state: Array, multipliers: Array, torque: Array) -> _Struct:
-    """A trajectory that is given."""
+    """The struct of a trajectory with given states, multipliers and applied torques."""
     return _filled(_Trajectory, *(_doubles(a) for a in (state, multipliers, None, torque)))
 
 
@@ -200,7 +200,7 @@ class CompiledKernel:
         names: tuple[str, ...],
         by: CostDerivativesByRolloutOutputs,
     ) -> RolloutCostGradient:
-        """Compute a cost's gradient along a rollout by the adjoint method. `by` holds its partial derivatives."""
+        """Compute the gradient of a cost, also by the parameters `names`, from its derivatives `by` along a rollout."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = RolloutCostGradient(*(np.zeros(shape) for shape in shapes))
@@ -216,7 +216,7 @@ class CompiledKernel:
     def step_residuals_and_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepResidualsAndJacobians:
-        """Evaluate step residuals along a trajectory in C, with their Jacobians if `derivatives` is set."""
+        """Evaluate the step residuals along any trajectory in C. Without `derivatives`, the Jacobians are empty."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         # in the order of the struct
         matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
@@ -230,7 +230,7 @@ class CompiledKernel:
     def iterate_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute the derivatives of a rollout's steps in C. See `step.iterate_step_derivatives`."""
+        """Compute the derivatives of a rollout's steps in C, as `step.iterate_step_derivatives` describes them."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)
@@ -241,7 +241,7 @@ class CompiledKernel:
         return after, effort
 
     def _call(self, function: str, *structs: _Struct) -> int:
-        """Status of a function of the library, which takes structs by address."""
+        """Call a function of the library with the addresses of the structs. Returns its status code."""
         outcome: Any = _Outcome()
         code: int = getattr(self._library, function)(*map(ctypes.byref, (*structs, outcome)))
         _check(code, outcome)
@@ -275,7 +275,7 @@ class CompiledKernel:
 
 def _check(code: int, outcome: Any) -> None:
     if code == NewtonStatusCode.OUT_OF_MEMORY:
-        raise out_of_memory_error("the work on one step", outcome.memory)
+        raise out_of_memory_error("the work arrays of one time step", outcome.memory)
 
 
 def _width(member: RolloutInputs) -> int:
@@ -302,7 +302,7 @@ def _theta_columns(model: StepEquationsAndFunctions, kernel: ctypes.CDLL, names:
     told = "\0".join([file_sha256(Path(codegen.__file__)), Path(kernel._name).name, *places])
     library = compiler.compile_and_load_library(told, source)
     if library is None:
-        what, where = "the C compiler failed for the derivatives by parameters", "the environment variable CC"
+        what, where = "the C compiler failed on the code for parameter derivatives", "the environment variable CC"
         raise ModelError(what, where=where, allowed="a C compiler, or CC=none for no compiled code", hint="set CC=none")
     function = ca.external("by_theta", library._name)
     sizes = model.sizes

@@ -52,12 +52,12 @@ _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spo
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
 _HUNG_COMPILERS: set[str] = set()  # compilers that did not end in time: they are waited for once
 _MARKER_SYMBOL = "yid_compiled"
-_NOT_LOADED = "compiled code cannot be loaded (%s); going on without it"
+_NOT_LOADED = "compiled code cannot be loaded (%s); continuing without it"
 
 
 @functools.cache
 def _compiler_path() -> str | None:
-    """Path of the C compiler, or None with one log message; the environment variable CC selects it, `none` disables."""
+    """Path of the C compiler, or None and one log message. The environment variable CC names it, or is `none`."""
     wanted = os.environ.get("CC")
     names = () if wanted == "none" else (wanted,) if wanted else ("cc", "gcc", "clang")
     path = next((found for name in names if (found := shutil.which(name))), None)
@@ -66,7 +66,7 @@ def _compiler_path() -> str | None:
         what, where = f"there is no compiler '{wanted}'", "the environment variable CC"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
-        _LOG.warning("no C compiler was found: all computations run without compiled code, about ten times slower")
+        _LOG.warning("no C compiler was found, or CC is none: computations run uncompiled, about ten times slower")
     return path
 
 
@@ -81,7 +81,7 @@ def _optimization_flag() -> str:
 
 
 def private_cache_folder() -> Path:
-    """Return the private folder of compiled code, and create it if it is absent. YID_OCP_CACHE overrides it."""
+    """Return the private folder of compiled code, created if absent. The environment variable YID_OCP_CACHE sets it."""
     wanted = os.environ.get("YID_OCP_CACHE")
     folder = Path(wanted or platformdirs.user_cache_dir("yid_ocp"))
     allowed = "a folder that you own, writable by you alone"
@@ -90,25 +90,25 @@ def private_cache_folder() -> Path:
         writable = os.access(folder, os.W_OK)
     except OSError as error:
         if wanted:
-            what = f"the cache of compiled code cannot be made: {error.strerror}"
+            what = f"the folder of compiled code cannot be created: {error.strerror}"
             hint = "set YID_OCP_CACHE to a folder of your own, or CC=none for no compiled code"
             raise OutputError(what, where=str(folder), allowed=allowed, hint=hint) from error
         writable = False
     if not writable and not wanted:  # as in containers
         return _temporary_cache_folder(folder)
     if not _is_mine_alone(folder.stat()):
-        what = "another user owns the cache of compiled code, or can write to it"
-        hint = f"empty it and chmod 700 it, or set YID_OCP_CACHE to another folder ({folder.name})"
+        what = "the folder of compiled code belongs to another user, or other users can write to it"
+        hint = "delete its files and run chmod 700 on it, or set YID_OCP_CACHE to another folder"
         raise OutputError(what, where=str(folder), allowed=allowed, hint=hint)
     return folder
 
 
 @functools.cache
 def _temporary_cache_folder(instead_of: Path) -> Path:
-    """Path of a cache of this process alone, removed when it ends."""
+    """Path of a cache folder for this process alone, which is removed when the process ends."""
     folder = Path(tempfile.mkdtemp(prefix="yid-ocp-cache-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    message = "the cache of compiled code %s cannot be written to; compiled code is made for this command alone: %s"
+    message = "the folder of compiled code, %s, is not writable; compiled code is kept for this command only: %s"
     _LOG.warning(message, instead_of, "set YID_OCP_CACHE to a folder of your own")
     return folder
 
@@ -205,10 +205,10 @@ def _library_file(source: str, level: str, make: Callable[[], str | None] | None
                     os.replace(built, target)
                     return target
     except OSError as error:
-        message = "compiled code cannot be kept in %s (%s); going on without it: %s"
-        _LOG.warning(message, folder, error.strerror or error, "set YID_OCP_CACHE to a folder with room, or CC=none")
+        message = "compiled code cannot be stored in %s (%s); continuing without it: %s"
+        _LOG.warning(message, folder, error.strerror or error, "set YID_OCP_CACHE to another folder, or CC=none")
         return None
-    _LOG.warning("the C compiler %s failed; going on without compiled code:\n%s", path, said[:2000])
+    _LOG.warning("the C compiler %s failed; continuing without compiled code:\n%s", path, said[:2000])
     return None
 
 
@@ -220,15 +220,15 @@ def _kept(folder: Path, key: str) -> Path | None:
             own = stat.S_ISREG(info.st_mode) and _is_mine_alone(info)
             if own and path.stem.partition("-")[2] == file_sha256(path)[:32] and _is_ours(path):
                 return path
-        _LOG.warning("compiled code in the cache is damaged or of another user, and is compiled again: %s", path)
+        _LOG.warning("a file of compiled code is damaged or belongs to another user; it is compiled again: %s", path)
         with contextlib.suppress(OSError):
             path.unlink()
     return None
 
 
 def _said(command: list[str], patience: float) -> tuple[bool, str]:
-    """Whether a program ended with success, and its output."""
-    notice = "the C compiler %s has been at work for %g s; it is given %g s, and CC=none does without it"
+    """Whether a program succeeded within `patience` seconds, and its output."""
+    notice = "the C compiler %s has run for %g s; it is stopped after %g s (set CC=none to work without it)"
     timer = threading.Timer(_NOTICE_DELAY, _LOG.warning, (notice, command[0], _NOTICE_DELAY, patience))
     timer.daemon = True
     try:

@@ -5,11 +5,10 @@ Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h) and q_m
     p_k + D1 L_d(q_k, q_{k+1}) + f- - ((1 - s) Dphi(q_k) + s Dphi(q_m))' lam_k = 0     phi(q_{k+1}) - C lam_k / h = 0
     p_{k+1} = D2 L_d(q_k, q_{k+1}) + f+ - s (Dphi(q_m) - Dphi(q_{k+1}))' lam_k
 
+phi = 0 are the constraints of grasps, with Jacobian Dphi, multipliers lam and compliance C. F is the generalized force.
 The symmetric force split has f- = f+ = (h/2) F, the left one f- = h F and f+ = 0. s = 0 puts the constraint force at
-the node, s = 1/2 at the midpoint.
-
-With s = 1/2 the motion is stable under any tension, with s = 0 only if lam times the constraint's curvature is below
-4 M/h^2 (docs/design/constraints.md). Both rules have order two.
+the node, s = 1/2 at the midpoint. With s = 1/2 the motion is stable under any tension, with s = 0 only if lam times the
+constraint's curvature is below 4 M/h^2 with the mass M (docs/design/constraints.md). Both rules have order two.
 
 The first equation holds for free coordinates. At a prescribed coordinate its left side is -h times the effort that the
 motion requires at node k. Both equations of a compliant coordinate are multiplied by its compliance, and so is its
@@ -61,12 +60,12 @@ class _ConstraintImpulses:
 
     @property
     def left_jacobian(self) -> ca.SX:
-        """Jacobian whose transpose times lam is subtracted from the momentum balance, (m, n)."""
+        """Jacobian (m, n); the momentum balance contains minus its transpose times lam."""
         return self.start_share * self.before_jacobian + self.midpoint_share * self.middle_jacobian
 
     @property
     def right_jacobian(self) -> ca.SX:
-        """Jacobian whose transpose times lam is subtracted from p1, (m, n)."""
+        """Jacobian (m, n); p1 contains minus its transpose times lam."""
         return self.midpoint_share * (self.middle_jacobian - self.after_jacobian)
 
 
@@ -122,7 +121,7 @@ class DiscreteEquations:
 
     @property
     def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
-        """The impulses of the closed-form force in `momentum_balance` and `p1`, each (n, 1) [N m s], or None."""
+        """The impulses of `force_with_derivatives` in `momentum_balance` and `p1`, each (n, 1) [N m s], or None."""
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares
@@ -130,7 +129,7 @@ class DiscreteEquations:
 
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
-        """The constraint violation at the end of the step without relaxation, phi(q_{k+1}) - C lam / h, (m, 1)."""
+        """The constraint violation phi(q_{k+1}) - C lam / h (m, 1) at the end of the step, without relaxation."""
         if self.constraint_relaxation_gain is None:
             return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
@@ -156,7 +155,8 @@ def discrete_equations(
     places = "constraint_force_at", constraint_force_at, ConstraintForcePlacement
     for name, said, known in (("force_split", force_split, ForceSplit), places):
         if said not in get_args(known):
-            raise ModelError(f"{name} = '{said}'", where=name, **unknown_name_error_arguments(said, get_args(known)))
+            choice = unknown_name_error_arguments(said, get_args(known))
+            raise ModelError(f"{name} = '{said}' is not a known rule", where=name, **choice)
     at = _Symbols.from_system(system)
     lam, h, qm, vm = at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
@@ -203,7 +203,7 @@ def discrete_equations(
 
 @dataclass(frozen=True)
 class _Symbols:
-    """The symbols of a step and of its midpoint. `placed` expresses the midpoint by the two nodes."""
+    """The symbols of a step and of its midpoint. `placed` replaces the midpoint's symbols by those of the two nodes."""
 
     q0: ca.SX
     q1: ca.SX
@@ -232,7 +232,7 @@ class _Symbols:
         return _Symbols(**symbols, h=symbols["time_step"] * system.recorded_time_scale, internal=own)
 
     def placed(self, expressions: Sequence[ca.SX], dense: bool = True) -> list[ca.SX]:
-        """Expressions of the midpoint in terms of the two nodes."""
+        """Expressions in which symbols of the two nodes replace those of the midpoint."""
         midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
         (q, v), (z, z_rate) = (((a + b) / 2, (b - a) / self.h) for a, b in ((self.q0, self.q1), (self.z0, self.z1)))
         nodes = ca.vertcat(q, v, z, z_rate, self.lam / self.h, z)
@@ -243,7 +243,7 @@ class _Symbols:
 def _summed_terms(
     system: System, at: _Symbols, kinematics: Kinematics
 ) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithFactoredDerivatives | None]:
-    """Lagrangian, force, internal equations (moving, at rest) and closed force of springs, inputs and effects."""
+    """Lagrangian, force, internal equations (moving, at rest) and closed-form force of springs, inputs and effects."""
     names = tuple(system.effect_internal_coordinate_symbols)
     rows_of = {name: i for i, name in enumerate(names)}
     state = MidpointStateSymbols(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
@@ -360,7 +360,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
 
 
 def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
-    """Each orientation row of a grasp as a sum of products of a holder vector and a vector of the held frame."""
+    """For each orientation row of a grasp, the pairs of vectors (holder, held frame) whose dot products sum to it."""
     if grasp.kind == "point":
         return []
     a = ca.horzsplit(kinematics.frame_pose(grasp.holder_frame).rotation @ grasp.held_orientation)
@@ -382,7 +382,7 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
 
 @dataclass(frozen=True)
 class EquilibriumEquations:
-    """The symbolic equations of static equilibrium. Torques and springs hold driven joints; prescribed ones are set."""
+    """The symbolic equations of static equilibrium. Torques and springs hold the driven joints."""
 
     # (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
     # held torque, holding spring's stiffness, theta, time step

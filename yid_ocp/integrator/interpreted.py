@@ -39,8 +39,8 @@ _PointEvaluator = Callable[[Array], list[Array]]
 class InterpretedKernel:
     """A thread-safe stepping kernel that runs in CasADi's interpreter and NumPy, for machines without a compiler.
 
-    Its methods are as in `CompiledKernel`. A point is a column of all `DiscreteEquations.arguments`. The outputs are
-    the rows of the balance, internal and constraint equations, then p1, then the effort of the prescribed coordinates.
+    It has the methods of `CompiledKernel`. A point is a column of all `DiscreteEquations.arguments`. The outputs at a
+    point are the residuals of the balance, internal and constraint equations, then p1, then the prescribed efforts.
     """
 
     def __init__(self, model: StepEquationsAndFunctions) -> None:
@@ -67,7 +67,7 @@ class InterpretedKernel:
         return other
 
     def _evaluators(self) -> Sequence[_PointEvaluator]:
-        """Outputs at a point and their Jacobians, by the unknowns (of the residual) and the point, for this thread."""
+        """Evaluators, for this thread, of the outputs, the residual's Jacobian by the unknowns, and that of all."""
         if not hasattr(self._own, "evaluators"):
             self._own.evaluators = [dense_function_evaluator(f, kept=False) for f in self._functions(None)]
         return tuple(self._own.evaluators)
@@ -85,7 +85,7 @@ class InterpretedKernel:
         return np.concatenate([*parts, [self._model.time_step]])
 
     def _columns(self, names: Sequence[str]) -> IntArray:
-        """Columns of parameters in a point."""
+        """Indices of parameters in a point."""
         return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 
     def _newton(
@@ -223,7 +223,7 @@ class InterpretedKernel:
     def iterate_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute the derivatives of a rollout's steps. See `step.iterate_step_derivatives`."""
+        """Compute the derivatives of a rollout's steps, as `step.iterate_step_derivatives` describes them."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
@@ -282,7 +282,7 @@ class InterpretedKernel:
     def step_residuals_and_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepResidualsAndJacobians:
-        """Evaluate step residuals along a trajectory one by one, with their Jacobians if `derivatives` is set."""
+        """Evaluate the step residuals along any trajectory. Without `derivatives`, the Jacobians are empty."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
@@ -300,7 +300,7 @@ class InterpretedKernel:
 
 
 def dense_function_evaluator(function: Any, kept: bool = True) -> Callable[[Array], list[Array]]:
-    """Create a fast evaluator of a CasADi function of one vector, for one thread. Outputs stay valid if `kept`."""
+    """Create a fast one-thread evaluator of a CasADi function of a vector. A call overwrites outputs unless `kept`."""
     point = np.zeros(function.numel_in(0))
     results = [np.zeros(function.size_out(i)[::-1]) for i in range(function.n_out())]
     run, views = bound_function(function, [point], results), [result.T for result in results]
@@ -314,7 +314,7 @@ def dense_function_evaluator(function: Any, kept: bool = True) -> Callable[[Arra
 
 
 def bound_function(function: Any, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
-    """Bind a CasADi function to contiguous arrays of nonzeros, column by column; return a call that evaluates it."""
+    """Return a function that evaluates a CasADi function from and into contiguous arrays (of nonzeros by column)."""
     buffer, run = function.buffer()
     for bind, arrays in ((buffer.set_arg, inputs), (buffer.set_res, outputs)):
         for i, array in enumerate(arrays):

@@ -31,7 +31,7 @@ class Equilibrium:
     state_by_theta: Array  # derivative with respect to the named parameters, (nx, len(names))
     state_by_known_coordinates: Array  # derivative by driven, then prescribed coordinates, (nx, nk)
     state_by_torque: Array  # derivative by the measured torque, (nx, nu)
-    is_converged: bool
+    is_converged: bool  # also False if a joint would have to leave its measured angle
     max_imbalance: float  # largest remaining imbalance [N m] or constraint violation [m]
     message: str
 
@@ -90,7 +90,7 @@ class EquilibriumSolver:
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
     ) -> Equilibrium:
-        """Find the equilibrium for given driven and prescribed coordinates, or the best point if Newton's method fails.
+        """Find the equilibrium for given driven and prescribed coordinates, or the best point if the search fails.
 
         Parameters
         ----------
@@ -98,8 +98,8 @@ class EquilibriumSolver:
             Known coordinates, driven then prescribed [rad or m].
         torque : array_like, shape (nu,), optional
             Measured torque at this configuration [N m]; the spring that holds a driven joint then only compensates
-            noise. For servos, the commands; the search then starts from `configuration`. A joint with
-            `MOTOR_OFF_COMMAND` is held until motion begins.
+            noise. With servos: their commands, and the search starts from `configuration`. A joint with
+            `MOTOR_OFF_COMMAND` is held until the motion begins.
         guess : array_like, shape (n,), optional
             Configuration to start from; default: the undeformed object.
         names : sequence of str
@@ -164,7 +164,7 @@ class EquilibriumSolver:
         return Equilibrium(state, held + stiffness * give, w[count:], *derivatives, *said)
 
     def _near(self, equations: Callable[[Array], tuple[Array, Array]], start: Array) -> tuple[Array, float, bool]:
-        """Root near a start, with grasp forces first fitted by least squares; not converged if the root is far."""
+        """Root near a start, its largest residual and convergence. A root far from the start does not count."""
         count = len(start) - self.step.sizes["m"]
         residual, slopes = equations(start)
         if not np.all(np.isfinite(residual)):
@@ -232,7 +232,7 @@ class EquilibriumSolver:
     def _rest_equations(
         self, w: Array, theta: Array, hold: _Hold, h: float, names: tuple[str, ...] = ()
     ) -> tuple[list[Array], list[Array]]:
-        """Equilibrium equations at `w` and the momentum, with derivatives by (q, z, forces), torques and `names`."""
+        """Residual at the unknowns `w`, and momentum, both with derivatives by (q, z, forces), torques and `names`."""
         step, system, free = self.step, self.step.system, len(self.free_coordinates)
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
         q, z, lam = self._configuration(w, hold.given), w[free : free + nz], h * w[free + nz :]
@@ -242,7 +242,7 @@ class EquilibriumSolver:
         found = step.kernel.step_residuals_and_jacobians(theta, state, lam[None], u[None], names, True)
 
         def by_point(new: Array, old: Array, push: Array) -> Array:
-            """By (q, z, lam), both nodes together and torques as they follow the angles."""
+            """Derivatives by (q, z, lam), with equal nodes, and with the torques that follow from the angles."""
             whole = new[0]
             whole[:, : n + nz] += old[0]
             whole[:, driven] -= hold.stiffness * push[0]
@@ -299,7 +299,7 @@ class EquilibriumSolver:
 
     def _explain(self, state: Array, theta: Array, error: float) -> str:
         system, step, e = self.step.system, self.step, self.step.equations
-        text, n = f"no equilibrium found (remaining imbalance {error:.2g})", system.n_coordinates
+        text, n = f"no equilibrium found (remaining imbalance {error:.2g} N m or m)", system.n_coordinates
         if not system.grasps or not np.all(np.isfinite(state)):
             return text
         with CASADI_LOCK:
@@ -331,7 +331,7 @@ def measured_joint_angle_hold_stiffness(system: System, known: bool) -> float:
 
 @dataclass(frozen=True)
 class _Hold:
-    """Known coordinates, and the torque and spring that hold the driven coordinates."""
+    """Known coordinates `given`, and the torques `held` and springs that hold the driven coordinates."""
 
     given: Array
     held: Array
@@ -348,7 +348,7 @@ class _Hold:
 def _damped_newton(
     function: Callable[[Array], tuple[Array, Array]], w: Array, tolerance: float
 ) -> tuple[Array, float, bool]:
-    """Root, largest residual and convergence of Newton's method with natural monotonicity (Deuflhard 2011, 3.3)."""
+    """Root, largest residual and success of Newton's method with a natural monotonicity test (Deuflhard 2011, 3.3)."""
     if len(w) == 0:
         return w, 0.0, True
     residual, jacobian = function(w)

@@ -159,8 +159,8 @@ class Step(ReprMixin):
             raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1)")
         ends = ((), ()) if prescribed is None else prescribed
         if len(ends) != 2:
-            what = f"prescribed has {len(ends)} entries"
-            raise ModelError(what, where="prescribed", allowed="the pair (s0, s1)", hint="pass prescribed=(s0, s1)")
+            what, allowed = f"prescribed has {len(ends)} entries", "the pair (s0, s1) of coordinates at both nodes"
+            raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1)")
         path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in ends])
         start[list(self.system.prescribed_coordinate_indices)] = path[0]
         torque = check("u", u, (sizes["nu"],))[None, :]
@@ -207,7 +207,7 @@ def compile_step(
 
 
 def step_with_time_step(step: Step, time_step: float) -> Step:
-    """Copy a step with another positive time step [s]. Equations and compiled code are shared."""
+    """Return a copy of a step with another positive time step [s]. Equations and compiled code are shared."""
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_coordinate_tolerance(time_step))
     return Step(model, step.kernel.make_kernel_sharing_code(model), step.is_compiled)
 
@@ -221,7 +221,7 @@ def compile_step_like(step: Step, system: System, *, use_compiler: bool | None =
 
 def _positive(time_step: float) -> float:
     if not (math.isfinite(time_step) and time_step > 0):
-        raise ModelError(f"time_step = {time_step}", where="time_step", allowed="a number above 0 [s]")
+        raise ModelError(f"time_step = {time_step} is not positive", where="time_step", allowed="a number above 0 [s]")
     return time_step
 
 
@@ -285,7 +285,7 @@ def checked_rollout_inputs(
     sizes, check = step.sizes, float_array_with_checked_shape
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
-        raise ModelError(f"steps = {steps}", where="steps", allowed="a whole number from 1")
+        raise ModelError(f"a simulation has {steps} time steps", where="steps", allowed="a whole number from 1")
     begin = check("start", start, (nx,)).copy()
     fixed = list(step.system.prescribed_coordinate_indices)
     inputs = np.zeros((steps, nu)) if torque is None else check("torque", torque, (steps, nu))
@@ -342,9 +342,9 @@ def reachable_and_observable_state_mask(
     """Return a mask (nx,) of the states that depend on a state or input and affect measurements, also indirectly.
 
     Prescribed coordinates and internal states of a neutral effect are excluded. Other coordinates and momenta count as
-    measured. Only the first and the last step are examined. `loads` are extra excitations as in
-    `iterate_step_derivatives`. `seen` (nx,) marks states that sensors depend on directly. `disturbed` (nx,)
-    marks those with an initial error; if given, states that neither these nor torque errors reach are excluded, too.
+    measured. Only the first and the last step are examined. `loads` are further inputs as in
+    `iterate_step_derivatives`. `seen` (nx,) marks states on which sensors depend directly. `disturbed` (nx,) marks
+    states with an initial error; if given, states that neither initial errors nor torque errors reach are excluded.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     given = (step, theta, rollout, np.repeat(inputs, count, 0), None, loads)

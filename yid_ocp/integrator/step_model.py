@@ -79,25 +79,25 @@ class NewtonStatusCode(IntEnum):
 
 _STATUS_MESSAGES = {
     NewtonStatusCode.OK: "converged",
-    NewtonStatusCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping or a fitting start",
-    NewtonStatusCode.SINGULAR: "the step's equations are singular; "
-    "look for redundant grasps or a coordinate without inertia",
-    NewtonStatusCode.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: "
-    "add feedback or damping",
+    NewtonStatusCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping or another start",
+    NewtonStatusCode.SINGULAR: "the equations of the step are singular; "
+    "look for redundant grasps or a joint without inertia",
+    NewtonStatusCode.NOT_FINITE: "the state is no longer finite, because the simulated motion is unstable; "
+    "add damping or, for driven arms, a tracking filter",
     NewtonStatusCode.OUT_OF_MEMORY: "there is not enough memory",
 }
 
 _LONG_ROLLOUT_STEPS = 100
 """Number of steps after which a failure is attributed to the integration method, not to the initial state."""
 _INSTABILITY_HINT = (
-    "the midpoint rule damps nothing by itself: without damping in the model the fastest modes grow over some hundred "
-    "steps until a step of this length cannot follow them"
+    "the midpoint rule has no numerical damping: if the model has no damping either, the fastest vibrations can grow "
+    "over some hundred steps until Newton's method fails"
 )
 
 
 @dataclass(frozen=True)
 class RolloutConvergenceInfo:
-    """The convergence of a rollout: status code, last Newton correction [rad or m] and totals over all steps.
+    """The outcome of a rollout: status code, last Newton correction [rad or m], and counts over all steps.
 
     `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
     the values after the last step.
@@ -143,8 +143,8 @@ class SensitivityDirections:
 
     def __post_init__(self) -> None:
         if self.count < len(self.parameter_names):
-            what, where = f"{self.count} directions for {len(self.parameter_names)} parameters", "SensitivityDirections"
-            raise ModelError(what, where=where, allowed="at least as many directions as parameters")
+            what = f"initial_state_tangents has {self.count} directions for {len(self.parameter_names)} parameters"
+            raise ModelError(what, where="SensitivityDirections", allowed="at least one column for each parameter")
 
     @property
     def count(self) -> int:
@@ -154,7 +154,7 @@ class SensitivityDirections:
 
 @dataclass(frozen=True)
 class TrackingFeedback:
-    """A feedback that keeps driven arms near their measured motion, u_k = ubar_k - K_k (x_k[index] - xbar_k).
+    """A feedback that keeps driven arms near the measured motion: torque u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     `state_indices` (nb,) selects entries of the state (q, p, z). `gain` (N, nu, nb) holds K_k [N m/rad for a
     coordinate, 1/s for a momentum]. `reference` (N, nb) holds the measured values xbar_k of these entries.
@@ -183,7 +183,7 @@ class RolloutInputs:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A simulated trajectory. Sensitivities (..., d) are its derivatives along d directions. NaN follows a failed step.
+    """A simulated trajectory, with its derivatives (..., d) along d directions. Values after a failed step are NaN.
 
     `state` (N + 1, nx) holds (q, p, z) at every node, q in rad or m, p in N m s or N s. `multipliers` (N, m) are in N
     s. `effort` (N, nc) is the effort of prescribed coordinates at nodes 0..N-1 [N m], `torque` (N, nu) the applied
@@ -277,7 +277,7 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], make: Callable[...
 def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     """Create the error for a lack of memory, because `what` needs `size` bytes."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
-    said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}: it takes {amount}"
+    said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}, which needs {amount}"
     hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
     allowed = "a computation that fits into the free memory"
     return InsufficientMemoryError(said, where="this machine", allowed=allowed, hint=hint)
@@ -286,7 +286,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 def attach_status_to_rollout(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """Add a status to a rollout, and set values after a failed step to NaN. `counts`: iterations, factorisations."""
+    """Add a status to a rollout, and set values after a failed step to NaN. `counts` are iterations, factorisations."""
     if code != NewtonStatusCode.OK:
         first_missing = {"state": step + 2, "state_sensitivity": step + 1}  # the last state that was tried is kept
         for name in [name for name, array in vars(rollout).items() if isinstance(array, np.ndarray)]:

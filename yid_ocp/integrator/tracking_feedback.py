@@ -1,4 +1,4 @@
-"""Tracking filter of driven arms: a feedback with LQR gains that keeps them near the measured motion.
+"""The tracking filter of driven arms, a feedback that keeps them near the measured motion.
 
 The discrete momentum contains half the impulse of the previous step. An effect, or a torque other than the recorded
 one, therefore changes the momentum that belongs to a given motion.
@@ -35,8 +35,8 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     nu = step.sizes["nu"]
     values = np.atleast_1d(np.asarray(gains, float))
     if values.size not in (1, nu) and nu % max(values.size, 1):
-        what = f"{values.size} gains for {nu} driven joints"
-        allowed = f"1 or {nu} gains, or one for each joint of an arm"
+        what = f"the settings have {values.size} gains for {nu} driven joints"
+        allowed = f"1 or {nu} gains, or one for each joint of one arm (all arms then have the same gains)"
         raise ModelError(what, where="problem.arm_proportional_gains", allowed=allowed)
     values = np.resize(values, nu)
     if np.any(values < 0):
@@ -93,13 +93,13 @@ def lqr_tracking_feedback(
 
 
 def compile_driven_arms_only_step(step: Step) -> Step:
-    """Compile a step that contains only the driven joints. Raises `ModelError` if other joints come before them."""
+    """Compile the step of a system of the driven joints alone. Raises `ModelError` if other joints come before them."""
     system, mechanism = step.system, step.system.mechanism
     keep = [mechanism.joint_index(name) for name in system.driven]
     if sorted(keep) != list(range(len(keep))):
-        what = "the LQR filter needs the driven joints to come first in the configuration"
-        where, allowed = "problem.arm_tracking_feedback", "driven joints that are the first coordinates"
-        raise ModelError(what, where=where, allowed=allowed, hint="use proportional gains instead")
+        what = "the LQR tracking filter requires that the driven joints come first in the configuration vector"
+        where, allowed = "problem.arm_tracking_feedback", "driven joints that are the first coordinates of the model"
+        raise ModelError(what, where=where, allowed=allowed, hint="set problem.arm_tracking_feedback: proportional")
     frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint_index < len(keep)}
     arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, link_chains={})
     damping = {name: value for name, value in system.joint_damping.items() if name in system.driven}
@@ -150,7 +150,7 @@ class JointMotionAndTorqueWithSensitivities:
 
     @property
     def _before_and_after(self) -> tuple[Array, Array]:
-        """Angles before and after the step to every node but the last; before the first node the joints are at rest."""
+        """Angles one node earlier and at every node but the last. Before the first node, the joints are at rest."""
         return _one_before(self.angles[:-1]), self.angles[:-1]
 
 
@@ -159,8 +159,8 @@ class EffectMomentumCalculator:
 
     `lqr_tracking_feedback` computes its reference momentum once, from recorded angles and torques without effects. An
     effect such as an armature, a fitted mass or damping of the arm, or a torque other than the recorded torque, changes
-    the momentum of the motion. Without this shift the feedback would oppose it: by half at a joint whose momentum gain
-    times h/2 is one. `parameter_names` are those on which the momentum depends if the torques are known.
+    the momentum of the motion. Without this shift the feedback would oppose the effect: by half at a joint whose
+    momentum gain times h/2 is one. The momentum depends on the parameters `parameter_names` (at given torques).
     """
 
     def __init__(self, step: Step) -> None:
@@ -289,7 +289,7 @@ def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> 
 
 
 class _Memory:
-    """Internal coordinates of one effect along a motion. `rows` are their indices among those in the momentum."""
+    """Internal coordinates of one effect along a motion. `rows` are their indices among those in the momentum shift."""
 
     def __init__(self, step: Step, inputs: list[ca.SX], law: ca.SX, rows: list[int], columns: list[int]) -> None:
         before, now, last, then, theta, symbol = inputs
@@ -343,7 +343,7 @@ class _Memory:
 
 
 def _columns(expression: ca.SX, theta: ca.SX) -> list[int]:
-    """Which entries of theta an expression depends on."""
+    """Indices of the entries of theta on which an expression depends."""
     return [int(i) for i in np.flatnonzero(np.array(ca.DM(ca.jacobian_sparsity(expression, theta), 1)).any(axis=0))]
 
 
