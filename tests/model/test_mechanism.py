@@ -99,11 +99,11 @@ def test_a_cable_is_counted_from_clamp_to_clamp():
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("T1:140%", "'140%' is not a location along 'T1'"),
+        ("T1:140%", "'140%' is not a position along 'T1'"),
         ("T1:-1%", "a percentage of the length from 0% (base) to 100% (tip)"),
         ("T1:40", "T1:40%"),
-        ("T1:half", "'half' is not a location along 'T1'"),
-        ("T1:nan%", "'nan%' is not a location"),
+        ("T1:half", "'half' is not a position along 'T1'"),
+        ("T1:nan%", "'nan%' is not a position"),
         ("T9:40%", "there is no frame 'T9:40%'"),
         ("T9:40%", ":40%'?"),
         ("w_T9", "did you mean 'w_T"),

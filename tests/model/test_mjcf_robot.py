@@ -135,7 +135,7 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     with caplog.at_level(logging.WARNING):
         mechanism = read_urdf(file)
         read_urdf(file)
-    assert caplog.text.count("motors: 1 not taken over (but for their limits") == 1
+    assert caplog.text.count("motors: 1 ignored (except their limits") == 1
     assert "actuators other" not in caplog.text
     assert "equalities" not in caplog.text  # the second finger follows the first
     assert "finger2" not in mechanism.joint_names
@@ -147,7 +147,7 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     with caplog.at_level(logging.WARNING):
         file.write_text(MODELS["rail with references"])
         read_urdf(file)
-    assert "springs of joints: 1 not taken over (model.joint_springs)" in caplog.text
+    assert "springs of joints: 1 ignored (set model.joint_springs)" in caplog.text
 
 
 GRIPPER = """<body name="gripper" {at}>{free}<site name="palm" pos="0 0.02 0.01"/>

@@ -75,7 +75,7 @@ class FlexibleSegment:
 
 @dataclass(frozen=True)
 class ElasticJoint:
-    """A spring and damper on one joint of a segment, with energy 1/2 stiffness (q - rest)^2 and force -damping v."""
+    """A spring and damper on one joint, with the energy 1/2 stiffness (q - rest_angle)^2 and the torque -damping v."""
 
     joint_name: str
     segment_name: str
@@ -208,10 +208,10 @@ def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravi
 
 
 def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
-    """Compute how each edge of a polyline is rotated from the previous edge, without twist, as matrices (3, 3).
+    """Return how each edge of a polyline is rotated from the previous edge, without twist, as k - 1 matrices (3, 3).
 
-    The rotations serve as a segment's `rest_rotation` and `link_rest_rotations`. `vertices` (k, 3) are the
-    undeformed centre line [m]. `initial_frame` (3, 3) is the frame before the first edge, with z along the line;
+    They are a segment's `rest_rotation` and `link_rest_rotations`. `vertices` (k, 3) are the undeformed centre line
+    [m]. The first rotation starts from `initial_frame` (3, 3), whose z axis is along the line before the first vertex;
     default: the world frame. Raises `ModelError` if neighbouring vertices coincide or the shape is wrong.
     """
     points = np.asarray(vertices, float)
@@ -221,7 +221,7 @@ def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLi
     edges = np.diff(points, axis=0)
     if not np.all(np.linalg.norm(edges, axis=1) > 0):
         index = int(np.argmin(np.linalg.norm(edges, axis=1) > 0))
-        what, hint = f"vertices {index} and {index + 1} coincide or are not finite", "remove one of them"
+        what, hint = f"vertices {index} and {index + 1} coincide or are not finite", "remove or correct one of them"
         raise ModelError(what, where="vertices of the polyline", allowed="distinct, finite vertices", hint=hint)
     frame = np.eye(3) if initial_frame is None else np.asarray(initial_frame, float)
     rotations = []
@@ -245,7 +245,7 @@ def _length_shares(segment: FlexibleSegment) -> tuple[float, ...]:
 
 
 def _cross_section(own: Mapping[str, Parameter]) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Mean squares of x and y over a section [m^2], and its equivalent radius [m]."""
+    """Mean squares of x and of y over a cross-section [m^2], and its equivalent radius [m]."""
     if "radius" in own:
         radius = own["radius"].symbol
         return radius**2 / 4, radius**2 / 4, radius
@@ -293,20 +293,20 @@ def _check(segment: FlexibleSegment, known: Mapping[str, SegmentLayout]) -> None
         refuse(what, **unknown_name_error_arguments(parent, known))
     if (segment.radius is None) == (section is None):
         found = "both a radius and a section" if section else "neither a radius nor a section"
-        refuse(f"the segment has {found}", "one of the two", "set cross_section_size: [0.001, 0.08] or radius: 0.004")
+        refuse(f"the segment has {found}", "one of the two", "set radius: 0.004 or cross_section_size: [0.001, 0.08]")
     sizes = {"mass": segment.mass, **({"length": segment.length} if lengths is None else {})}
     sizes |= {} if segment.radius is None else {"radius": segment.radius}
     for quantity, value in (sizes | {f"cross_section_size[{i}]": size for i, size in enumerate(section or ())}).items():
         if not (math.isfinite(value) and value > 0):
             unit = "kg" if quantity == "mass" else "m"
-            refuse(f"{quantity} = {value}", f"a number above 0 [{unit}]")
+            refuse(f"{quantity} = {value} is not positive", f"a number above 0 [{unit}]", f"correct {quantity}")
     if lengths is None and count < 1:
-        refuse(f"links = {count}", "a whole number from 1")
+        refuse(f"links = {count} is not possible", "a whole number from 1", "set links: 4, for example")
     if lengths is not None and not min(lengths, default=0.0) > 0:
-        refuse(f"link_lengths = {list(lengths)}", "one or more numbers above 0 [m]")
+        refuse(f"link_lengths = {list(lengths)} has no length, or one that is not positive", "numbers above 0 [m]")
     if turns is not None and len(turns) != count - 1:
-        refuse(f"{count} links have {len(turns)} link rotations", f"{count - 1}, one between two neighbouring links")
+        refuse(f"{count} links have {len(turns)} link rotations", f"{count - 1}, one for each link after the first")
     if at is not None and parent is not None and not 0 <= at < (links := len(known[parent].link_joints)):
-        refuse(f"parent_link_index = {at}", f"0 to {links - 1}, the links of segment '{parent}'")
+        refuse(f"parent_link_index = {at} is not a link of '{parent}'", f"0 to {links - 1}, the links of '{parent}'")
     if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(AXIS_UNIT_VECTORS):
-        refuse(f"joint_axes = '{axes}'", "letters of x, y, z, each at most once")
+        refuse(f"joint_axes = '{axes}' does not name axes", "one or more of the letters x, y, z, each at most once")

@@ -1,7 +1,7 @@
 """Symbolic kinematics and rigid-body mechanics of a kinematic tree, with joint screws in the world frame.
 
-A spatial velocity consists of the angular velocity and the linear velocity of the body point at the world origin. A
-wrench consists of the moment about the world origin and the force. In one fixed frame the derivatives are cheap.
+A spatial velocity is the angular velocity and the linear velocity of the body's point at the world origin. A wrench is
+the moment about the world origin and the force. Derivatives are cheap because all are in one fixed frame.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class LagrangianFirstDerivatives:
 
         dL/dv_j = S_j . H_j            dL/dq_j = D_j . H_j + S_j . W_j
 
-    For i an ancestor of j or j itself, F_j = Ic_j S_j, B_j = Ic_j D_j + S_j x* H_j, G_j the moment by which the weight
-    changes with the posture, and w_i the angular part of S_i:
+    The second derivatives, for i = j or i an ancestor of j, with F_j = Ic_j S_j, B_j = Ic_j D_j + S_j x* H_j, the
+    derivative G_j of the weight's moment (in W_j) by q_j, and the angular part w_i of S_i:
 
         L_vv[i, j] = S_i . F_j              L_qv[j, i] = S_i . B_j   (row: q_j, column: v_i)
         L_qq[i, j] = D_i . B_j + w_i . G_j  L_qv[i, j] = D_i . F_j
@@ -112,7 +112,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 
 
 def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> LagrangianFirstDerivatives:
-    """Compute the first derivatives of the bodies' Lagrangian at velocities v (n, 1) with gravity (3, 1)."""
+    """Compute the first derivatives of the bodies' Lagrangian at joint velocities v (n, 1) and gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
@@ -194,7 +194,7 @@ def mass_matrix(rigid: LagrangianFirstDerivatives, mechanism: Mechanism) -> ca.S
 def lagrangian_second_derivatives(
     rigid: LagrangianFirstDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Return the second derivatives L_qq, L_qv, L_vv (n, n) of the bodies' Lagrangian. Rows of L_qv belong to q."""
+    """Return the second derivatives L_qq, L_qv and L_vv (n, n) of the bodies' Lagrangian. L_qv has a row for each q."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
     by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
     by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))
@@ -206,7 +206,7 @@ def _dot(a: ca.SX, i: int, b: ca.SX, j: int) -> ca.SX:
 
 
 def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, ca.SX]]) -> ca.SX:
-    """Matrix of (upper, lower) entries for every joint j and its ancestors i."""
+    """Matrix (n, n) with the entries (upper [i, j], lower [j, i]) for every joint j and its ancestors i."""
     n = len(mechanism.joints)
     matrix = ca.SX(n, n)
     for j in range(n):

@@ -97,9 +97,9 @@ class Joint:
 class Frame:
     """A named frame fixed to the link that a joint moves. `joint_index` is -1 for the world.
 
-    `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and further joints) belong to the same link.
-    They stay with the joint if the mechanism is cut at this frame. All other bodies and frames of the link are beyond
-    the cut.
+    `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and joints) are parts of the same link. If the
+    mechanism is cut at this frame, they stay with the joint. All other bodies and frames of the link are beyond the
+    cut.
     """
 
     joint_index: int
@@ -112,11 +112,11 @@ class Frame:
 class ArcLengthChain:
     """A chain of straight links on which a point is located by its fraction of the arc length."""
 
-    tip_frames: tuple[str, ...]  # frame at the end of every link (at the link's translation), base to tip
+    tip_frames: tuple[str, ...]  # frame at the end of every link, base to tip
     length_fractions: tuple[float, ...]  # fraction of the nominal arc length of each link; the sum is one
 
     def _locate(self, length_fraction: float) -> tuple[str, float]:
-        """Tip frame of the link at a fraction of the arc length (0 to 1), and the fraction of that link."""
+        """Tip frame of the link at a fraction of the arc length (0 to 1), and the position on it as a fraction."""
         before = 0.0
         for tip, own in zip(self.tip_frames, self.length_fractions, strict=True):
             # the end of a link belongs to this link, not to the next one
@@ -189,7 +189,7 @@ class Mechanism(ReprMixin):
     def with_attached_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
-        """Return a copy with another mechanism, attached at the pose `placement` (4, 4) in `frame` (None: world)."""
+        """Return a copy with another mechanism attached at the pose `placement` (4, 4) in `frame` (None: the world)."""
         root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
         if frame is not None:
@@ -234,7 +234,7 @@ class Mechanism(ReprMixin):
         return replace(self, joints=joints)
 
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """Return a copy in which numbers replace all parameters. They come from `values` or are nominal."""
+        """Return a copy in which numbers replace all parameters: those in `values`, else the nominal values."""
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)
         symbolic = list[ca.SX]()
 
@@ -272,7 +272,7 @@ class Mechanism(ReprMixin):
 
 
 def map_expressions(description: Any, change: Callable[[ca.SX], ca.SX]) -> Any:
-    """Apply the function `change` to every symbolic expression in a model description, except its parameters."""
+    """Return a model description in which `change` was applied to every symbolic expression except the parameters."""
     if isinstance(description, ca.SX):
         return change(description)
     if isinstance(description, tuple):
@@ -292,13 +292,13 @@ def _fraction(name: str, said: str) -> float:
         value = math.nan
     if not 0.0 <= value <= 100.0:
         line, allowed = name.partition(":")[0], "a percentage of the length from 0% (base) to 100% (tip)"
-        what, hint = f"'{said}' is not a location along '{line}'", f"write a percentage, such as {line}:40%"
+        what, hint = f"'{said}' is not a position along '{line}'", f"write a percentage, such as {line}:40%"
         raise ModelError(what, where=name, allowed=allowed, hint=hint)
     return value / 100.0
 
 
 def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
-    """Combine rigidly connected bodies into one body. Returns None without bodies or with zero total mass."""
+    """Combine rigidly connected bodies into one body. Returns None if there are no bodies or their mass is zero."""
     entries = list(bodies)
     if not entries:
         return None
@@ -307,7 +307,7 @@ def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
         return None
     if not all(b.gravity_fraction is None or b.gravity_fraction.is_one() for b in entries):
         what = "the weight of a body is not its mass times gravity, so the body cannot be merged or written to a file"
-        hint = "leave out the effects that change weights without masses"
+        hint = "leave out effects that change weights but not masses, and set model.object.gravity_fraction: 1"
         raise ModelError(what, where="effects of the model", allowed="bodies with weight = mass * gravity", hint=hint)
     if len(entries) == 1:
         return Inertia(mass, entries[0].center_of_mass, ca.densify(entries[0].inertia_about_com))
@@ -355,7 +355,7 @@ def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
 
 
 def rotation_from_axis_sin_cos(axis: ArrayLike, sine: float, cosine: float) -> Array:
-    """Compute a rotation matrix from a unit axis and the sine and cosine of the angle (Rodrigues' formula)."""
+    """Compute the rotation matrix (3, 3) from a unit axis (3,) and the angle's sine and cosine (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
 

@@ -1,4 +1,4 @@
-"""A reader of robot descriptions in MJCF files. MuJoCo compiles a file; bodies and joints are converted as in URDF."""
+"""A reader of robots in MJCF files. MuJoCo compiles a file; its bodies and joints become links and joints of a URDF."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def mjcf_robot_description(file: Path) -> SimpleNamespace:
 
 
 def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
-    """Read the nonzero constants of an MJCF file's joints, by joint and name. Empty for other files.
+    """Read the constants of the joints that an MJCF file states, by joint and name. Empty for other file formats.
 
     Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
     `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `mjcf_robot_description`.
@@ -92,7 +92,7 @@ def _compiled(file: Path, changed: int) -> Any:
         model = mujoco.MjModel.from_xml_path(str(check_input_file(file)))
     except Exception as error:  # MuJoCo raises ValueError, and others for files that are missing
         what = f"MuJoCo cannot read the file: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        hint = "open it in MuJoCo's viewer, and put meshes where the file refers to them"
+        hint = "open it in MuJoCo's viewer to find the error; meshes must be where the file refers to them"
         raise ModelError(what, where=str(file), allowed="MJCF that MuJoCo compiles", hint=hint) from error
     for sentence in _left_out(model):
         log.warning("%s: %s", file.name, sentence)
@@ -119,7 +119,7 @@ def _body(
         label, kind = _joint_name(model, j), _JOINT_TYPES.get(int(model.jnt_type[j]))
         if kind is None:
             what, allowed = f"joint '{label}' has the type free or ball", "hinge and slide joints"
-            raise ModelError(what, where=where, allowed=allowed, hint="fix the base, or use several hinges")
+            raise ModelError(what, where=where, allowed=allowed, hint="delete a free joint; replace a ball by hinges")
         place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         origin = at @ _shift(place - last) @ joint_motion_pose(axis, -ref, kind)
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
@@ -153,7 +153,7 @@ def _limits(model: Any, j: int) -> SimpleNamespace:
 
 
 def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
-    """For each joint coupled by a linear equality: the joint that it follows, multiplier and offset."""
+    """For each joint coupled by an active linear equality: the joint that it follows, multiplier and offset."""
     found = {}
     for i in range(model.neq):
         first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
@@ -167,7 +167,7 @@ def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
 
 
 def _welded_free_bodies(model: Any) -> dict[int, tuple[int, Array]]:
-    """Free bodies held only by an active weld, with the body to which each is welded and its pose there."""
+    """Indices of free bodies that an active weld holds, with the index of the other body and the pose (4, 4) in it."""
     found: dict[int, tuple[int, Array]] = {}
     for i in range(model.neq):
         if int(model.eq_type[i]) != _WELD_EQUALITY or not model.eq_active0[i]:
@@ -193,16 +193,16 @@ def _left_out(model: Any) -> Iterator[str]:
     others_than_servos = [i for i in range(model.nu) if not _is_position_actuator(model, i)]
     motors = sum(_is_motor(model, i) for i in others_than_servos)
     others = {
-        "motors": (motors, "but for their limits: recorded or driving efforts are torques at the joint"),
+        "motors": (motors, "except their limits; efforts are torques at the joint"),
         "actuators other than motors and position servos": (len(others_than_servos) - motors, ""),
-        "equalities": (model.neq - taken, "welds and connects that close loops: model.grasp"),
-        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "model.joint_springs"),
+        "equalities": (model.neq - taken, "for welds and connects that close loops, set model.grasp"),
+        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "set model.joint_springs"),
         "tendons": (model.ntendon, ""),
         "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), ""),
     }
     for noun, (count, remedy) in others.items():
         if count:
-            yield f"{noun}: {count} not taken over" + (f" ({remedy})" if remedy else "")
+            yield f"{noun}: {count} ignored" + (f" ({remedy})" if remedy else "")
 
 
 def _body_name(model: Any, i: int) -> str:

@@ -49,7 +49,7 @@ class Parameters(ReprMixin):
         self._index = {entry.name: i for i, entry in enumerate(self._entries)}
         if len(self._index) != len(self._entries):
             twice = sorted(name for name, count in Counter(self.names).items() if count > 1)
-            what, hint = f"two parameters are called {twice[0]}", "give each part of the model its own name"
+            what, hint = f"two parameters are called {twice[0]}", "give each joint, segment and effect its own name"
             raise ConfigError(what, where="parameters of the model", allowed="unique names", hint=hint)
 
     def _summary(self) -> ReprTexts:
@@ -85,7 +85,7 @@ class Parameters(ReprMixin):
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """Return theta (ntheta,): nominal values, replaced by `values` where given. Raises `ConfigError` if invalid."""
+        """Return theta (ntheta,), from `values` (by name) or nominal. Raises `ConfigError` for a bad name or number."""
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):

@@ -34,7 +34,7 @@ _FirmwareTerm = Literal["integral", "derivative", "dead_band"]
 
 @dataclass(frozen=True)
 class _MotorFrictionData:
-    """Motor and friction constants identified together for one friction law; not valid with another law."""
+    """Motor and friction constants that were identified together for one friction law, and are valid for this only."""
 
     torque_constant: float  # kt [N m/A]
     resistance: float  # R [ohm]
@@ -115,7 +115,7 @@ class MotorKindAndPreset:
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.kind != "dc":
-            what = f"the motor has kind: {self.kind} and the preset '{self.preset}'"
+            what = f"the preset '{self.preset}' is for a dc motor, but the motor has kind: {self.kind}"
             hint = "set model.arms.servo.motor.kind: dc, or leave the preset out"
             raise ConfigError(what, where="model.arms.servo.motor.preset", allowed="preset with kind: dc", hint=hint)
 
@@ -152,8 +152,8 @@ class ServoModelOptions:
 
     def __post_init__(self) -> None:
         if "derivative" in self.extra_controller_terms and self.motor.kind == "ideal":
-            what = "an ideal motor has a derivative term already, JOINT.servo_damping"
-            hint = "leave it out, or set model.arms.servo.motor.kind: dc"
+            what = "derivative is not possible with an ideal motor, whose derivative gain is JOINT.servo_damping"
+            hint = "leave derivative out, or set model.arms.servo.motor.kind: dc"
             where = "model.arms.servo.extra_controller_terms"
             raise ConfigError(what, where=where, allowed="derivative with kind: dc", hint=hint)
 
@@ -165,8 +165,8 @@ class PositionServo:
         ideal:  torque = clip(gain (e + integral z) - damping dq/dt)
         dc:     torque = clip(gain (e + integral z) - derivative dq/dt) - damping dq/dt
 
-    with the error e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p), p =
-    `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, the sum over all limits. For a DC motor the duty cycle is
+    with the error e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p) and p =
+    `TORQUE_SATURATION_EXPONENT`. The tightness is limit^-p, summed over all limits. For a DC motor the duty cycle is
     limited, and the damping is the back-EMF (torque = kt/R (duty V - kt dq/dt), with torque constant kt, resistance R
     and voltage V). `current_limit_tightness` clips the resulting torque. At `MOTOR_OFF_COMMAND` the torque is zero.
     """
@@ -224,8 +224,8 @@ def build_joint_servos(
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
     """Build a servo for every named joint. Returns the servos and their parameters, such as `JOINT.servo_gain`.
 
-    With the initial gain, an error of `_DEFAULT_FULL_TORQUE_ERROR` gives the joint's effort limit. For a DC motor
-    `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor (the gain set in the firmware).
+    With the initial gain, an error of `_DEFAULT_FULL_TORQUE_ERROR` requests the joint's effort limit. For a DC motor,
+    `JOINT.servo_gain_factor` multiplies the gain; recordings may state this factor, the gain set in the firmware.
     """
     servos, entries = {}, []
     for joint in joints:

@@ -75,7 +75,7 @@ class Grasp:
         return ca.vertcat(*rows)
 
     def holder_minus_held_axis_directions(self, kinematics: Kinematics) -> ca.SX:
-        """Return the holder's axes minus the held axes (0, 3 or 9 rows). Opposite axes do not give zero."""
+        """Return the holder's axes minus the held axes (0, 3 or 9 rows), which is not zero for opposite axes."""
         if self.kind == "point":
             return ca.SX(0, 1)
         holder, held = (kinematics.frame_pose(name).rotation for name in (self.holder_frame, self.held_frame))
@@ -87,7 +87,7 @@ class Grasp:
 class MidpointStateSymbols:
     """The symbols at the midpoint of one time step, on which energies and forces may depend.
 
-    The coordinates q and internal coordinates z are means of both nodes; v and z_rate are differences divided by h.
+    Coordinates q and internal coordinates z are means of the two nodes; v and z_rate are their differences over h.
     """
 
     system: System
@@ -106,10 +106,10 @@ class MidpointStateSymbols:
 class NodeStateSymbols:
     """The symbols at one node of a trajectory, on which measurements may depend.
 
-    `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; the
-    acceleration `a` is their difference over h, with an error of order h^2. At the first and last node, `v` is the
-    velocity of the adjacent step, and `a` is the acceleration at the neighbouring node (error of order h). `load` and
-    `lam` belong to the step after the node (at the last node, to the last step).
+    The velocity `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node.
+    The acceleration `a` is their difference over h. The errors are of order h^2. At the first and last node, `v` is the
+    velocity of the adjacent step, and `a` is the acceleration at the neighbouring node (errors of order h). `load` and
+    `lam` belong to the step after the node, or at the last node to the last step.
     """
 
     system: System
@@ -142,7 +142,7 @@ class ForceWithFactoredDerivatives:
 
 @dataclass(frozen=True)
 class EffectStepTerms:
-    """The energy, forces and internal equations that an effect adds to one step. Forces: (n, 1) [N m or N]."""
+    """The energy, generalized forces (n, 1) [N m or N] and internal equations that an effect adds to one step."""
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
     generalized_force: ca.SX | None = None  # F(q, v, u, z)
@@ -159,9 +159,9 @@ class EffectStepTerms:
 class Effect:
     """The base class of effects, such as friction, that extend the nominal model. The base class changes nothing.
 
-    With neutral parameters a subclass leaves the nominal model unchanged. `reading_from_true_value` computes a reading.
-    Its inverse `true_value_from_reading` computes the true value of recorded inputs (torques that drive the model,
-    angles that are prescribed or followed).
+    With neutral parameters a subclass leaves the nominal model unchanged. `reading_from_true_value` computes a sensor
+    reading. Its inverse, `true_value_from_reading`, is for recorded inputs (torques that drive the model, angles that
+    are prescribed or followed).
     """
 
     kind: str  # name under which its class is registered
@@ -189,7 +189,7 @@ class Effect:
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """Return the delay [s] that this effect adds to a channel: the recorded minus the true time of a sample.
 
-        `camera` marks points of a camera. For a driving torque, `torque.JOINT`, the delay is from recording to action.
+        `camera` is True for points of a camera. For a driving torque, `torque.JOINT`, it is action minus recorded time.
         """
         return ca.SX(0)
 
@@ -287,7 +287,7 @@ class System(ReprMixin):
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
-            raise ModelError(f"gravity = {gravity}", where="gravity", allowed="three finite numbers [m/s^2]")
+            raise ModelError(f"gravity = {gravity} is invalid", where="gravity", allowed="three finite numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
@@ -295,7 +295,7 @@ class System(ReprMixin):
         dampers = {
             joint: Parameter(f"{joint}.damping", size, "N m s/rad", 0.0, math.inf, f"viscous damping of {joint}")
             for joint, size in wanted.items()
-            if tree.joint_index(joint) >= 0  # raises where there is none of the name
+            if tree.joint_index(joint) >= 0  # raises `ModelError` if there is no such joint
         }
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
@@ -398,7 +398,7 @@ class System(ReprMixin):
 
     @cached_property
     def _last_numeric_mechanism(self) -> dict[tuple[float, ...], Mechanism]:
-        """The last one made, by its parameter values: what handles one set of values asks for it several times."""
+        """A cache of the last numeric mechanism, by its parameter values, which are often requested several times."""
         return {}
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
@@ -437,7 +437,7 @@ class System(ReprMixin):
         return force
 
     def gear_torque_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
-        """Return the torque [N m or N] that the gear of a driven joint carries: the input minus weight and grasps."""
+        """Return the torque [N m or N] through the gear of a driven joint: input minus forces of weight and grasps."""
         outside = self.gravity_and_grasp_force_on_coordinate(state, index)
         return self.input_force(state.u, state.q, state.v)[index] - outside
 

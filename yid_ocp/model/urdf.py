@@ -214,7 +214,7 @@ def _parsed(file: Path) -> SimpleNamespace:
 
 
 def urdf_joint_dynamics(robot: str | Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the damping [N m s/rad] and the friction [N m] by joint that a URDF states, where they are above 0."""
+    """Return the damping [N m s/rad] and friction [N m] that a URDF states, by joint. Values of 0 are left out."""
     root = ElementTree.parse(check_input_file(urdf_path_from_robot_name(robot), MAX_TEXT_BYTES)).getroot()
     parts = [(joint.attrib["name"], part) for joint in root.findall("joint") for part in joint.iter("dynamics")]
 
@@ -323,12 +323,12 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
         hint = "correct the <inertia> of the link"
         raise ModelError(what, where=where, allowed="principal moments of 0 or more", hint=hint)
     if least + middle < (1 - _PRINCIPAL_MOMENT_RTOL) * most:
-        what = "%s: link '%s' has principal moments of inertia of %s kg m^2, which no body has: the largest is at most "
-        log.warning(what + "the sum of the others", where, link, values)
+        what = "%s: link '%s' has principal moments of inertia of %s kg m^2; in any body, the largest is at most "
+        log.warning(what + "the sum of the other two", where, link, values)
 
 
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
-    """Names of joints that follow others (mimic), which are locked because couplings are not modelled."""
+    """Names of joints that follow others (`mimic`). They are added to `locked`, because couplings are not modelled."""
     joints = {joint.name: joint for joint in robot.joints}
     following = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}
     for name, mimic in following.items():
@@ -382,7 +382,7 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
 def _walk(
     robot: Any, root: str, dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
 ) -> tuple[dict[str, tuple[_Carrier, Array, Any]], dict[str, Inertia], dict[str, tuple[_Carrier, Array, str]]]:
-    """Kept joints, bodies by link, and links with carrier (kept joint or None), pose (4, 4) and parent link."""
+    """Kept joints, bodies by link, and for each link its carrier (kept joint or None), pose (4, 4) and parent link."""
     links = {link.name: link.inertial for link in robot.links}
     joints: dict[str, tuple[_Carrier, Array, Any]] = {}
     bodies: dict[str, Inertia] = {}
@@ -455,9 +455,9 @@ def _unit_axis(joint: Any) -> Array:
 
 
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
-    """Write a mechanism as URDF text. The bodies of each joint become one link, and each frame a link on a fixed joint.
+    """Return a mechanism as URDF text. The bodies of a joint become one link, and each frame a link on a fixed joint.
 
-    `read_urdf` reads the same numbers back to 1e-12.
+    Parameters have the numbers in `values`, else nominal ones. `read_urdf` reads the same numbers back to 1e-12.
     """
     mechanism = mechanism.with_numeric_values(values)
     robot = ElementTree.Element("robot", name=mechanism.name)

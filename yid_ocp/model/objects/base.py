@@ -31,7 +31,7 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """The parent frame of an object, and the pose of the object's root in it."""
+    """The parent frame of an object, and the pose of the object's root in this frame."""
 
     parent_frame: Annotated[str | None, OptionInfo("frame in which xyz and rpy are given; default: world")] = None
     xyz: Annotated[_Vector3, OptionInfo("position in the parent frame", "m")] = (0.0, 0.0, 0.0)
@@ -47,8 +47,8 @@ class MountSettings:
 class ClampPosePointNames:
     """The names of two measured points that define a clamp's pose: the origin, and a second point on the z axis.
 
-    Two points do not determine the roll angle about z. It is zero at the start (x axis perpendicular to world y), and
-    the clamp never rotates about its own z axis.
+    Two points do not determine the roll angle about z. The model sets it to zero at the start (x axis perpendicular to
+    world y), and the clamp then never rotates about its own z axis.
     """
 
     clamp_name: str
@@ -74,7 +74,7 @@ class CableTopology:
             raise ModelError(what, where="cable: main_branch_vertex_names", allowed=allowed, hint=hint)
         for name, vertices in self.child_branch_vertex_names.items():
             if len(vertices) < 2 or vertices[0] not in free:
-                what = f"the branch '{name}' has {len(vertices)} vertices, starting with {vertices[:1] or 'none'}"
+                what = f"branch '{name}' ({', '.join(vertices)}) is too short, or does not start on the main branch"
                 allowed = f"two or more vertices, the first of them one of {', '.join(free)}"
                 raise ModelError(what, where=f"cable: child_branch_vertex_names.{name}", allowed=allowed)
         for vertex in self.vertex_names:
@@ -82,8 +82,8 @@ class CableTopology:
                 said = unknown_name_error_arguments(vertex, self.undeformed_positions)
                 raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", **said)
         if len(set(self.vertex_names)) != len(self.vertex_names):
-            allowed, hint = "every vertex in one branch", "list the vertex in one branch only"
-            raise ModelError("a vertex belongs to two branches", where="cable", allowed=allowed, hint=hint)
+            what = f"vertex '{max(self.vertex_names, key=self.vertex_names.count)}' belongs to two branches"
+            raise ModelError(what, where="cable", allowed="every vertex in one branch", hint="list it in one branch")
 
     @property
     def vertex_names(self) -> tuple[str, ...]:
@@ -126,7 +126,7 @@ class CableTopology:
 
 @dataclass(frozen=True)
 class InitialObjectSettings:
-    """An object that the command line of `init` describes, with initial values of its free parameters."""
+    """The settings of an object that the options of `yid-ocp init` describe, with initial values of its parameters."""
 
     settings: ObjectBuilder  # without its mount
     start_values: Mapping[str, tuple[float, str]]  # initial value of each free parameter, with a comment
@@ -137,10 +137,10 @@ class InitialObjectSettings:
 
 @dataclass(frozen=True)
 class InitObjectFactory:
-    """The default link number and the builder of an object that `init --object` can name.
+    """The default link number and the builder of an object that `yid-ocp init --object` can name.
 
-    `build` makes the object from inputs by name (flags of `init`, and `--number`) and the number of links per segment.
-    Raises `ConfigError` if an input is missing.
+    `build` makes the object's settings from numbers by name (from options such as `--length`, or `--number`) and the
+    number of links per segment. It raises `ConfigError` if a number is missing.
     """
 
     default_links: int  # per segment
@@ -177,7 +177,7 @@ def parse_comma_separated_numbers(text: str, count: int, flag: str) -> list[floa
 def initial_parameters_with_comments(
     segments: Sequence[FlexibleSegment], rigidity_ratio: float
 ) -> dict[str, tuple[float, str]]:
-    """Return start values by name, with comments: rigidity (`rigidity_ratio` x weight x length^2) and its damping."""
+    """Return each segment's initial rigidity (`rigidity_ratio` x weight x length^2) and damping, with comments."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
@@ -190,8 +190,8 @@ def initial_parameters_with_comments(
 class ObjectBuilder:
     """The base class of all kinds of flexible objects in `OBJECT_KINDS`. Its fields are the object's settings.
 
-    A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that is a whole system is also a
-    `ObjectBetweenClamps`.
+    A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that forms a whole system with its clamps
+    also has the methods of `ObjectBetweenClamps`.
     """
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
@@ -202,7 +202,7 @@ class ObjectBuilder:
     kind: Annotated[str, OptionInfo("kind of object")]
 
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
-        """Define the segments, parents first. Joints have `damping`; each link is split into `link_division` links."""
+        """Return the segments, parents first, with the damping `damping` and `link_division` links for each one."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
@@ -221,12 +221,12 @@ class ObjectBuilder:
 
     @property
     def uniform_or_total_link_count(self) -> int | None:
-        """The number of links in each segment, or the total if the segments differ. None without such segments."""
+        """The number of links in each segment, or the total number if segments differ. None without segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.segment_definitions()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
-        """Return the factor on a parameter that keeps a segment's stiffness if its links are divided, else 1."""
+        """Return the factor on a parameter that keeps a segment's stiffness or damping if its links are divided."""
         owner, _, quantity = parameter.rpartition(".")
         per_joint = {segment.name for segment in self.segment_definitions() if not segment.values_given_as_rigidities}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
@@ -241,7 +241,7 @@ class ObjectBuilder:
         }
 
     def with_file_names_only(self) -> ObjectBuilder:
-        """Return a copy with file names instead of full paths, so that objects of different runs can be compared."""
+        """Return a copy with file names in place of paths, so that the objects of different runs can be compared."""
         return replace(self, **{key: Path(file).name for key, file in self.input_file_paths().items()})
 
 
@@ -256,7 +256,7 @@ class ObjectBetweenClamps(Protocol):
         """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
 
     def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Compute parameter values from one recording's edge lengths [m]; empty if all recordings share the lengths."""
+        """Return length parameters from one recording's edge lengths [m]. Empty if all recordings share the lengths."""
 
 
 @dataclass(frozen=True, kw_only=True)

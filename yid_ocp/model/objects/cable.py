@@ -62,10 +62,10 @@ class CableOptions:
     """The settings of a cable's model.
 
     `shape_memory_fraction` models a cable that partly keeps the shape in which it was held before the recording. The
-    rest angle of each joint is then (1 - memory) x undeformed + memory x (start angle - load/stiffness), where the load
-    is the joint's torque in equilibrium at the start. The fraction becomes the parameter `SEGMENT.memory`. For a
-    recording that starts in motion it is multiplied by 1/(1 + (start speed/`start.speed_scale`)^2). Branches without an
-    entry have the `default_branch`. `gravity` is in m/s^2.
+    rest angle of each joint is then (1 - memory) x undeformed + memory x (start angle - load/stiffness), where load is
+    the joint's torque in equilibrium at the start. The fraction becomes the parameter `SEGMENT.memory`. If a recording
+    starts in motion, memory is multiplied by 1/(1 + (start speed/`start.speed_scale`)^2). Branches without an entry in
+    `branch_properties_by_name` have the `default_branch`. `gravity` is in m/s^2.
     """
 
     branch_properties_by_name: Annotated[
@@ -101,7 +101,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         return {row["point"]: np.array([float(row[axis]) for axis in "xyz"]) for row in rows}
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         allowed = "columns point, x, y, z with numbers in metres"
-        what, hint = "the table of vertices lacks a column, or has a cell that is not a number", "correct the table"
+        what, hint = "the table of vertices lacks a column, or a coordinate is not a number", "correct the table"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
 
 
@@ -185,7 +185,7 @@ def _with_memory(item: flexible.FlexibleObject, memory: float) -> flexible.Flexi
 def _with_vertices(
     item: flexible.FlexibleObject, cable: CableTopology, lengths: Mapping[tuple[str, str], float]
 ) -> flexible.FlexibleObject:
-    """The object with its vertices as frames; the parent's arc length runs from clamp to clamp."""
+    """The object with its vertices as frames. Arc lengths along the parent branch are measured from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
     for name, chain in cable.vertex_names_by_branch.items():

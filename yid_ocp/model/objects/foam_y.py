@@ -63,7 +63,7 @@ model:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of rigid links of every tube")] = 4
 
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
-        """Build the three tubes of the foam Y. Nominal joint stiffnesses are those for four links with any `links`."""
+        """Return the three tubes of the foam Y. The nominal joint stiffness does not depend on the setting `links`."""
         n = link_division
         links, damping = self.links * n, damping * n
         return [replace(s, links=links, bend=s.bend * n, twist=s.twist * n, damping=damping) for s in foam_y_segments()]

@@ -51,9 +51,9 @@ class SegmentGeometrySettings:
     has_length_parameter_per_link: Annotated[bool, OptionInfo("whether each link has its own length parameter")] = False
 
     def _build_segment(self, name: str, damping: float, link_division: int) -> FlexibleSegment:
-        """Build the segment `name`. Links are divided into `link_division` links at equal segment stiffness."""
+        """Build the segment `name`. Each link is divided into `link_division` links. The segment's stiffness stays."""
         if self.length is None and self.link_lengths is None:
-            what, hint = f"segment '{name}' has no length", "set one of the two"
+            what, hint = f"segment '{name}' has no length", "set length or link_lengths of the segment"
             where = f"model.object.named_segments.{name}"
             raise ModelError(what, where=where, allowed="length or link_lengths [m]", hint=hint)
         n = link_division
@@ -78,7 +78,7 @@ class SegmentGeometrySettings:
 
 
 def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> SegmentGeometrySettings:
-    """A segment for `init`. A flat one bends only across its thinner side."""
+    """A segment for `init`. If its cross-section is rectangular, it bends only across its thinner side."""
     section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
@@ -143,7 +143,7 @@ def _grown(branches: Sequence[tuple[str, SegmentGeometrySettings]]) -> dict[str,
             raise ConfigError(what, where="--branch", allowed=allowed, hint="rename one of them")
         if branch.parent is not None and branch.parent not in made:
             what = f"branch '{name}' grows on '{branch.parent}', which is not an earlier branch"
-            allowed, hint = ", ".join(made) or "a branch without @PARENT first", "list the parent before the branch"
+            allowed, hint = ", ".join(made) or "a branch without @PARENT", "put the --branch of the parent before it"
             raise ConfigError(what, where="--branch", allowed=allowed, hint=hint)
         made[name] = branch
     return made

@@ -70,7 +70,7 @@ parameters:
 
 
 def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
-    """The object with a taper parameter, on which masses, inertias, springs and dampers depend."""
+    """The object with the parameter `rod.taper`, on which masses, inertias, springs and dampers of links depend."""
     tree, [layout] = plain.mechanism, plain.segment_layouts
     taper = Parameter(f"{_SEGMENT}.taper", ratio, "1", 1e-3, math.inf, "radius of the tip over that of the base")
     n, links = len(layout.link_joints), layout.link_joints
@@ -94,7 +94,7 @@ def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
 
 
 def _frustum(body: Inertia, a: ca.SX, b: ca.SX, taper: ca.SX, length: ca.SX, radius: ca.SX) -> Inertia:
-    """Body of a link between sections of `a` and `b` times the base radius, by exact integrals."""
+    """Body of a link whose radius changes from `a` to `b` times the base radius, by exact integrals."""
     area, whole = (a**2 + a * b + b**2) / 3, (1 + taper + taper**2) / 3
     first = (a**2 + 2 * a * b + 3 * b**2) / 12 / area
     second = (a**2 + 3 * a * b + 6 * b**2) / 30 / area
