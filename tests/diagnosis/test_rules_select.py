@@ -12,11 +12,10 @@ from factories import alike, amplitude, cases, effect, fit, loss, point, score, 
 from heard import Heard
 
 from yid_ocp.diagnosis import select
-from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext
+from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult, _make_joint_score_model
 from yid_ocp.diagnosis.select import (
     _is_needed,
-    _is_plausible,
     _is_significant,
     _near_best_models,
     _pairs_to_refit,
@@ -201,14 +200,14 @@ def test_a_parameter_may_leave_its_range_by_a_factor_or_a_width(expected, within
         of = effect("wide@x", amplitude(), quantity)
         exact = [there(of, 1.0, s=value) for value in (*within, *beyond)]
         exact = [replace(found, std=found.std | {"wide@x.s": 0.0}) for found in exact]
-        assert [_is_plausible(of, found, LIMITS) for found in exact] == [True, True, False, False]
+        assert [found.implausible_parameters(of, LIMITS) for found in exact] == [[], [], ["wide@x.s"], ["wide@x.s"]]
 
 
 def test_a_value_that_may_as_well_lie_within_is_not_out_of_its_range():
     of = effect("wide@x", amplitude(), shape("s", expected=(0.1, 1.0), lower=-math.inf))
     for std, plausible in ((0.1, False), (0.54, False), (0.56, True), (math.inf, True)):
         found = fit([of], loss(1.0, 1.0), values={"wide@x.a": 1.0, "wide@x.s": 3.0}, std={"wide@x.s": std})
-        assert _is_plausible(of, found, LIMITS) is plausible
+        assert (found.implausible_parameters(of, LIMITS) == []) is plausible
 
 
 FEW = _make_joint_score_model(point([0.0]))
@@ -401,7 +400,7 @@ def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
 
 def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING)
-    monkeypatch.setattr(select, "_is_plausible", lambda of, fitted, limits: of.kind != "b")
+    monkeypatch.setattr(RefitStatistics, "implausible_parameters", lambda _, of, limits: ["a"] * (of.kind == "b"))
     assert rounds.compose()[1] == ["a", "c"]
     # of those that close too little, what does as well and is plausible is said first, even if it leaves more
     little = {"": (3.0, 3.2), "a": (2.951, 3.151), "b": (2.95, 3.15), "c": (2.98, 3.18)}

@@ -165,7 +165,7 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
     assert sure(1.0, ONE_LAW) == sure(1.0)
     assert sure(1.0, checks=(carried(),)) == sure(0.0)
     # a gap along one effect alone, and an effect of another size than one expects, are less sure
-    odd = [added(ONE, [OTHER], fitted=fit([ONE], values={f"{ONE.label}.a": 1.3}))]
+    odd = [added(ONE, [OTHER], fitted=fit([ONE], values={f"{ONE.label}.a": 99.0}))]
     assert sure(1.0) > sure(1.0, exceeds=False) == sure(1.0, odd) > sure(1.0, odd, exceeds=False) > 0.0
 
 

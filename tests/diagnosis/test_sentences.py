@@ -109,7 +109,7 @@ def effects():
     rivals = (added(FRICTION, [OFFSET, effect("third@x")]),)
     yield "rivals", with_effect(FRICTION, 0.5, selected_effects=rivals)
     odd = effect("offset@wrist", amplitude(neutral=9.0, lower=-99.0, upper=99.0, expected=(0.0, 2.0)))
-    for value in (2.5, 2.51, -0.5, -0.51, 9.0):
+    for value in (4.03, 4.05, -2.03, -2.05, 9.0):
         yield f"range 0 to 2, value {value}", with_effect(odd, value)
     for chi2, p, where in [
         (1.23, 0.002, (place("T2"),)), (1.23, 0.002, ()), (1.23, 0.02, ()), (1.23, 0.01, ()),

@@ -41,7 +41,6 @@ REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_toleranc
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
-_PRIOR_RANGE_TOLERANCE = 0.25  # fraction of its range by which an amplitude may exceed the range
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
 _MIN_LEFT_OUT_FOR_OWN_STEP = 800  # candidates, times refits, times recordings, which repay a step's compilation
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
@@ -132,11 +131,16 @@ class RefitStatistics(StoredFit):
         """Return the fitted parameters of an effect in reported units, with standard deviations."""
         return effect.parameters_as_reported(self.values, self.std)
 
-    def amplitudes_beyond_prior_range(self, effect: EffectBase) -> list[str]:
-        """List the amplitudes of an effect that leave their prior range by more than a quarter of its width."""
-        ranges = ((name, *effect.prior_ranges[name]) for name in effect.amplitude_parameter_names)
-        away = {name: abs(self.values[name] - (low + high) / 2) / (high - low) for name, low, high in ranges}
-        return [name for name, widths in away.items() if widths > 0.5 + _PRIOR_RANGE_TOLERANCE]
+    def implausible_parameters(self, effect: EffectBase, limits: Thresholds) -> list[str]:
+        """List the parameters of an effect that are far outside their prior range, by a width or a factor."""
+        room = limits.prior_range_margin_in_widths
+
+        def is_outside(name: str, low: float, high: float) -> bool:
+            unsure, width = limits.min_z * self.std.get(name, 0.0), room * (high - low)
+            least = low / (1 + room) if low > 0 else low - width
+            return not least - unsure <= self.values[name] <= high + width + unsure
+
+        return [name for name, ends in effect.prior_ranges.items() if is_outside(name, *ends)]
 
 
 @dataclass(frozen=True)

@@ -131,11 +131,11 @@ def _near_best_models(
     else:
         most = (1 - limits.min_explained_fraction) * nominal.held_out_loss.excess_chi2_per_sample
         enough = [fit for fit in fits if fit.held_out_loss.excess_chi2_per_sample <= most]
-        best = min((fit for fit in enough if _is_plausible(fit.effects[-1], fit, limits)), key=_chi2, default=best)
+        best = min((fit for fit in enough if _is_plausible(fit, limits)), key=_chi2, default=best)
         distances = [_distance_in_prediction(fit, best) for fit in fits]
         ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
     near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
-    near.sort(key=lambda own: (not _is_plausible(own[0].effects[-1], own[0], limits), *own[2]))
+    near.sort(key=lambda own: (not _is_plausible(own[0], limits), *own[2]))
     return [(fit, distance) for fit, distance, _ in near]
 
 
@@ -160,16 +160,9 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
 
 
-def _is_plausible(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether no parameter is clearly outside its prior range, widened by a width or a factor."""
-    room = limits.prior_range_margin_in_widths
-
-    def is_within(name: str, low: float, high: float) -> bool:
-        unsure, width = limits.min_z * fit.std.get(name, 0.0), room * (high - low)
-        least = low / (1 + room) if low > 0 else low - width
-        return least - unsure <= fit.values[name] <= high + width + unsure
-
-    return all(is_within(name, *expected) for name, expected in effect.prior_ranges.items())
+def _is_plausible(fit: RefitStatistics, limits: Thresholds) -> bool:
+    """Whether the parameters of the effect that was added last have usual values."""
+    return not fit.implausible_parameters(fit.effects[-1], limits)
 
 
 def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
@@ -197,7 +190,7 @@ def _plausible_beside(
     base: Sequence[EffectBase], fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> list[RefitStatistics]:
     """Fits whose effects beside `base` are plausible; others would correct errors of the effects in `base`."""
-    return [fit for fit in fits if all(_is_plausible(effect, fit, limits) for effect in _beside(base, fit))]
+    return [fit for fit in fits if not any(fit.implausible_parameters(effect, limits) for effect in _beside(base, fit))]
 
 
 def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[EffectsWithStart]:

@@ -12,6 +12,7 @@ from yid_ocp.diagnosis.events import EventSet
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
@@ -140,7 +141,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     added, total = result.selected_effects, result.closure_by_selected_effects
     limits, text = result.thresholds, list[str]()
     if added:
-        names = " and ".join(_named(entry.effect, added[-1].refitted_model) for entry in added)
+        names = " and ".join(_named(entry.effect, added[-1].refitted_model, limits) for entry in added)
         verb, part = "closes" if len(added) == 1 else "together close", "an unknown part of it on held-out motions"
         if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
             part += ", because the nominal model's error there is within noise"
@@ -191,15 +192,15 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
     return text
 
 
-def _named(effect: EffectBase, fit: RefitStatistics) -> str:
-    """An effect with its estimates, and a warning if an amplitude is far outside its expected range."""
+def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
+    """An effect with its estimates, and a warning if one is far outside its expected range."""
     values, odd = [], ""
     for name, r in fit.effect_parameters_as_reported(effect).items():
         known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
-    for name in fit.amplitudes_beyond_prior_range(effect):
+    for name in fit.implausible_parameters(effect, limits):
         low, high = effect.prior_ranges[name]
-        odd = f" (outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
+        odd = f" (far outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
     return f"{effect.label} with {', '.join(values)}{odd}"
 
 

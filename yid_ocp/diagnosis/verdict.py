@@ -222,7 +222,7 @@ def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> fl
     unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
     margin = math.log((1.0 - said.required_total_explained_fraction(limits)) / unexplained)
     fit = said.selected_effects[-1].refitted_model
-    is_substitute = any(fit.amplitudes_beyond_prior_range(effect) for effect in fit.effects)
+    is_substitute = any(fit.implausible_parameters(effect, limits) for effect in fit.effects)
     log_odds = _LOGISTIC_OFFSET + _LOGISTIC_SLOPE * margin - _LOG_ODDS_PER_DOUBT * (is_substitute + (not exceeds_noise))
     return 1.0 / (1.0 + math.exp(-log_odds))
 
