@@ -148,7 +148,7 @@ def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, foun
 def test_a_limit_that_cannot_be_kept_is_named(moved, wanted):
     hasty = plan_motion_to_target(moved, replace(wanted, duration=0.15))
     assert not hasty.is_successful
-    assert "shoulder passes its limit" in hasty.message or "leaves the point" in hasty.message
+    assert "shoulder exceeds its limit" in hasty.message or "leaves the point" in hasty.message
     assert "plan.duration" in hasty.message
 
 
@@ -157,7 +157,7 @@ def test_a_motion_that_leaves_the_point_elsewhere_has_not_arrived(moved, wanted)
     few = plan_motion_to_target(moved, replace(wanted, n_spline_coefficients=2, duration=0.4, limits=limits))
     assert few.max_position_error > 2 * wanted.position_tolerance, "the motion must fail for this to be a test"
     assert not few.is_successful
-    assert f"leaves the point {1e3 * few.max_position_error:.3g} mm from its place" in few.message
+    assert f"leaves the point {1e3 * few.max_position_error:.3g} mm from its target" in few.message
 
 
 def test_a_path_is_followed(moved, wanted):
@@ -229,12 +229,12 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"start_joint_positions": {"shoulder": 1.5}}, ("starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2")),
         ({"start_joint_positions": {"sholder": 0.5}}, ("'sholder' is not a joint", "did you mean 'shoulder'?")),
         ({"start_joint_positions": {}}, ("the position of shoulder is missing",)),
-        ({"start_joint_positions": None}, ("the start of the motion is not given",)),
+        ({"start_joint_positions": None}, ("the start positions of the joints are not given", "model.grasp")),
         ({"goal": "path"}, ("no waypoints",)),
-        ({"goal": "box"}, ("plan.goal: box needs plan.box",)),
+        ({"goal": "box"}, ("plan.goal is box, but plan.box is not set",)),
         ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "from 1 up to 0 m")),
         ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, ("mm outside the box along z", "plan.frames_in_box")),
-        ({"minimize_parameter_sensitivity": True}, ("no parameter uncertainty is known", "plan.parameter_run_folder")),
+        ({"minimize_parameter_sensitivity": True}, ("parameters is not known", "plan.parameter_run_folder")),
         ({"n_spline_coefficients": 1}, ("n_spline_coefficients = 1", "from 2")),
         ({"duration": -1.0}, ("duration = -1", "above 0")),
     ],
@@ -246,5 +246,5 @@ def test_what_is_refused(moved, wanted, more, words):
 
 
 def test_a_system_without_moved_joints_is_refused(urdf_folder, wanted):
-    with pytest.raises(ConfigError, match="the model has no prescribed joint"):
+    with pytest.raises(ConfigError, match="the model has no arm with prescribed joints"):
         plan_motion_to_target(pendulum_step(urdf_folder), wanted)

@@ -40,19 +40,19 @@ _MIN_VISIBLE_MOTION = 1e-4  # of a point, for a change of a parameter by its who
 
 @dataclass(frozen=True)
 class _ParameterPrecision:
-    std_recorded: float
-    std_planned: float
-    std_combined: float
+    std_recorded: float  # relative standard deviation of the parameter from the existing recordings
+    std_planned: float  # from the planned recording alone
+    std_combined: float  # from the existing and the planned recordings together
     verdict: str  # from the planned recording alone
 
 
 @dataclass(frozen=True, eq=False)
 class InformativeMotionPlan(PlannedMotion):
-    """The most informative motion found, with predicted standard deviations and distances between effects."""
+    """The best motion of an information search, with the parameter precision and effect distances it should give."""
 
     parameter_precisions: Mapping[str, _ParameterPrecision]
-    # for each pair of effects: distance of the first effect's change from its best imitation by the second effect and
-    # all free unknowns [data stds], in the recordings and in the plan; empty without effects
+    # for each pair of effects: distance of the first effect's change of the data from its best imitation by the second
+    # effect and all free unknowns [data stds], in the existing recordings and in the planned one; empty without effects
     effect_distances: Mapping[tuple[str, str], tuple[float, float]]
     start_results: tuple[MotionSearchResult, ...]  # of the random initial motions, in the order drawn
     best_start_index: int
@@ -77,10 +77,10 @@ def plan_informative_motion(
     Parameters
     ----------
     problem : EstimationProblem
-        Its first recording defines the sensors, their noise and their rates. Its free parameters are fitted.
+        Problem whose first recording defines sensors, noise and sample rates of the planned one.
     values : mapping of str to float, optional
         Parameter values at which the motion is optimised. Default: the values of the problem.
-    effects : mapping of label to mapping of quantity to value, optional
+    effects : mapping of kind@location to mapping of quantity to value, optional
         Known sizes of the effects to discriminate. Default: typical sizes.
     """
     check_option_bounds(options, "plan")
@@ -105,7 +105,7 @@ def plan_informative_motion(
     seeds = range(options.seed, options.seed + options.n_random_starts)
     begins = [_smooth(experiment, search.shrink_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
-        what, allowed = "no motion keeps the limits", "limits within which the arms can move"
+        what, allowed = "none of the random initial motions keeps the limits", "limits within which the arms can move"
         raise ConfigError(what, where="plan.limits", allowed=allowed, hint="widen plan.limits")
     unseen = _unseen(experiment, [rows for _, rows in begins])
     _check_seen(chosen, rivals, unseen, experiment)
@@ -144,7 +144,7 @@ def _effects(
 ) -> tuple[EffectBase, ...]:
     where = "plan.effects_to_discriminate"
     if len(set(labels)) < 2:
-        what, hint = f"plan.effects_to_discriminate has {len(set(labels))} effects", "list the effects to tell apart"
+        what, hint = f"the list of effects to discriminate has {len(set(labels))} effects", "list two effects or more"
         raise ConfigError(what, where=where, allowed="two effects or more, each KIND@LOCATION", hint=hint)
     there = {f"{effect.kind}@{effect.location}" for effect in problem.system.effects}
     found = []
@@ -155,7 +155,7 @@ def _effects(
             raise ConfigError(f"the effect '{label}' has no location", where=where, allowed="KIND@LOCATION", hint=hint)
         if label in there:
             what, allowed = f"the effect {label} is already part of the model", "effects that the model does not have"
-            raise ConfigError(what, where=where, allowed=allowed, hint="leave it out, and free its parameters instead")
+            raise ConfigError(what, where=where, allowed=allowed, hint=f"remove {label} from the list")
         found.append(make_effect(kind, place, problem.system, sizes.get(label)))
     return tuple(found)
 
@@ -176,7 +176,7 @@ def _criterion(
 
 
 def _size(effect: EffectBase) -> Array:
-    """Amplitudes of an effect relative to neutral: the known ones together, else half of each range, one at a time."""
+    """Amplitudes of an effect relative to neutral, a case per column: all known ones, else half a range of each one."""
     neutral = effect.neutral_values
     known = np.array([effect.parameters[name].value - neutral[name] for name in effect.amplitude_parameter_names])
     if np.any(known):
@@ -190,15 +190,15 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
     for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
         if not low <= 0.0 <= high:
-            what = f"{name} begins {max(low, -high):.3g} beyond the limit of the joint"
-            allowed = "positions within the limits of the joints"
+            what = f"joint {name} starts {max(low, -high):.3g} rad or m beyond its position limit"
+            allowed = "start positions within the position limits of the joints"
             hint = "set plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
     values, _ = limits.limited_values_and_jacobian(mover.simulate_path(still), still)
     broken = limits.worst_value_and_bound_by_violated_limit(values)
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
-        said = "; ".join(f"{name}: {x:.4g}, limit {bound:.4g}, {what}" for what, name, x, bound in parts)
+        said = "; ".join(f"{what} of {name} is {x:.4g}, limit {bound:.4g}" for what, name, x, bound in parts)
         hint = "widen plan.limits if the robot allows it, or set another plan.start_joint_positions"
         what, allowed = f"the arms exceed their limits before they move: {said}", "a start within all limits"
         raise ConfigError(what, where="plan.limits", allowed=allowed, hint=hint)
@@ -222,7 +222,7 @@ def _smooth(experiment: SplineMotionExperiment, w: Array) -> tuple[Array, Array 
 
 
 def _unseen(experiment: SplineMotionExperiment, told: Sequence[Array | None]) -> dict[str, float]:
-    """Parameters to which no measurement of any motion is sensitive, with the largest sensitivity of each [stds]."""
+    """Parameters to which no motion's measurements are sensitive, with the largest sensitivity of each [data stds]."""
     largest = np.zeros(len(experiment.sensitivity_column_names))
     for rows in told:
         if rows is not None:
@@ -238,38 +238,38 @@ def _check_seen(
     lost = [name for name in chosen if name in unseen]
     if chosen and len(lost) == len(chosen):
         worst = max(unseen[name] for name in lost)
-        what = f"no motion gives information about {', '.join(lost)}: a change by its whole value changes all readings "
-        what += f"together by {worst:.1g} standard deviations"
+        what = f"no motion gives information about {', '.join(lost)}: a change by the whole value of a parameter "
+        what += f"changes all readings together by at most {worst:.1g} standard deviations"
         hint = "; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost)
         where = "plan.parameters_to_identify"
         raise ConfigError(what, where=where, allowed="a parameter that changes readings", hint=hint)
     for effect in rivals:
         if all(name in unseen for name in effect.amplitude_parameter_names):
-            what = f"{effect.label} is unobservable: its first-order sensitivity is zero in every sensor"
-            allowed, hint = "effects that change readings", "add a sensor whose readings it changes, or leave it out"
+            what = f"{effect.label} is unobservable: a small amplitude of this effect changes no reading of any sensor"
+            allowed, hint = "effects that change readings", "remove the effect, or add a sensor that it influences"
             raise ConfigError(what, where="plan.effects_to_discriminate", allowed=allowed, hint=hint)
 
 
 def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
-    """Sentence on a sensor that would observe a parameter."""
+    """Hint on a sensor or grasp with which the parameter `name` would be observable."""
     mover, n = experiment.simulator, experiment.simulator.step.system.n_coordinates
     wide, seen = step_with_frames_at_measurable_points(mover.step)
     w = _PROBE_AMPLITUDE * w / max(float(np.abs(w).max()), _PROBE_AMPLITUDE)
     rolled = mover.simulate_path(w, names=[name])
     if rolled.state_sensitivity is None or not rolled.status.is_converged:
-        return f"{name} needs another sensor"
+        return f"add another sensor to observe {name}"
     frames = FramePositionEvaluator(wide.system, [sight.name for sight in seen])
     by_q = frames.positions_and_jacobian(rolled.state[:, :n], mover.theta)[1]
     size = abs(mover.theta[wide.system.parameters.index(name)]) or 1.0
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
     farthest = np.linalg.norm(moved, axis=2).max(0)
     best = int(np.argmax(farthest))
-    motion = f"a random motion of {_PROBE_AMPLITUDE:g} rad, with {name} changed by its whole value"
-    moved_by = f"{1e3 * farthest[best]:.2g} mm in {motion}"
+    motion = f"if {name} changes by its whole value, in a random motion of {_PROBE_AMPLITUDE:g} rad"
+    moved_by = f"{1e3 * farthest[best]:.2g} mm {motion}"
     if farthest[best] > _MIN_VISIBLE_MOTION:
-        return f"let a camera see {seen[best].description}: it moves by {moved_by}"
-    grasp = "take another grasp, which loads it (`identifiability --what-if` tries some), or fix it"
-    return f"no point of the object moves by more than {moved_by}: {grasp}"
+        return f"let a camera measure {seen[best].description}: its position changes by {moved_by}"
+    grasp = f"choose a grasp that loads {name} (`identifiability --what-if` compares some), or set its `free: false`"
+    return f"{grasp}; no measurable point changes its position by more than {moved_by}"
 
 
 def _plan(
@@ -285,12 +285,12 @@ def _plan(
     best = int(np.argmax([one.configured_criterion for one in judged]))
     chosen = judged[best]
     if not np.isfinite(chosen.configured_criterion):
-        what, hint = "no motion of the search can be simulated with its torques", "lower plan.limits.max_acceleration"
+        what, hint = "no motion found can be simulated with the torques it needs", "lower plan.limits.max_acceleration"
         raise SolverError(what, where="plan", allowed="a motion whose torques reproduce it", hint=hint)
     w, message = chosen.w, "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
-        way = "lower plan.limits, or give another plan.start_joint_positions"
-        message = f"the motions are too rough to be improved; {way}"
+        way = "lower plan.limits, or set another plan.start_joint_positions"
+        message = f"the search could not improve the best of its random initial motions; {way}"
     elif not chosen.is_converged:
         message = f"the search was stopped after {chosen.n_iterations} rounds; raise plan.max_iterations"
     precisions, unidentifiable = _parameters(experiment, w)

@@ -108,16 +108,13 @@ class PlanOptions:
 
 
 class FramePositionEvaluator:
-    """A function of the configuration that gives world positions of named frames and their Jacobian.
-
-    Raises `ConfigError` if a frame does not exist.
-    """
+    """A compiled function of the world positions of frames, with Jacobian. Raises `ConfigError` for unknown frames."""
 
     def __init__(self, system: System, names: Sequence[str]) -> None:
         for name in names:
             if not system.mechanism.has_frame(name):
                 said = unknown_name_error_arguments(name, system.point_frames)
-                raise ConfigError(f"there is no frame '{name}'", where="plan", **said)
+                raise ConfigError(f"there is no frame '{name}'", where="plan.point or plan.frames_in_box", **said)
         self.names = tuple(names)
         with CASADI_LOCK:
             q, theta = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*(entry.symbol for entry in system.parameters))
@@ -140,9 +137,9 @@ _N_REST_CONTROL_POINTS = 3  # equal control points at each end, for zero velocit
 class RestToRestSplineBasis:
     """A spline path of joints from rest to rest: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
-    The coefficients w_k are the control points. The spline has degree 5 and clamped ends. The path and its derivatives
-    lie within the convex hulls of their control points, so limits on control points hold at all times, not only at
-    nodes.
+    The coefficients w_k (one row for each k) are control points of a spline of degree 5 with clamped ends. The path and
+    its derivatives lie within the convex hulls of their control points. Limits on control points therefore hold at all
+    times, not only at nodes.
     """
 
     duration: float  # [s]
@@ -158,7 +155,7 @@ class RestToRestSplineBasis:
         return BSpline(knots, controls, _SPLINE_DEGREE).derivative(order)
 
     def coefficients_to_control_points_matrix(self, order: int = 0) -> Array:
-        """Return the matrix (..., K) from coefficients to the control points of the spline's `order`-th derivative."""
+        """Return the matrix (n, K) from K coefficients to n control points of the spline's `order`-th derivative."""
         splines = self._splines(order)
         return np.asarray(splines.c[: len(splines.t) - splines.k - 1])
 
@@ -168,7 +165,7 @@ class RestToRestSplineBasis:
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight_line_coefficients(self, change: Array) -> Array:
-        """Return the coefficients (K, nj) of a straight line in joint space with the displacement `change` (nj,)."""
+        """Return the coefficients (K, nj) of a straight path in joint space with the total motion `change` (nj,)."""
         t = np.linspace(0.0, self.duration, 200)
         s = t / self.duration
         smooth = s**3 * (10 - 15 * s + 6 * s**2)
@@ -178,7 +175,7 @@ class RestToRestSplineBasis:
 
 @dataclass(frozen=True, eq=False)
 class PathSimulator:
-    """A simulator of a system, initially at rest, whose prescribed joints follow a spline path."""
+    """A simulator of a system that starts at equilibrium and whose prescribed joints then follow a spline path."""
 
     step: Step  # all moving joints are prescribed, none is driven
     theta: Array  # (ntheta,)
@@ -223,7 +220,10 @@ class PathSimulator:
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """Simulate the path with coefficients `w` (K, nc), with sensitivities to `names` and, if `slopes`, to `w`."""
+        """Simulate the path with coefficients `w` (K, nc).
+
+        The rollout has sensitivities to the parameters `names` and then, if `slopes`, to the K nc coefficients.
+        """
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
@@ -258,7 +258,7 @@ TARGET_REACHED_TOLERANCE_FACTOR = 1.5  # in position tolerances; beyond it, a ta
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A planned motion of the arms, with its simulator, simulated motion, success and message."""
+    """A planned motion of the arms, with its simulation, whether the planner succeeded, and a message on the result."""
 
     simulator: PathSimulator
     spline_coefficients: Array  # (K, nc)
@@ -293,7 +293,7 @@ class PlannedMotion:
 
     @property
     def joint_efforts(self) -> Array:
-        """The efforts that the moved joints need, shape (N + 1, nc) [N m or N]. The last row is repeated."""
+        """The efforts (N + 1, nc) [N m or N] that the moved joints need. The last row repeats the row before it."""
         return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
 
     @cached_property
@@ -315,22 +315,22 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 
 
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
-    """Return the start positions (nc,) of the moved joints. `ConfigError` if one is missing or out of range."""
+    """Return the start positions (nc,) of the moved joints. Raises `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
             said = unknown_name_error_arguments(name, system.prescribed)
-            raise ConfigError(f"'{name}' is not a joint that moves", where=where, **said)
+            raise ConfigError(f"'{name}' is not a joint that the plan moves", where=where, **said)
     missing = [name for name in system.prescribed if name not in posture]
     if missing:
-        what, allowed = f"the position of {', '.join(missing)} is missing", "every joint that moves"
-        hint = "add them, or set the whole key to null to begin where the arms grasp the undeformed object"
+        what, allowed = f"the position of {', '.join(missing)} is missing", "a start position of every joint that moves"
+        hint = f"add the missing positions, or set {where}: null for the default start"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     chosen = np.array([float(posture[name]) for name in system.prescribed])
     for name, value, low, high in zip(system.prescribed, chosen, *_position_limits(system), strict=True):
         if not low - 1e-9 <= value <= high + 1e-9:
             over = low - value if value < low else value - high
-            what = f"{name} starts at {value:.4g}, {over:.3g} beyond its limit"
+            what = f"joint {name} starts at {value:.4g}, which is {over:.3g} beyond its limit (rad or m)"
             raise ConfigError(what, where=f"{where}.{name}", allowed=f"{low:.4g} to {high:.4g} rad or m")
     return chosen
 
@@ -351,7 +351,10 @@ def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, gues
 def check_rest_effort_and_spring_limits(
     step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str
 ) -> None:
-    """Check that efforts and spring angles at the equilibrium `rest` are within limits. Raises `ConfigError`."""
+    """Raise `ConfigError` if an effort or spring angle at the equilibrium `rest` exceeds its limit.
+
+    `when` is the part of the message that says which equilibrium it is, such as "where it ends".
+    """
     system, joints = step.system, step.system.mechanism.joints
     efforts = zip(system.prescribed_coordinate_indices, simulate(step, theta, rest.state, 1).effort[0], strict=True)
     springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
@@ -361,18 +364,18 @@ def check_rest_effort_and_spring_limits(
     rows += [(i, "max_spring_angle", "rad", rest.state[i], largest) for i in springs]
     for i, which, unit, value, limit in rows:
         if not abs(value) <= limit * (1 + 1e-9):
-            over = f"{value:.4g} {unit}, {abs(value) - limit:.3g} beyond its limit"
-            what, where = f"{joints[i].name} at rest {when} needs {over}", f"plan.limits.{which}"
-            hint = f"raise {where} if the robot allows it, or choose another posture or target"
+            over = f"{value:.4g} {unit}, which is {abs(value) - limit:.3g} beyond its limit"
+            what, where = f"{joints[i].name} at rest {when} has {over}", f"plan.limits.{which}"
+            hint = f"raise {where} if the robot allows it, or set another plan.start_joint_positions or target"
             raise ConfigError(what, where=where, allowed=f"up to {limit:.4g} {unit}", hint=hint)
 
 
 def solve_equilibrium_at_point_target(
     step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, target: Array, tolerance: float
 ) -> Equilibrium:
-    """Find an equilibrium within joint limits at which a point is at its target. `start` is the initial guess.
+    """Find an equilibrium within the joint limits at which a point is at its target, from the initial guess `start`.
 
-    Raises `ConfigError` if no joint moves the point, or if no equilibrium has the point at the target.
+    Raises `ConfigError` if no joint moves the point, or if the point stays over 1.5 `tolerance` [m] from the target.
     """
     statics, system = EquilibriumSolver(step), step.system
     n, first = system.n_coordinates, start.state[list(system.prescribed_coordinate_indices)]
@@ -404,19 +407,19 @@ def solve_equilibrium_at_point_target(
     rest = statics.solve(found.x, theta, guess=guess[0])
     distance = float(np.linalg.norm(point_and_slope(rest)[0] - target)) if rest.is_converged else np.inf
     if not distance <= TARGET_REACHED_TOLERANCE_FACTOR * tolerance:
-        off = f"{1e3 * distance:.3g} mm off" if rest.is_converged else "nowhere, as no posture near it is at rest"
+        off = f"{1e3 * distance:.3g} mm off" if rest.is_converged else "at no position near the target"
         near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
         names = ", ".join(name for name, one in zip(system.prescribed, near, strict=True) if one)
         limits = f", with {names} at the joint's limit" if names else ""
-        what = f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
+        what = f"the target is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
         where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in target)} m in the world)"
-        hint = "use a nearer target, a smaller plan.point_target_offset_from_start, or other plan.start_joint_positions"
+        hint = "set a nearer target, a smaller plan.point_target_offset_from_start, or other plan.start_joint_positions"
         raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest
 
 
 def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """Wrap a function so that it remembers its latest value, because searches ask twice for the same point."""
+    """Wrap a function so that a second call with the same argument returns the value of the first call."""
     last: list[tuple[Array, _Value]] = []
 
     def at(x: Array) -> _Value:

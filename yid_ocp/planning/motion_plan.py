@@ -46,7 +46,7 @@ class ParameterCovarianceBeforePlan:
 class TargetMotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
-    Its time step is shorter than that of the given step if the planner had to halve it for accuracy.
+    The time step of its simulation is shorter than that of the planner's argument `step` if accuracy required halving.
     """
 
     target_point: str
@@ -55,7 +55,7 @@ class TargetMotionPlan(PlannedMotion):
     max_residual_speed: float  # largest speed of a point of the object in that time [m/s]
     max_path_deviation: float | None  # largest distance from the reference path [m]; None without one
     end_position_std: Array | None  # (3,), of the final position, from the parameters' covariance [m]; None without one
-    n_evaluations: int
+    n_evaluations: int  # motions that the search simulated with derivatives
 
     @property
     def _further_points(self) -> tuple[str, ...]:
@@ -72,15 +72,14 @@ def plan_motion_to_target(
     """Plan a motion of the prescribed joints that brings a point to a target.
 
     `theta` holds the parameter values; default: those of the system. `known` is the covariance of uncertain parameters.
-    If no motion keeps the limits, the result is still a plan, whose `message` names the violated limit and the excess.
-    Raises `ConfigError` or `ModelError` if the target is out of reach, a name does not exist, or there is no
-    equilibrium.
+    If no motion keeps the limits, a plan is still returned, whose `message` states the violated limits. Raises
+    `ConfigError` or `ModelError` if the target is out of reach, a name does not exist, or there is no equilibrium.
     """
     check_option_bounds(options, "plan")
     system = step.system
     if system.driven or not system.prescribed:
-        what, hint = "the model has no prescribed joint", "set model.robot, and model.arms.mode: prescribed"
-        raise ConfigError(what, where="plan", allowed="a robot whose arms are prescribed", hint=hint)
+        what, hint = "the model has no arm with prescribed joints", "set model.robot, and model.arms.mode: prescribed"
+        raise ConfigError(what, where="plan", allowed="a robot whose arm joints are all prescribed", hint=hint)
     known = ParameterCovarianceBeforePlan() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
     progress.begin_stage("finding where the motion begins and ends")
@@ -113,9 +112,9 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     if options.start_joint_positions is not None:
         return start_joint_positions_as_array(system, options.start_joint_positions)
     if not system.grasps:
-        what, where = "the start of the motion is not given", "plan.start_joint_positions"
-        hint = "set it, or model.grasp: the positions then follow from the grasp"
-        raise ConfigError(what, where=where, allowed="the position of every joint that moves", hint=hint)
+        what, where = "the start positions of the joints are not given", "plan.start_joint_positions"
+        hint = f"set {where}, or set model.grasp, from which start positions follow"
+        raise ConfigError(what, where=where, allowed="a start position of every joint that moves", hint=hint)
     angles = grasping_joint_angles(system, dict(zip(system.parameters.names, map(float, theta), strict=True)))
     return start_joint_positions_as_array(system, {name: angles[name] for name in angles if name in system.prescribed})
 
@@ -132,9 +131,9 @@ def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluato
 
 def _place(options: PlanOptions, begin: Array) -> Array:
     if (options.target_position is None) == (options.point_target_offset_from_start is None):
-        what, hint = "the target of the point is not given", "set one of the two"
+        what, hint = "the target of the point is not given", "set one of these two keys"
         if options.target_position is not None:
-            what, hint = "the target of the point is given twice", "set one of the two to null"
+            what, hint = "the target of the point is given twice", "set one of these two keys to null"
         allowed, where = "either plan.target_position or plan.point_target_offset_from_start", "plan.target_position"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if options.goal == "path" and not options.point_waypoint_offsets_from_start:
@@ -147,9 +146,9 @@ def _place(options: PlanOptions, begin: Array) -> Array:
 
 
 def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, place: Array) -> None:
-    """Raise `ConfigError` if frames start outside the box, at `places` (frames, 3) [m], or if the target is outside."""
+    """Raise `ConfigError` without a valid box, or if the target `place` or a start position in `at` is outside it."""
     if options.box is None:
-        what, hint = "plan.goal: box needs plan.box", "set plan.box, or plan.goal: place"
+        what, hint = "plan.goal is box, but plan.box is not set", "set plan.box, or plan.goal: place"
         raise ConfigError(what, where="plan.box", allowed="the lowest and the highest corner [m]", hint=hint)
     low, high = np.array(options.box)
     if np.any(low >= high):
@@ -158,7 +157,7 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
         raise ConfigError(what, where="plan.box", allowed="the lowest corner first", hint="exchange the two numbers")
     places = [(name, x, "starts") for name, x in zip(inside.names, at, strict=True)]
     if options.point in inside.names:
-        places.append((str(options.point), place, "is to arrive"))
+        places.append((str(options.point), place, "has its target"))
     for name, where, when in places:
         over = np.maximum(low - where, where - high)
         if np.any(over > 0):
@@ -188,7 +187,7 @@ def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBefo
 
 
 def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
-    """The same motion from equilibrium with another step or other parameters."""
+    """The simulator with another step or other parameters, and the start equilibrium that belongs to them."""
     rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.start_system_configuration)
     return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
@@ -207,11 +206,12 @@ def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array)
 def _scenarios(
     rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBeforePlan
 ) -> list[PlanResidualAndLimitFunctions]:
-    """The same motion with parameters off by one std, along the axes that move the point's equilibrium most."""
+    """Cases with parameters off by one std along the two axes of their covariance that move the final point most."""
     mover, system = rows.simulator, rows.simulator.step.system
     if not len(known.parameter_names):
-        what, where = "no parameter uncertainty is known, but this needs it", "plan.minimize_parameter_sensitivity"
-        raise ConfigError(what, where=where, allowed="false, or with plan.parameter_run_folder: FOLDER of `solve`")
+        what, where = "the uncertainty of the parameters is not known", "plan.minimize_parameter_sensitivity"
+        allowed = "false; or true with the run folder of a `solve` under plan.parameter_run_folder"
+        raise ConfigError(what, where=where, allowed=allowed, hint="set plan.parameter_run_folder")
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
     slope = _point_slopes(rows, rows.quasi_static_coefficients, known)
@@ -255,17 +255,17 @@ def _outcome(
     broken = rows.worst_value_and_bound_by_violated_limit(rows.limited_values_and_jacobian(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
-        message += f"; {name} passes its limit of {what}: {value:.4g} where {bound:.4g} is allowed"
+        message += f"; {name} exceeds its limit: {what} reaches {value:.4g}, the limit is {bound:.4g}"
     if not np.all(np.isfinite(rollout.state)):
-        message += "; the model could not be stepped to the end of the motion"
+        message += "; the simulation failed before the end of the motion"
     if broken:
-        message += "; take a longer plan.duration, a nearer place, or a higher plan.limits where the machine allows it"
+        message += "; set a longer plan.duration, a nearer target, or higher plan.limits if the robot allows it"
     # the motion with the smallest mean error need not reach the target at the most likely parameters
     doubt = float(np.linalg.norm(std)) if std is not None and rows.options.minimize_parameter_sensitivity else 0.0
     far = not error <= TARGET_REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
     if shot.is_converged and far:
-        message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its place"
-        message += "; take a longer plan.duration or a nearer place"
+        message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its target"
+        message += "; set a longer plan.duration or a nearer target"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
     return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)
@@ -278,7 +278,7 @@ def _shortest(
     attempt: Callable[[float], TargetMotionPlan],
     progress: Progress,
 ) -> TargetMotionPlan:
-    """Bisect, in steps of h, between a duration that reaches the goal and one that does not."""
+    """The plan with the shortest duration, found by bisection to 0.02 s; `found` itself if that misses the goal."""
 
     def good(one: TargetMotionPlan) -> bool:
         return one.is_successful and one.max_residual_speed <= options.point_rest_speed_tolerance

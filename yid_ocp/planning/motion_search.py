@@ -50,7 +50,7 @@ def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array,
 
 @dataclass(eq=False)
 class PlanResidualAndLimitFunctions:
-    """The functions that compute the goal residuals and limited quantities of a planned motion."""
+    """Functions of a planned motion: the residual of its goal, and the quantities that must stay within limits."""
 
     simulator: PathSimulator
     options: PlanOptions
@@ -155,7 +155,7 @@ class PlanResidualAndLimitFunctions:
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
     def worst_value_and_bound_by_violated_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
-        """Return the worst row of each violated kind of limit: its name, value and bound."""
+        """Return row name, value and bound of the worst violation, by kind of limit. Other kinds are absent."""
         found = {}
         for rows, own in self.split_values_by_limit_kind(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
@@ -199,7 +199,7 @@ class MotionToTargetResult:
 
 
 class MotionToTargetSearch:
-    """A search for a motion that reaches a target. Goal residuals cover all parameter cases, limits only the first."""
+    """A search for the motion that reaches a target best in all `cases` of parameters. Limits hold for the first."""
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
@@ -224,7 +224,7 @@ class MotionToTargetSearch:
 
         The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
         bounds `lower` and `upper` of the coefficients are enforced by an interior trust-region method (Branch, Coleman
-        and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations.
+        and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations per multiplier update.
         """
         low, high = lower.ravel(), upper.ravel()
         x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
@@ -267,7 +267,7 @@ class MotionToTargetSearch:
 
 
 def _prior(columns: int, bounded: Sequence[int]) -> Array:
-    """Prior information: parameters have a std of `MAX_WEAK_RELATIVE_STD`, other unknowns a negligible term."""
+    """Prior information of each column: parameters have a std of `MAX_WEAK_RELATIVE_STD`, others a negligible term."""
     prior = np.full(columns, 1e-6)
     prior[list(bounded)] = MAX_WEAK_RELATIVE_STD**-2
     return prior
@@ -302,8 +302,8 @@ class DOptimalityCriterion:
 class EffectDiscriminationCriterion:
     """A measure of how well the measurements separate effects: -1/2 log sum_ij 1 / (1 + d_ij^2).
 
-    d_ij^2 = min_b |J_i a - J_j b|^2 is the distance of effect i (amplitudes a, sensitivities J_i) from the best
-    imitation by effect j and the nuisance unknowns (b, J_j). The smallest distances dominate the sum.
+    d_ij^2 = min_b |J_i a - J_j b|^2 is the squared distance of effect i (amplitudes a, sensitivities J_i) from its best
+    imitation by effect j and all nuisance unknowns (values b, sensitivities J_j). Small distances dominate the sum.
     """
 
     amplitude_columns: tuple[tuple[int, ...], ...]  # columns of the amplitudes of every effect
@@ -319,7 +319,7 @@ class EffectDiscriminationCriterion:
         return found
 
     def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Return the criterion [nat] and its gradient with respect to sensitivities `rows` (nr, columns)."""
+        """Return the criterion [nat] and, if `slope`, its gradient with respect to sensitivities `rows` (nr, nx)."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
@@ -345,7 +345,7 @@ class EffectDiscriminationCriterion:
 MotionSearchCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
 
 _MIN_TRUST_RADIUS, _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 1e-3, 0.05, 0.4  # for every unknown [rad or m]
-_MIN_STEP = 1e-9  # step in the linear picture that counts as none [rad or m]
+_MIN_STEP = 1e-9  # step of the linearised problem that counts as zero [rad or m]
 _MAX_INNER_ITERATIONS = 100  # iterations of the inner search
 _LIMIT_SLACK = 1e-3  # margin of the linear limits, as a fraction of the limits
 _MIN_GAIN = 1e-2  # gain of the criterion below which the search ends [nat]
@@ -354,14 +354,14 @@ _MAX_LIMIT_CORRECTIONS = 2  # largest number of corrections of the linear limits
 
 @dataclass(frozen=True)
 class MotionSearchResult:
-    """The result of a search for an informative motion, with coefficients w (K, nc) and criteria [nat]."""
+    """The coefficients w (K, nc) that a search for an informative motion found, and its criterion before and after."""
 
     w: Array
-    initial_criterion: float
+    initial_criterion: float  # [nat], as the other criteria
     final_criterion: float
     is_converged: bool
     n_iterations: int
-    configured_criterion: float = -np.inf  # in the configured problem; minus infinity if its rollout fails
+    configured_criterion: float = -np.inf  # at w in the configured problem; minus infinity if its rollout fails
 
 
 class InformativeMotionSearch:
@@ -385,7 +385,7 @@ class InformativeMotionSearch:
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
     def shrink_to_limits(self, w: Array) -> Array:
-        """Scale spline coefficients (K, nc) down until the motion satisfies its limits."""
+        """Scale spline coefficients (K, nc) down until the motion satisfies its limits. Zero if it never does."""
         for _ in range(60):
             if self._limited_values(w)[1]:
                 return w
@@ -398,7 +398,7 @@ class InformativeMotionSearch:
         return -np.inf if rows is None else self.criterion.value_and_gradient_wrt_sensitivities(rows, False)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
-        """Maximise the criterion in at most `rounds` rounds, from feasible coefficients `start` (K, nc)."""
+        """Maximise the criterion in at most `rounds` rounds from coefficients `start` (K, nc) within the limits."""
         w, radius = start, _INITIAL_TRUST_RADIUS
         value, rows = self._value_and_rows(w)
         first, finished, done = value, False, 0

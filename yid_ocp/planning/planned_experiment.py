@@ -1,9 +1,9 @@
 """Prediction of the recording and sensitivities that a planned arm motion would give with the configured sensors.
 
-During the search, the arm motion is prescribed and the required torques are measured, each with a constant error. The
-effect of errors of a driven arm's motion on all readings is computed once, at standstill, and eliminated (Golub and
-Pereyra 1973, doi:10.1137/0710036). The motion found is judged with the configured estimation problem, which is driven
-by these torques. The information of a camera is its mean rate over the recording, constant along the motion.
+In the problem of the search, the arm motion is prescribed, and its torques are measured with noise and a constant error
+of each joint. The effect of errors of a driven arm's motion on all readings is computed once, at standstill, and
+eliminated (Golub and Pereyra 1973, doi:10.1137/0710036). The motion found is judged with the configured estimation
+problem, which is driven by these torques. A camera gives the same information per second at all times: its mean.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ class SplineMotionExperiment:
     ) -> SplineMotionExperiment:
         """Make a planned experiment from plan options, at parameter `values` and with the free parameters `names`.
 
-        Raises `ConfigError` if there is no joint whose motion can be planned, or if the arms have servos. Raises
-        `ModelError` if no equilibrium is found.
+        Raises `ConfigError` if no joint's motion can be planned, if the arms have servos, or if the motion is too short
+        for the filter of efforts. Raises `ModelError` if no equilibrium is found.
         """
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_point_names or not (system.driven or system.prescribed):
-            said, allowed = "the model has no joint whose motion could be planned", "a robot whose arms move"
+            said, allowed = "the model has no robot arm that a plan can move", "robot arms that move, without clamps"
             raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
             what = "motions cannot be planned for servos, whose commands differ from their motion"
@@ -171,7 +171,7 @@ class SplineMotionExperiment:
         return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
     def planned_sensitivities_to_unknowns(self, w: Array) -> Array:
-        """Return a planned recording's whitened sensitivities to relative changes of unknowns. Raises `SolverError`."""
+        """Return the whitened sensitivities of the recording planned with `w` to relative changes of the unknowns."""
         return self._weighted(self.planned_estimation_problem(w))
 
     @property
@@ -196,7 +196,7 @@ class SplineMotionExperiment:
 
     @cached_property
     def _known(self) -> EstimationProblem:
-        """The problem of the search, in which the motion is known and torques are measured."""
+        """The estimation problem of the search, in which the motion is known and torques are measured."""
         recording = self._noise_free_recording(self.zero_coefficients, _MAX_SEARCH_POINT_RATE)
         joints = recording.joints
         assert joints is not None
@@ -215,7 +215,7 @@ class SplineMotionExperiment:
 
     @cached_property
     def estimated_unknown_scales(self) -> Array:
-        """The typical size of each unknown, relative to which its changes are given, in column order."""
+        """The sizes of the unknowns, in column order. Sensitivities are per change of an unknown by its size."""
         return _sizes(self._known)
 
     @cached_property
