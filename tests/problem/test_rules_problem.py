@@ -396,7 +396,7 @@ def test_a_free_parameter_has_room_about_its_start(bounds, words):
 
 
 def test_there_must_be_something_to_estimate_on(free_step):
-    with pytest.raises(DataError, match="no recording to estimate on"):
+    with pytest.raises(DataError, match="no recording to estimate from"):
         EstimationProblem(free_step, [], FREE)
     t = H * np.arange(10)
     hidden = recording(None, seen(["tip"], t, np.full((10, 1, 3), np.nan), std=np.ones((10, 1, 3))))

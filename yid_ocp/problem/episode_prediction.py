@@ -54,7 +54,7 @@ class _Prepared:
 
 @dataclass(frozen=True)
 class EpisodePredictor:
-    """A predictor that computes an episode from the initial state to readings with derivatives. It is stateless."""
+    """A stateless predictor of episodes: initial state, rollout and sensor readings, with derivatives by unknowns."""
 
     model_functions: ModelFunctions
     options: ProblemOptions
@@ -79,7 +79,7 @@ class EpisodePredictor:
         return tuple(begin[kind] + (hidden.index(name) if kind == "z" else joints(name)) for kind, name in split)
 
     def episode_with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
-        """Fit an episode's initial state to the first measured points, if the option `initial_state` says so."""
+        """Return the episode; with a fitted initial state if `options.initial_state` is `fitted_to_points`."""
         if episode.fixed_initial_state is not None or self.options.initial_state != "fitted_to_points":
             return episode
         samples = episode.measurements
@@ -140,7 +140,7 @@ class EpisodePredictor:
         return InitialStateWithSensitivity(state, np.hstack([by_theta, by_offset]), rest, "")
 
     def are_input_corrections_neutral_and_fixed(self, episode: Episode, theta: Array) -> bool:
-        """Check whether all effects on the episode's inputs, times and tracked reference are neutral and fixed."""
+        """Return whether all effects on the episode's inputs, times and tracked reference are neutral and not free."""
         wanted = self.unknowns.free_parameter_names
         inputs = self.corrected_inputs(episode, theta, wanted)
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
@@ -167,10 +167,10 @@ class EpisodePredictor:
         by_unknowns: Array | None = None,
         inputs: CorrectedInputs | None = None,
     ) -> CorrectedInputs:
-        """Correct an episode's inputs, and compute the momentum that effects add to the tracking reference.
+        """Return an episode's corrected inputs, with the momentum that effects add to the tracking reference.
 
         `state` (nx,) is the initial state; `by_unknowns` (nx, d) is its derivative with respect to `names` and the
-        offset. `inputs` are the corrected inputs of `theta` and `names`, if known.
+        state offset. `inputs` are the corrected inputs of `theta` and `names`, if known.
         """
         inputs = inputs or self.corrected_inputs(episode, theta, names)
         if not self._follows_momenta:
@@ -182,7 +182,7 @@ class EpisodePredictor:
         return inputs.with_effect_momentum_in_reference(shift, recorded, measured, theta, names, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> CorrectedInputs:
-        """Correct recorded torques, angles and paths for effects, with derivatives by the parameters `names`."""
+        """Return recorded torques, angles and paths corrected for effects, with derivatives by parameters `names`."""
         corrections = self.model_functions.input_corrections
         torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
@@ -315,7 +315,7 @@ class EpisodePredictor:
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
     def rollout_node_values(self, rollout: Rollout) -> NodeStateValues:
-        """Return the states at all nodes of a rollout. Loads: efforts of prescribed or torques of driven joints."""
+        """Return the node values of a rollout for sensors. Loads: efforts of prescribed, torques of driven joints."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.actuated_coordinate_indices)] = rollout.torque
@@ -347,7 +347,7 @@ class EpisodePredictor:
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
     def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeValueSmoother | None:
-        """Make a smoother of predicted efforts that equals the filter of measured efforts. None if there are none."""
+        """Make a smoother of predicted efforts that equals the filter of measured efforts. None without a filter."""
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
@@ -488,12 +488,12 @@ class _Trajectory:
 def episode_at_equilibrium_with_denoised_gear_loads(
     predictor: EpisodePredictor, episode: Episode, theta: Array
 ) -> Episode:
-    """Start an episode at the equilibrium near its first points, and remove effort noise from the gear loads."""
+    """Return an episode that starts at the equilibrium near its first points, with gear loads without effort noise."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
 
 def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Episode with an equilibrium near its first points, kept at all parameters: of least energy at `theta` if near."""
+    """Episode with a guess of the equilibrium near its first points: that of least energy at `theta` if it is near."""
     fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
     early = None if fitted or not predictor.system.grasps else _until_first_points(episode)
     if early is None:

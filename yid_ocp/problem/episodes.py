@@ -56,7 +56,7 @@ class EpisodePrediction:
 
     @property
     def feedback_torque_and_sensitivity(self) -> Array | None:
-        """The array (N, nu, 1 + d) of `torque_correction` and its derivative, if known. None without a correction."""
+        """The array (N, nu, 1 + d) of `torque_correction` and then its d derivatives, if known. None without it."""
         if self.torque_correction is None:
             return None
         known, slopes = self.torque_correction[:, :, None], self.torque_correction_sensitivity
@@ -65,12 +65,12 @@ class EpisodePrediction:
 
 @dataclass(frozen=True)
 class InitialStateWithSensitivity:
-    """The initial state of a rollout, its derivative and equilibrium, or the reason why there is no initial state."""
+    """The initial state of a rollout, with derivative and equilibrium, or the reason why no initial state was found."""
 
     state: Array  # (q, p, z), (nx,)
     state_sensitivity: Array  # by the wanted parameters, then the state offset, (nx, d)
-    equilibrium: Equilibrium | None
-    failure_message: str
+    equilibrium: Equilibrium | None  # None for a fitted or given state
+    failure_message: str  # empty on success
 
 
 log = logging.getLogger(__name__)
@@ -118,7 +118,7 @@ class TorqueAndAngleErrorModel:
         )
 
     def on_finer_steps(self, ratio: int) -> TorqueAndAngleErrorModel:
-        """Return this error model for `ratio` times shorter steps. Torques are held, the reference is interpolated."""
+        """Return this model for `ratio` times shorter steps, with torques held and the reference interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
         if (known := self.smoothed_reference) is not None:
@@ -196,7 +196,7 @@ class Episode:
 
     @property
     def tracking_feedback_to_smoothed_reference(self) -> TrackingFeedback | None:
-        """The tracking filter, which follows the Kalman smoother's estimate if there is one."""
+        """The tracking filter, with the Kalman smoother's estimate as its reference if there is one."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)

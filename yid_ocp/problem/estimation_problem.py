@@ -106,7 +106,7 @@ class EstimationProblem(ReprMixin):
             options = replace(options, path_cutoff=select_path_cutoff([*recordings, *held_out], step.system.prescribed))
         check_free_parameter_names(step.system, free, options)
         if not recordings:
-            what, hint = "there is no recording to estimate on", "add one under recordings.estimate"
+            what, hint = "there is no recording to estimate from", "add a recording under recordings.estimate"
             raise DataError(what, where="recordings.estimate", allowed="one recording or more", hint=hint)
         theta = step.system.parameters.vector(values)
         names = (*free, *(name for name in may_free if name not in free))
@@ -199,7 +199,7 @@ class EstimationProblem(ReprMixin):
     def positive_unknowns_mask(self) -> BoolArray:
         """The mask (nx,) of nonnegative unknowns that start above zero, except amplitudes that may become zero.
 
-        An amplitude of zero is a common result. Where an effect has shape parameters, these would lose their influence.
+        An amplitude may become zero unless its effect has shape parameters, which would then lose their influence.
         """
         effects = [e for e in self.system.effects if isinstance(e, EffectBase) and not e.shape_parameter_names]
         vanishing = {name for e in effects for name in e.amplitude_parameter_names if e.neutral_values[name] == 0}
@@ -280,10 +280,10 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Compute the cost, its gradient (adjoint method; with process noise, sensitivities) and the evaluation.
+        """Return the cost, its gradient (nx,) and the evaluation at `x`, without its Jacobian.
 
-        A known `evaluation` at `x` saves the rollout, which is most of the work. The returned evaluation has no
-        Jacobian.
+        The gradient comes from the adjoint method, or from the Jacobian if residuals are whitened by more than sensor
+        noise. A known `evaluation` at `x` saves the rollout, which is most of the work.
         """
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
@@ -355,7 +355,7 @@ class EstimationProblem(ReprMixin):
     def held_out_parameter_vector(self, x: Array, held: Episode) -> Array:
         """Return the parameter vector theta (ntheta,) of a held-out recording, with the shared parameters in `x`.
 
-        Local parameters have the values in `x` if it is part of an estimation recording, else their initial values.
+        Local parameters have the values in `x` if `held` is part of an estimation recording, else initial values.
         """
         whole = held.initial_state_shared_with
         theta, _ = self.unpack_episode_unknowns(x, whole or 0)
@@ -393,7 +393,7 @@ class EstimationProblem(ReprMixin):
         return self._changed(theta=theta)
 
     def with_model_functions(self, functions: ModelFunctions) -> EstimationProblem:
-        """Return a problem with other model functions, which have the free and some fixed parameters. Episodes stay."""
+        """Return a problem with the same episodes and other model functions, of all free and some fixed parameters."""
         index, names = self.system.parameters.index, functions.step.system.parameters.names
         return self._changed(model_functions=functions, theta=self.theta[[index(name) for name in names]])
 
@@ -417,7 +417,7 @@ class EstimationProblem(ReprMixin):
     def whitened_held_out_residual_and_jacobian(
         self, i: int, episode: Episode, result: EpisodePrediction
     ) -> ResidualAndJacobian:
-        """Whiten the residual of held-out recording `i` without robust loss; `result` is from `predict_held_out`."""
+        """Return the whitened residual of held-out recording `i`, without robust loss, for its prediction `result`."""
         return whitened_prediction_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
     def truncated_to_duration(self, duration: float) -> EstimationProblem:

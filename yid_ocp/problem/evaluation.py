@@ -192,7 +192,7 @@ class UnknownVectorLayout:
         return result, own[len(self.free_parameter_names) :]
 
     def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
-        """Make an unknown vector with the same local parameters and initial state offset for all recordings."""
+        """Return the unknown vector (nx,) in which all recordings have the same local parameters and state offset."""
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
         return np.concatenate(parts)
@@ -203,8 +203,8 @@ def stated_prior_stds_of_unknowns(
 ) -> Array:
     """Return the standard deviation of each unknown's stated Gaussian prior, (nx,). Infinite without prior.
 
-    `inertia` returns the mass matrix diagonal, which converts an initial velocity to a momentum. An effect's internal
-    coordinate has a uniform prior within its limits, of which the standard deviation is returned.
+    `inertia` returns the mass matrix diagonal of named joints, which converts a velocity std to a momentum std. An
+    effect's internal coordinate has a uniform prior within its limits, and the std of this uniform prior is returned.
     """
     limits = _unobserved_state_limits(system)
     stds = []
@@ -225,7 +225,7 @@ def stated_prior_stds_of_unknowns(
 
 
 def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Return the Jacobian (k, nx) of the stated priors' whitened residual, which equals Jacobian x (x - initial x)."""
+    """Return the Jacobian P (k, nx) of the stated priors' whitened residual P (x - x0); x0: the initial unknowns."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -282,7 +282,7 @@ def check_free_parameter_names(system: System, free: Sequence[str], options: Pro
         if name not in free:
             what = f"the parameter '{name}' has a prior or differs per recording, but is not free"
             where = f"parameters.{name}"
-            raise ConfigError(what, where=where, **unknown_name_error_arguments(name, free, "set its `free: true`"))
+            raise ConfigError(what, where=where, **unknown_name_error_arguments(name, free, f"set {where}.free: true"))
 
 
 def check_unique_recording_names(names: Sequence[str]) -> None:
@@ -298,7 +298,7 @@ def check_no_known_value_of_free_parameters(episodes: Iterable[Episode], free: S
         known = {*episode.known_parameters, *getattr(episode.fixed_initial_state, "fitted_parameters", ())}
         if found := [name for name in free if name in known]:
             what = f"{found[0]} is free, but this recording has a known value of it"
-            allowed, hint = "parameters that are either free or known", f"set parameters.{found[0]}.free: false"
+            allowed, hint = "a parameter is either free or known, not both", f"set parameters.{found[0]}.free: false"
             raise ConfigError(what, where=f"recording '{episode.name}'", allowed=allowed, hint=hint)
 
 

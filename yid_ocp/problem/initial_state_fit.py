@@ -41,32 +41,32 @@ class FixedInitialState:
     """An initial state that does not depend on the unknowns. It is given or fitted to the first measured points."""
 
     state: Array  # (q, p, z) at node 0, (nx,)
-    fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # in their units
+    fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # values fitted together with the state
 
 
 @dataclass(frozen=True)
 class _Task:
-    """One fit: measured rows, theta, configuration and weights of the prior, number of parameters, softness."""
+    """The data of one fit of a configuration to the points of one frame."""
 
-    measured: list[tuple[SensorMeasurements, int]]
+    measured: list[tuple[SensorMeasurements, int]]  # measurements of each sensor, and its row of this frame
     theta: Array
-    rest: Array
-    prior: Array
-    wanted: int
-    softness: float
+    rest: Array  # configuration at which the prior has its mean, (n,)
+    prior: Array  # weight of each coordinate's deviation from `rest`, (n,)
+    wanted: int  # number of parameters that are fitted as well
+    softness: float  # factor on the noise of measurements and constraints
 
 
 class InitialStateFitter:
     """A solver that fits an initial state, and optionally parameters, to the first measured points of an episode.
 
-    At the first frame, Gauss-Newton over the configuration q (and the parameters `fitted_parameters`, which need finite
-    bounds) minimises the misfit of the points w(q), the elastic energy (stiffnesses kappa_i) and the violation of the
-    constraints phi(q):
+    At the first frame, a search over the configuration q (and the parameters `fitted_parameters`, which need finite
+    bounds) minimises the misfit of points w(q) to measured points wbar, the elastic energy (stiffnesses kappa_i, rest
+    angles q_rest,i) and the violation of the constraints phi(q):
 
         |(w(q) - wbar)/std|^2 + sum kappa_i/kappa_mean (q_i - q_rest,i)^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2.
 
-    The energy determines angles that no point shows, such as the roll of a clamp. The last frame of the window is
-    fitted with a prior of small velocity from the first. The momentum follows from this velocity.
+    The energy determines angles that points do not show, such as the roll of a clamp. The last frame of the window is
+    fitted near the first (prior: small velocity). The velocity between both gives the momentum.
     """
 
     def __init__(self, step: Step, fitted_parameters: Sequence[str] = ()) -> None:
@@ -125,9 +125,9 @@ class InitialStateFitter:
                     if near <= last and np.any(group.weight[row] > 0):
                         frames.setdefault(near, []).append((group, row))
         if not frames:
-            what = f"no point is seen in the first {window:g} s, so the initial state cannot be fitted"
-            where, allowed = "problem.initial_state_fit_window", "a window in which a point is seen [s]"
-            hint = "widen the window, or set problem.initial_state: equilibrium"
+            what = f"no point is seen in the first {window:g} s of a recording, so its initial state cannot be fitted"
+            where, allowed = "problem.initial_state_fit_window", "a window in which a point is measured [s]"
+            hint = "set a longer window, or problem.initial_state: equilibrium"
             raise DataError(what, where=where, allowed=allowed, hint=hint)
         nodes = sorted(frames)
         first, then = nodes[0], nodes[-1]
@@ -175,7 +175,7 @@ class InitialStateFitter:
         return ca.Function("points", [e.q1, e.theta], [ca.densify(read["y"]), ca.densify(slopes)])
 
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
-        """Angle of each joint with a preset, and the torque of its spring there if the object is in equilibrium.
+        """Values of the parameters for joints' initial angle and for their springs' torque at equilibrium there.
 
         The clamps' unknown reactions f have least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa.
         """

@@ -189,8 +189,8 @@ class SensorMeasurements:
     def prediction_change_per_step(self, at_nodes: Array, unmoved: SensorMeasurements, steps: Array) -> Array:
         """Return the change of a prediction during one time step at each delayed sample, (M, k).
 
-        At a node it is the mean of adjacent steps. `at_nodes` (len(nodes), k) is the prediction. `unmoved` are the
-        measurements before the delay of `steps` (k,).
+        For a sample at a node, it is the mean of the adjacent steps. `at_nodes` (len(nodes), k) is the prediction at
+        `evaluation_nodes`. `unmoved` are the measurements before their shift by `steps` (k,).
         """
         nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short part may hold no sample of a slow sensor
@@ -236,7 +236,7 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
     """Locate a sensor's samples between rollout nodes. Raises `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
-        what, allowed = "a noise level is zero or missing", "a standard deviation above 0"
+        what, allowed = "a noise standard deviation is zero or missing", "a standard deviation above 0"
         place, hint = f"recording '{where}': {data.sensor.group_name}", f"set sensors.{data.sensor.group_name}.std"
         raise DataError(what, where=place, allowed=allowed, hint=hint)
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)

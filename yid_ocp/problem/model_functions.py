@@ -27,7 +27,7 @@ from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 
 @dataclass(frozen=True)
 class CorrectedInputs:
-    """The inputs of a rollout, corrected for effects, with derivatives (..., d) by d parameters (None: zero)."""
+    """The true inputs of a rollout: recorded inputs corrected for effects. Sensitivities (..., d) of None are zero."""
 
     torque: Array  # (N, nu) [N m]
     first_torque: Array  # torque of the initial equilibrium, (nu,) [N m]
@@ -54,7 +54,7 @@ class CorrectedInputs:
     def tracking_feedback_with_corrected_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
-        """Correct the tracking reference from measured to true angles, and add the momentum that effects cause."""
+        """Return `feedback` with its reference corrected to true angles, plus the momentum that effects cause."""
         turned = None if self.driven_angles_sensitivity is None else self.driven_angles - measured
         if feedback is None or (turned is None and self.momentum_shift is None):
             return feedback
@@ -76,8 +76,8 @@ class CorrectedInputs:
     ) -> CorrectedInputs:
         """Return a copy with the momentum that effects add to the tracking filter's reference in every step.
 
-        The angles in `recorded` are smoothed, the angles `measured` (N + 1, nu) are not. `by_internal` (nz, d) is the
-        derivative of the initial internal coordinates.
+        `recorded` has smoothed angles; `measured` (N + 1, nu) are the angles without smoothing. `by_internal` (nz, d)
+        is the derivative of the initial internal coordinates.
         """
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
@@ -92,7 +92,7 @@ class CorrectedInputs:
     def torque_sensitivity_with_feedback_reference(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
-        """Return the sensitivity (N, nu, width) of the corrected torque plus the feedback gain times its reference."""
+        """Return the sensitivity (N, nu, width) of the sum: corrected torque plus feedback gain times its reference."""
         reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
         for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
             if feedback is not None and slope is not None:
@@ -115,7 +115,7 @@ class CorrectedInputs:
 class InputCorrectionFunctions:
     """A set of compiled functions from recorded to true inputs and times, defined by the system's effects.
 
-    `names` are the parameters for which derivatives are available. A method's `wanted` is a subset of `names`.
+    `names` are the parameters for which derivatives are available. Methods return derivatives by some of them.
     """
 
     def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:
@@ -200,7 +200,7 @@ class InputCorrectionFunctions:
     def sensor_delays_with_derivatives(
         self, sensor: Sensor, theta: Array, names: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Return each output's recorded minus true time (k,) [s] and its derivatives (k, d) by `names`, or None."""
+        """Return each output's delay, recorded minus true time (k,) [s], and its derivatives (k, d); None: no delay."""
         return self._evaluate(self._sensor_delays(sensor), theta, names)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
@@ -230,20 +230,20 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 @dataclass(frozen=True)
 class NodeStateValues:
-    """The numerical values of `NodeStateSymbols` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m)."""
+    """The values at K nodes on which sensor readings depend, (K, n) unless stated otherwise."""
 
-    q: Array
-    v: Array
-    a: Array
-    z: Array
-    load: Array
-    lam: Array
+    q: Array  # coordinates
+    v: Array  # velocities
+    a: Array  # accelerations
+    z: Array  # internal coordinates of effects, (K, nz)
+    load: Array  # efforts at the coordinates
+    lam: Array  # constraint forces, (K, m)
 
     @staticmethod
     def from_trajectory(
         step: Step, state: Array, load: Array | None = None, lam: Array | None = None
     ) -> NodeStateValues:
-        """Compute the values at all nodes of a trajectory (K, nx). Loads and constraint forces default to zero."""
+        """Compute the values at all nodes of a trajectory `state` (K, nx). Default load and constraint force: zero."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
         rates, h = (central_difference_velocity, second_difference_acceleration), step.time_step
@@ -291,7 +291,7 @@ def _inner_nodes(nodes: IntArray, count: int) -> IntArray:
 
 
 class _SensorReadings(NamedTuple):
-    """Readings (K, k) of a sensor at K nodes, with derivatives (K, k, ...); see `sensor_function_with_jacobians`."""
+    """Readings (K, k) of a sensor's k outputs at K nodes, and derivatives (K, k, ...) by node values and parameters."""
 
     output: Array
     by_q: Array
@@ -304,14 +304,14 @@ class _SensorReadings(NamedTuple):
 
     @property
     def needs_neighbours(self) -> bool:
-        """Whether they depend on velocities, accelerations or constraint forces, which need neighbouring nodes."""
+        """Whether readings depend on velocities, accelerations or constraint forces, hence on neighbouring nodes."""
         return self.by_v.shape[2] + self.by_a.shape[2] + self.by_lam.shape[2] > 0
 
 
 class ModelFunctions:
     """The compiled functions of a system: sensor readings, equilibrium, initial state fit and input corrections.
 
-    `names` are the parameters for which derivatives are available. `start_parameters` are fitted with initial states.
+    `names` are the parameters for which derivatives are available; `start_parameters` those fitted with initial states.
     """
 
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:
@@ -345,7 +345,7 @@ class ModelFunctions:
 
     @property
     def arms_only_integrator_step(self) -> Step:
-        """The compiled step of the arms alone, from which the tracking filter's gains are computed."""
+        """The compiled step of a model of the driven arms alone, for the computation of the tracking filter's gains."""
         return self._arms(None)
 
     @property

@@ -44,10 +44,9 @@ class MultivariateGaussianPrior:
 
 @dataclass(frozen=True)
 class ExcessResidualCriteria:
-    """The limits beyond which a residual exceeds its noise: a significance level and a smallest excess of chi2.
+    """The criteria by which a residual exceeds its noise: chi2 is significant, and chi2/n - 1 is at least a minimum.
 
-    A residual exceeds its noise if it is significant and chi2/n - 1 is at least `min_excess_chi2_per_dof`. The fraction
-    `noise_fraction_of_stated_std` of stated standard deviations is noise; the rest represents model error.
+    The stated standard deviations times `noise_fraction_of_stated_std` are the noise; the rest of them is model error.
     """
 
     significance_level: float = 0.01
@@ -57,7 +56,7 @@ class ExcessResidualCriteria:
 
 @dataclass(frozen=True)
 class DividedLinksModel:
-    """A model of the object in which each link is divided in two. Factors on parameters keep its stiffness."""
+    """A model of the object with each link divided in two. `parameter_factors` on parameters keep the stiffness."""
 
     build_step: Callable[[bool], Step]  # function of whether the step is compiled
     parameter_factors: Mapping[str, float]
@@ -76,14 +75,13 @@ class ProblemOptions:
     multivariate_prior : MultivariateGaussianPrior
         Correlated prior of several parameters, in place of entries of `prior_stds`.
     stated_std_factor : float
-        Factor by which the stated standard deviations, of noise and priors, are already multiplied, to leave noise
-        alone.
+        Ratio of the standard deviations of noise and priors here to the stated ones; below 1 to exclude model error.
     parameters_by_recording : mapping of recording to mapping of parameter to value
         Known values of parameters that differ between recordings, such as marker positions.
     known_initial_states : mapping of recording to array_like, shape (nx,)
         Known initial state (q, p, z) of a recording, in place of an equilibrium or a fit.
     has_uncertain_point_clocks : bool
-        Whether point groups can be late by half a sample, as noise, if damping parameters are free.
+        Whether clocks of point groups have an unknown offset (half a sample period) if damping parameters are free.
     data_issues : tuple of Issue
         Data quality issues found in the recordings.
     excess_residual_criteria : ExcessResidualCriteria

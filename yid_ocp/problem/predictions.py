@@ -27,7 +27,7 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
     for group in recording.points:
         if set(points) <= set(group.names):
             return group
-    what, where = "the points are in several groups", f"recording '{recording.name}'"
+    what, where = f"no point group contains all of {', '.join(points)}", f"recording '{recording.name}'"
     said = {"allowed": "points of one group", "hint": "put the points of one object in one group"}
     if missing := [point for point in points if point not in recording.point_names]:
         what = f"point '{missing[0]}' is not recorded"
@@ -35,7 +35,7 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
     raise DataError(what, where=where, **said)
 
 
-_GIVEN_FRAMES = 2  # frames that the predictions of a cable without a model start from, as its own start state does
+_GIVEN_FRAMES = 2  # number of measured frames that predictions without a model use, like the fit of the initial state
 
 
 def naive_cable_predictions(
@@ -75,16 +75,16 @@ def measured_point_positions(recording: Recording, points: Sequence[str]) -> Arr
 
 
 def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
-    """Positions (len(points), 3) [m] in the last of the frames that predictions without a model start from."""
+    """Measured positions (len(points), 3) [m] in the second frame, from which predictions without a model start."""
     at, where = measured_point_positions(recording, points), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
         what, allowed = f"there are {len(at)} frames of the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
-        raise DataError(what, where=where, allowed=allowed, hint="leave the recording out")
+        raise DataError(what, where=where, allowed=allowed, hint="remove the recording from the settings")
     start = np.asarray(at[_GIVEN_FRAMES - 1])
     if not np.all(np.isfinite(start)):
         hidden = points[int(np.argmin(np.isfinite(start).all(axis=1)))]
-        what, allowed = f"point '{hidden}' is not seen in frame {_GIVEN_FRAMES}", "a frame with all points"
-        hint = "begin the recording where all points are seen, or leave the point out"
+        what, allowed = f"point '{hidden}' is not seen in frame {_GIVEN_FRAMES}", "a frame with all points of the cable"
+        hint = "cut the recording so that it begins when all points are seen, or omit the point"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return start
 
@@ -212,7 +212,7 @@ def _channel_groups(
     theta: Array,
     rng: np.random.Generator | None,
 ) -> tuple[SensorChannelGroup, ...]:
-    """Readings of declared channels at every node."""
+    """Groups of predicted channels, other than joints and points, with readings at every node."""
     made: dict[str, SensorChannelGroup] = {}
     for sensor in (samples.sensor for samples in episode.measurements):
         name, _, quantity = sensor.group_name.rpartition(".")
@@ -241,7 +241,7 @@ def _channel_groups(
 
 
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
-    """A group with the recorded points that clamps follow: they are inputs and are not predicted."""
+    """The group, extended by the recorded points that clamps follow, which are inputs and are not predicted."""
     original = next(entry for entry in source.points if entry.name == group.name)
     clamps = predictor.options.clamp_pose_point_names
     followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point_name, clamp.z_axis_point_name))
@@ -317,7 +317,7 @@ def _commanded(
     names: tuple[str, ...],
     rng: np.random.Generator | None,
 ) -> JointGroup:
-    """Joints of servos at every node, with their commands."""
+    """Joint group of servos at every node, with noisy angles, commands and gains."""
     source, times = episode.recording.joints, episode.grid.node_times
     assert source is not None
     columns = [source.names.index(name) for name in names]

@@ -33,8 +33,8 @@ _NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion i
 def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -> float:
     """Choose the lowest cutoff [Hz], from 10 Hz in octaves to rate / 5, above which angles contain only noise.
 
-    What a filter of twice the cutoff keeps beyond this one is compared with white noise of the angles' own size. A
-    lower cutoff removes motion, and the prediction of efforts lacks the torques that this motion needs.
+    The power of the angles between a cutoff and twice this cutoff is compared with that of white noise of the angles'
+    noise level. A lower cutoff would remove motion, and predicted efforts would lack the torques for this motion.
     """
     groups = [own.joints for own in recordings if own.joints is not None and len(own.joints.t) > 1]
     most = min((_MAX_CUTOFF_OVER_RATE / median_sample_period(group.t) for group in groups), default=math.inf)
@@ -65,11 +65,10 @@ def mean_step_inputs(
     """Return the mean input (steps, nu) of driven joints in every step: torque [N m] or servo command [rad or m].
 
     Effort samples are interpolated by a cubic spline. Efforts that are interval means are integrated, and the input is
-    the derivative of a spline through the integral, which preserves every mean. Efforts of kind `command` and held
-    commands are piecewise constant. A lost sample is interpolated from its neighbours. Each input acts later than
-    recorded by `delay` (nu,) [s]. With `servos` (for all driven joints) the input is the position command. `where` is
-    the name of the recording. Raises `DataError` if a joint is missing, or if efforts (with `servos`: commands) are not
-    recorded.
+    the derivative of a spline through the integral, which preserves every mean. Efforts of kind `command` are piecewise
+    constant, with up to five lost samples in a row interpolated. Each input acts later than recorded by `delay` (nu,)
+    [s]. With `servos` (of all driven joints) the input is the position command, or `MOTOR_OFF_COMMAND`. `where` is the
+    name of the recording. Raises `DataError` if a joint is missing or efforts (`servos`: commands) are not recorded.
     """
     if not driven:
         return np.zeros((grid.steps, 0))
@@ -89,7 +88,7 @@ def mean_step_input_delay_derivative(
     delay: Array,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Return the derivative (steps, nu) of `mean_step_inputs` by each joint's delay; at jumps, a mean of both sides."""
+    """Return the derivative (steps, nu) of `mean_step_inputs` by each joint's delay. At jumps: mean of both sides."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
@@ -102,7 +101,7 @@ def mean_step_input_delay_derivative(
 def _motor_off_steps(
     joints: JointGroup, driven: tuple[str, ...], grid: TimeGrid, where: str, has_servos: bool
 ) -> BoolArray:
-    """Mask (steps, nu) of steps with servo motors off: by `torque_enable` at mid-step; all if there are no commands."""
+    """Mask (steps, nu) of steps with servo motors off, by `torque_enable` at mid-step. All steps without commands."""
     is_off = has_servos and joints.position_command is None
     if is_off or not has_servos or joints.torque_enable is None:
         return np.full((grid.steps, len(driven)), is_off)
@@ -112,9 +111,9 @@ def _motor_off_steps(
 
 
 def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
-    """Read the firmware gains in recordings, as `JOINT.servo_gain_factor` values by recording name.
+    """Read the servo gains stated in recordings: by recording name, the values of parameters `JOINT.servo_gain_factor`.
 
-    Raises `DataError` if only some of the recordings with motors on state gains, because gains cannot be compared then.
+    Raises `DataError` if only some of the recordings with position commands state gains.
     """
     wanted = {name: f"{name}.{JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX}" for name in system.servos}
     wanted = {name: parameter for name, parameter in wanted.items() if parameter in system.parameters}
@@ -132,7 +131,7 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
         found[recording.name] = {wanted[name]: float(gains[column]) for name, column in columns.items()}
     if found and silent:
         what = "the recording has no proportional gain of its servos, but others have it"
-        hint = 'write it in all recordings, or set parameters: {"*.servo_gain_factor": {initial: GAIN}}'
+        hint = "write the attribute in all recordings, or remove it from all and set parameters `*.servo_gain_factor`"
         where = f"recording '{silent[0]}': joints, attribute proportional_gain"
         raise DataError(what, where=where, allowed="the gain in all recordings, or in none", hint=hint)
     return found
@@ -214,7 +213,7 @@ def smoothed_joint_efforts(
     if joints is None or joints.effort is None:
         what = "the elastic gears of the model need joint efforts, but the recording has none"
         where, allowed = f"recording '{recording.name}': joints/effort", "the effort of every joint"
-        raise DataError(what, where=where, allowed=allowed, hint="leave series_elasticity and backlash out")
+        raise DataError(what, where=where, allowed=allowed, hint="remove the effects series_elasticity and backlash")
     effort = low_pass(joints.t, joints.effort[:, recorded_joint_column_indices(joints, names, recording.name)])
     # the mean of an interval belongs to its centre
     late = 0.0 if joints.effort_sampling_kind_or_default == "sample" else median_sample_period(joints.t) / 2
@@ -224,8 +223,8 @@ def smoothed_joint_efforts(
 def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
     """Remove effort noise from gear loads: return the model's loads plus the slow part of measured minus model.
 
-    `measured` and `model` are smoothed loads (N + 1, k), compared at `nodes` (M,). Outside these nodes the
-    difference is constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
+    `measured` and `model` are smoothed loads (N + 1, k). Before the first and after the last of `nodes` (M,), their
+    difference is taken as constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
     """
     gap = (measured - model)[np.clip(np.arange(len(model)), nodes.min(), nodes.max())]
     return measured - gap + ZeroPhaseLowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
@@ -259,7 +258,7 @@ def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
 
 
 def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
-    """Return the kinds of effects that cannot be candidates, by the signals that they require but recordings lack."""
+    """Return kinds of effects that cannot be candidates, by missing signals, such as 'camera and joints.effort'."""
     present, found = signal_kinds_for_effects(recordings), dict[str, list[str]]()
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):

@@ -22,13 +22,13 @@ _MIN_RELATIVE_WEIGHT = 1e-4  # fraction of the largest weight below which weight
 
 @dataclass(frozen=True)
 class ZeroPhaseLowPassFilter:
-    """A zero-phase Butterworth low-pass filter of order 4 on an even clock, run forward and backward."""
+    """A zero-phase low-pass filter for evenly spaced samples: Butterworth of order 4, run forward and backward."""
 
-    cutoff: float  # frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter
-    passes: int = 1
+    cutoff: float  # frequency at which each pass halves the amplitude [Hz]; infinite for no filter
+    passes: int = 1  # a pass is one run forward and one backward
 
     def __call__(self, t: Array, values: Array) -> Array:
-        """Smoothed values (M, k) at the same times. An uneven clock is resampled internally to its median step."""
+        """Return smoothed `values` (M, k) at the times `t` (M,) [s]. Uneven times are resampled internally."""
         if not math.isfinite(self.cutoff):
             return values
         step = float(np.median(np.diff(t)))
@@ -47,7 +47,7 @@ class ZeroPhaseLowPassFilter:
 
     @property
     def end_distortion_duration(self) -> float:
-        """The time [s] after which the distortion at the ends of a record has decayed to a thousandth."""
+        """The time [s] from the ends of a record at which their distortion has decayed to a thousandth."""
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * _FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
@@ -90,7 +90,8 @@ class ZeroPhaseLowPassFilter:
         least = _MIN_CUTOFF_FRACTION * nyquist
         if not least < self.cutoff < nyquist:
             allowed = f"above {least:.2g} and below {nyquist:g} Hz for this recording"
-            raise DataError(f"path_cutoff = {self.cutoff:g} Hz", where="problem.path_cutoff", allowed=allowed)
+            what, hint = f"path_cutoff = {self.cutoff:g} Hz is out of range", "set it to 0 for an automatic choice"
+            raise DataError(what, where="problem.path_cutoff", allowed=allowed, hint=hint)
         warped = math.tan(math.pi / 2 * self.cutoff / nyquist)
         damping = 2 * warped * np.sin(np.pi / (2 * _FILTER_ORDER) * np.arange(1, _FILTER_ORDER, 2))
         scale = 1 + damping + warped**2
@@ -119,7 +120,7 @@ class NodeValueSmoother:
 
 @lru_cache(maxsize=16)
 def _weights(low_pass: ZeroPhaseLowPassFilter, step: float) -> Array:
-    """Filter weights of neighbouring samples, an odd number that sum to one."""
+    """Filter weights of a sample and its neighbours, an odd number of weights whose sum is one."""
     response = low_pass._response(step)
     middle = len(response) // 2
     reach = int(np.abs(np.flatnonzero(np.abs(response) > _MIN_RELATIVE_WEIGHT * response[middle]) - middle).max())
@@ -134,10 +135,10 @@ def zero_phase_effort_filter(cutoff: float) -> ZeroPhaseLowPassFilter:
 
 @dataclass(frozen=True)
 class FirstOrderLag:
-    """The first-order lags of k channels, T dz/dt = x - z, with derivatives by their time constants T.
+    """The first-order lags of k channels from input x to output z, T dz/dt = x - z, with derivatives by the T.
 
-    With the time step h, E = exp(-h/T) and f = T/h (1 - E). At T = 0 both are zero and the output z equals the input x.
-    Node values allow a negative T: then z leads x, with z = x - T dx/dt.
+    With the time step h, E = exp(-h/T) and f = T/h (1 - E). At T = 0, E and f are zero, and z equals x. The methods for
+    node values also allow a negative time constant T: then z leads x, with z = x - T dx/dt.
     """
 
     time_constant: Array  # T, (k,) [s]
@@ -147,8 +148,8 @@ class FirstOrderLag:
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
         """Compute the lag's mean output z in each step, with derivatives, for inputs x (N, k) held over a step.
 
-        The mean is x + (z - x) f with z_{k+1} = x + (z - x) E, with E and f as in the class. The output starts at the
-        first input. `slope` (N, k, d) is the derivative of x.
+        The mean of step k is x_k + (z_k - x_k) f, where z_{k+1} = x_k + (z_k - x_k) E and z_0 = x_0, with E and f of
+        the class. `slope` (N, k, d) is the derivative of x.
         """
         decay, share, decay_slope, share_slope = self._factors()
         gap = self._following(value, np.zeros(value.shape), decay) - value
@@ -178,7 +179,7 @@ class FirstOrderLag:
         return followed, total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Convert a cost's gradient with respect to lagged values to gradients with respect to input and parameters."""
+        """Convert a cost's gradient `pull` (N, k) by lagged values to its gradients by the input and by parameters."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         by_time = self._by_time(value, self._straight(value, decay, share))
