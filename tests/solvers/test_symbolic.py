@@ -352,7 +352,7 @@ def test_blocks_and_rows_have_names():
 
 def test_what_is_added_must_fit():
     program = chain()
-    with pytest.raises(SolverError, match="'other' is neither an unknown nor a parameter"):
+    with pytest.raises(SolverError, match="'other' is neither a variable nor a parameter"):
         program.with_user_terms(ca.MX.sym("other") * program.w[0])
     with pytest.raises(SolverError, match="3 lower bounds for 2 constraints"):
         program.with_user_terms(0.0, program.w[:2], [0.0, 0.0, 0.0])

@@ -64,9 +64,9 @@ class Iterate:
     cost: float
     x: Array
     gradient_norm: float  # largest scaled component of the projected gradient
-    n_evaluations: int  # rollouts of all recordings
+    n_evaluations: int  # evaluations of the problem so far
     seconds: float
-    note: str = ""  # anything unusual, such as a shortened horizon
+    note: str = ""  # special conditions, such as a shortened horizon
 
 
 @dataclass(frozen=True, repr=False)
@@ -94,9 +94,9 @@ class Solution(ReprMixin):
     wall_time : float
         Duration of the search [s].
     evaluation, problem : Evaluation or None, EstimationProblem or None
-        Evaluation at `x`; the problem, whitened there.
+        Evaluation at `x`; the problem with its whitening filters at `x`.
     checks : EstimateChecksBeyondFit, optional
-        Made by `yid_ocp.solve`. Without checks, standard deviations include the data and the misfit only.
+        Checks by `yid_ocp.solve`. Without them, standard deviations include errors of the data and the misfit only.
     """
 
     status: Status
@@ -142,7 +142,7 @@ class Solution(ReprMixin):
 
     @cached_property
     def episode_predictions(self) -> tuple[EpisodePrediction | str, ...]:
-        """The prediction of each recording from its torques minus their offsets. A failed rollout gives a message."""
+        """Each recording's prediction from its torques minus estimated offsets, or the message of a failed rollout."""
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
         problem = problem_with_sensor_noise_only(self.problem)
@@ -175,32 +175,32 @@ IterationCallback = Callable[[Iterate], None]
 
 
 class StopSearch(Exception):  # noqa: N818
-    """An exception that a callback raises to end a search at its last iterate. Its text is the solution's message."""
+    """An exception for callbacks, which ends the search at its last iterate. Its text becomes the message."""
 
 
 @dataclass(frozen=True)
 class SolverResult:
-    """The raw result of a solver: status, best unknown vector, history, and equilibria there (None if unknown)."""
+    """The raw result of a solver: status, message, best unknown vector `x` and history."""
 
     status: Status
     message: str
     x: Array
     history: tuple[Iterate, ...]
     n_evaluations: int
-    equilibrium_guesses: EquilibriumGuesses | None = None
+    equilibrium_guesses: EquilibriumGuesses | None = None  # start equilibria at `x`, if known
     evaluation: Evaluation | None = None  # at `x`, with Jacobian, if the solver has computed it
     stopped_at_noise_level: bool = False  # many steps lowered the cost negligibly compared with the noise
-    stopped_by_callback: bool = False  # `StopSearch`
+    stopped_by_callback: bool = False  # the callback raised `StopSearch`
 
 
 @runtime_checkable
 class Solver(Protocol):
     """The interface of a solver, which is a frozen dataclass of settings, registered under its name.
 
-    Optional class attributes, with their defaults: `needs_rollout` (True), whether the rollout must succeed at the
-    start; `uses_process_noise_covariance` (False), whether the solver can whiten residuals by process noise;
+    Optional attributes and their defaults: `needs_rollout` (True), whether the rollout must succeed at the start;
+    `uses_process_noise_covariance` (False), whether the solver can whiten residuals by process noise;
     `estimates_torque_errors` (False), whether torque errors are unknowns; `with_coarse_tolerances` (the solver itself),
-    a quicker solver where process noise is whitened anew; `cost_tolerance` (0), a relative change of cost.
+    a quicker solver for preliminary searches; `cost_tolerance` (0), the relative change of cost at convergence.
     """
 
     @property
@@ -216,7 +216,7 @@ class Solver(Protocol):
 
 
 class SolverWithCheckedSettings:
-    """The base class of the package's own solvers, which checks settings against their annotated bounds."""
+    """The base class of the package's solvers, which checks the settings in the fields against their bounds."""
 
     name: ClassVar[str]
 
@@ -230,7 +230,7 @@ _DEFAULT_SOLVER = "gauss_newton"
 
 @dataclass
 class AcceptedIterateRecorder:
-    """A recorder of a solver's accepted iterates, evaluations and time, which passes iterates to a callback."""
+    """A recorder of a solver's accepted iterates, evaluations and time. It also passes iterates to a callback."""
 
     callback: IterationCallback | None
     start_time: float = field(default_factory=time.perf_counter)
@@ -287,8 +287,8 @@ def solve(
     `yid_ocp.solve` (`analysis.estimation`) adds the discretisation error and checks of the fit. Without
     `initial_unknowns`, free effects start with a small amplitude (`unknowns_with_neutral_effects_activated`). If the
     rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over a short horizon,
-    which then grows. Methods that can whiten by process noise are followed by steps with renewed weights. Torque errors
-    among the unknowns are judged by the same weights. A search that does not converge raises no error; see `status`.
+    which then grows. Solvers that can whiten by process noise are followed by steps with renewed whitening. The same
+    whitening applies to the result if torque errors are unknowns. A search without convergence raises no error.
 
     Parameters
     ----------
@@ -319,11 +319,11 @@ def solve(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Evaluated end of one run of a solver from one start, and the problem with its whitening."""
+    """The fit from one start."""
 
     result: SolverResult
-    evaluation: Evaluation
-    weighted: EstimationProblem
+    evaluation: Evaluation  # at the end of the search
+    weighted: EstimationProblem  # with whitening filters at the end of the search
     n_evaluations: int
     history: Sequence[Iterate]
 
@@ -343,7 +343,7 @@ class _MultiStartSearch:
         return min(self._fits, key=lambda fit: fit.evaluation.cost)
 
     def restart(self, first: Array, limits: ExcessResidualCriteria) -> None:
-        """Try other starts, as far as the best fit so far suggests them."""
+        """Fit again from other starts if the best fit is poor, uncertain or may be a local minimum."""
         noisy, most = self._problem.has_process_noise, 1 + len(INITIAL_VALUE_RESTART_FACTORS)
         for factor in INITIAL_VALUE_RESTART_FACTORS:
             if _good_fit(self._problem, self._best.evaluation):
@@ -392,7 +392,7 @@ class _MultiStartSearch:
         self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
 
     def _no_better_minimum(self, x: Array, note: str) -> _Fit | None:
-        """The best fit, where under its weights a start leads to it or to a worse one; else None."""
+        """The best fit if a coarse search with its whitening leads from `x` to it or to a worse one; else None."""
         best, coarse = self._best, getattr(self._solver, "with_coarse_tolerances", None)
         if coarse is None or not (best.evaluation.ok and self._problem.has_process_noise):
             return None
@@ -512,7 +512,7 @@ def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: It
 
 @dataclass
 class _RelinearizingSearch:
-    """Gauss-Newton steps over unknowns and torque errors together: residuals are whitened anew after every step."""
+    """A search by Gauss-Newton steps with process noise, in which residuals are whitened anew after every step."""
 
     weighted: EstimationProblem  # about the last iterate
     evaluation: Evaluation
@@ -545,7 +545,7 @@ class _RelinearizingSearch:
             least = np.where(problem.positive_unknowns_mask, np.maximum(lower, _LEAST_FACTOR * x), lower)
             along, whole = now.jacobian @ moved, now.jacobian @ step
             if np.any(along):
-                # where steps alternate, the secant through the last two says how much of this one is right
+                # if steps alternate, the secant through the last two gives the fraction of this step to take
                 alternation = float(along @ whole) / float(along @ along)
                 fraction = float(np.clip(1 / max(1 / fraction - alternation, 1.0), _MIN_STEP_FRACTION, 1.0))
             ahead = np.clip(x + fraction * step, least, upper)
@@ -565,7 +565,7 @@ class _RelinearizingSearch:
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:
-    """Positive unknowns that the data inform poorly, and those that have nearly vanished."""
+    """Mask of positive unknowns that the data determine poorly or that are nearly zero compared with their start."""
     x = fit.result.x
     if not fit.evaluation.ok or fit.evaluation.jacobian is None:
         return np.zeros(len(x), bool)
@@ -575,7 +575,7 @@ def _doubtful(fit: _Fit, first: Array) -> BoolArray:
 
 
 def uses_process_noise_covariance(solver: Solver) -> bool:
-    """Check whether a solver can whiten residuals by process noise."""
+    """Return whether a solver can whiten residuals by process noise."""
     return bool(getattr(solver, "uses_process_noise_covariance", False))
 
 

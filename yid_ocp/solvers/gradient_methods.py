@@ -44,9 +44,9 @@ class GaussNewton(base.SolverWithCheckedSettings):
     Each iteration solves min |J d + r|^2 + mu |d/s|^2 for the step d, subject to lower <= x + d <= upper, with the
     Jacobian J, the damping mu and the scales s. The step is accepted if the cost falls by a sufficient part of the
     predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5). The
-    search ends at a stationary point (`is_stationary_point`), not at a short step or a small predicted decrease of a
-    damped step. It also ends after many steps whose decrease is small against the noise, as happens if the cost is not
-    smooth (friction that changes sign, fast waves over many seconds).
+    search ends at a stationary point (`is_stationary_point`); a short or damped step with a small predicted decrease is
+    not sufficient. The search also ends after many steps that together lower the cost negligibly compared with the
+    noise. This happens if the cost is not smooth (friction that changes sign, fast waves over many seconds).
     """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
@@ -107,7 +107,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 message = f"no convergence in {self.max_iterations} iterations; "
                 message += "raise solver.max_iterations or free fewer parameters"
                 return ended(base.Status.ITERATION_LIMIT, message)
-            # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
+            # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
             scaled, mu = _step_within_length(jacobian * size, residual, mu, low, (upper - x) / size, longest)
@@ -138,7 +138,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 if is_stationary_point(problem, x, now):
                     return ended(base.Status.CONVERGED, _LOWEST)
                 message = f"no step lowers the cost ({trial.message or 'the linear model does not hold'}); "
-                message += "start nearer, shorten the recording, or use multiple_shooting"
+                message += "start nearer to the solution, shorten the recording, or use multiple_shooting"
                 return ended(base.Status.STALLED, message)
 
 
@@ -157,7 +157,7 @@ def _step_within_length(
 
 
 def _saved(problem: EstimationProblem, history: Sequence[base.Iterate], now: Evaluation) -> float | None:
-    """Decrease of the cost over the last steps together if it is negligible, else None."""
+    """Total decrease of the cost in the last steps if it is negligible, else None."""
     if len(history) <= _PATIENCE_STEPS:
         return None
     before, last = history[-1 - _PATIENCE_STEPS], history[-1]
@@ -173,7 +173,7 @@ def _saved(problem: EstimationProblem, history: Sequence[base.Iterate], now: Eva
 @base.SOLVERS.register("single_shooting")
 @dataclass(frozen=True)
 class SingleShooting(base.SolverWithCheckedSettings):
-    """The single shooting method with SciPy's L-BFGS-B, in which the unknowns are scaled to order one.
+    """The single shooting method: SciPy's L-BFGS-B minimises the cost over unknowns that are scaled to order one.
 
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
     """

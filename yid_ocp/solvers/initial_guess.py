@@ -1,4 +1,4 @@
-"""Initial guesses of the unknowns, in which free effects are active, and of the states at nodes."""
+"""Initial guesses of the unknowns, with small amplitudes of free effects, and of the states at nodes."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ log = logging.getLogger(__name__)
 _MisfitFunction = Callable[[int, Array, Array], float]
 # Number of values tried per shape parameter, over its range.
 _N_SHAPE_VALUES = 4
-# Initial amplitude over its range, if the effect has no derivative at neutral, and smallest initial amplitude.
+# Smallest initial amplitude of an activated effect, as a fraction of the amplitude's expected range.
 _MIN_AMPLITUDE_FRACTION = 0.1
-# A start that cannot be rolled out is drawn back towards the neutral one.
+# Fractions of the way from the neutral start to one with active effects, tried until the rollout succeeds.
 _START_FRACTIONS = (1.0, 0.5, 0.2, 0.05)
 # Mean square whitened residual above which another guess of the node states is tried.
 _POOR_GUESS_CHI2 = 10.0
-# A soft object hangs in other shapes, and hops from one to another: positive parameters are tried that much larger.
+# Factors on positive parameters that are tried, because a soft object has several shapes and snaps between them.
 _PARAMETER_FACTORS = (1.0, 4.0, 2.0, 10.0)
-# Shapes change slowly: so far apart is enough [s].
+# Spacing of the equilibria from which a guess is interpolated [s].
 _EQUILIBRIUM_SPACING = 0.1
 # A branch measured a few times a second fits several frequencies, so a parameter with a relative std above the first
 # number can have other minima. It is multiplied by these factors, and the others follow the fit's covariance. If the
@@ -48,7 +48,7 @@ _SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 class UnknownsAndNodeStateGuess:
     """A guess of the unknowns, and of each recording's initial state, node states and constraint multipliers."""
 
-    x: Array
+    x: Array  # unknowns, (nx,)
     initial_states: tuple[InitialStateWithSensitivity, ...]
     node_states: tuple[Array, ...]  # shape (K + 1, nx) each
     multipliers: tuple[Array, ...]  # shape (K, m) or (N, m) each
@@ -60,8 +60,8 @@ def guess_unknowns_and_node_states(
     """Guess unknowns and node states near a solution, from `x` or, if `x` fits poorly, from multiples of `x`.
 
     The states of a recording come from a rollout with the tracking filter, so that they satisfy the equations of
-    motion. If the rollout fails or deviates from the measurements, each node in `nodes` (K + 1,) instead gets the
-    equilibrium at the arms' measured posture. This guess has defects (gaps between steps) but follows the data.
+    motion. If the rollout fails or deviates from the measurements (by `misfit`), each node in `nodes` (K + 1,) gets the
+    equilibrium at the arms' measured posture. Such states follow the data, but violate the equations of motion.
     """
     lower, upper = problem.bounds
     best: tuple[float, UnknownsAndNodeStateGuess] | None = None
@@ -92,7 +92,7 @@ def guess_unknowns_and_node_states(
 
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
-    """Compute the mean square whitened residual of recording `i` on a trajectory (N + 1, nx), without efforts."""
+    """Return the mean square whitened residual of recording `i` for a trajectory (N + 1, nx). Efforts are not used."""
     shared, _ = problem.unpack_episode_unknowns(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameter_names)))
@@ -122,7 +122,7 @@ def _tracked(
 def _resting(
     problem: EstimationProblem, episode: Episode, nodes: IntArray, theta: Array, start: Array
 ) -> tuple[Array, Array]:
-    """Node states at the equilibria of the measured postures, with the momenta of moving between them."""
+    """Node states and multipliers at equilibria of the measured postures, with momenta from their differences."""
     step, statics = problem.step, problem.model_functions.equilibrium_solver
     n, m, h = step.sizes["n"], step.sizes["m"], step.time_step
     state = np.tile(start, (len(nodes), 1))
@@ -151,13 +151,13 @@ def _resting(
 
 
 def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array) -> Array:
-    """Return an initial unknown vector (nx,) in which free effects of zero amplitude get a small amplitude.
+    """Return the unknown vector `x` (nx,) with small amplitudes of free effects whose amplitudes in `x` are neutral.
 
     At zero amplitude, an effect's shape parameters (rest angle of a spring, relaxation time) have no influence and
     cannot be estimated, and a poor shape can drive the amplitude to its bound. Several shapes are therefore tried for
     each such effect. The best shape starts with the amplitude that the linearised model predicts, clipped to the
     expected range. An effect without shape parameters keeps its zero amplitude, unless the residual's derivative is
-    zero there. Returns `x` unchanged if no effect was changed or if no changed start can be rolled out.
+    zero there. An effect also keeps it if the rollout fails with every smaller amplitude that is tried.
     """
     place = {name: i for i, name in enumerate(problem.unknown_names)}
     for effect in problem.system.effects:
@@ -224,7 +224,7 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
 
 
 def starts_toward_other_minima(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
-    """Find start vectors from which an uncertain unknown may reach another minimum, the most likely one first."""
+    """Return start vectors that may lead to another minimum than `x` (evaluation: `finish`), by increasing cost."""
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, finish)

@@ -104,16 +104,16 @@ class MultipleShooting(base.SolverWithCheckedSettings):
     def minimize_cost(
         self, problem: EstimationProblem, start: Array, callback: base.IterationCallback | None
     ) -> base.SolverResult:
-        """Minimize the problem's cost from `start` by IPOPT or condensed Gauss-Newton steps."""
+        """Minimize the problem's cost from `start` by IPOPT, or with `condensing` by Gauss-Newton steps."""
         if self.condensing:
             return self._by_condensing(problem, start, base.AcceptedIterateRecorder(callback))
         told: tuple[str, ...] = ()
         if self.hessian not in ("gauss_newton", "exact"):
-            hint = "use hessian: gauss_newton"
+            hint = "set hessian: gauss_newton"
             told = f"hessian = '{self.hessian}'", "hessian", "gauss_newton, exact", hint
         elif str(self.ipopt_options.get("hessian_approximation", "exact")) != "exact":
-            what = "a limited-memory Hessian is too slow for thousands of node states"
-            hint = "leave the option out, and use hessian: gauss_newton"
+            what = "a limited-memory Hessian is not supported: it is too slow for thousands of node states"
+            hint = "remove the option, and set hessian: gauss_newton"
             told = what, "ipopt_options.hessian_approximation", "exact", hint
         elif self.node_interval not in (None, 1):
             hint = "set condensing: true, or node_interval: 1"
@@ -133,7 +133,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
-            message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
+            message = f"{size}, of which {free / 1e9:.2g} GB are free; set a longer time_step, a shorter duration, or "
             return recorder.solver_result_with_iterates(base.Status.FAILED, message + "gauss_newton", start)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
         watch = _Watch(problem, program, functions, ridge, recorder)
@@ -173,7 +173,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         if returned == "Maximum_Iterations_Exceeded":
             limit = f"IPOPT stopped after {self.max_iterations} iterations, {closed}"
             return base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
-        return base.Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer, or use gauss_newton"
+        return base.Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer to the solution, or use gauss_newton"
 
     def _by_condensing(
         self, problem: EstimationProblem, start: Array, recorder: base.AcceptedIterateRecorder
@@ -201,7 +201,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
             if moved < self.step_tolerance or flat:
                 if now.defect < _CLOSED_DEFECT:
-                    return ended(base.Status.CONVERGED, f"closed to {now.defect:.1e}")
+                    return ended(base.Status.CONVERGED, f"largest defect {now.defect:.1e}")
                 # steps along uninformed directions would only increase the defects
                 step = np.zeros_like(step)
             slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
@@ -218,15 +218,15 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                 factor *= 0.5
             else:
                 if mu > _STALLED_DAMPING:
-                    reason = trial if isinstance(trial, str) else "no step lowers the cost or closes the defects"
-                    return ended(base.Status.STALLED, f"{reason}; try more nodes, or gauss_newton")
+                    reason = trial if isinstance(trial, str) else "no step lowers the cost or the defects"
+                    return ended(base.Status.STALLED, f"{reason}; set a shorter node_interval, or use gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
-        limit = f"no convergence in {self.max_iterations} iterations; largest defect {now.defect:.1e}"
+        limit = f"no convergence in {self.max_iterations} iterations, largest defect {now.defect:.1e}"
         return ended(base.Status.ITERATION_LIMIT, limit)
 
 
 class _AdaptiveRidge(ca.Callback):
-    """Factor of a ridge that rises if parameters oscillate, and falls if they keep their direction."""
+    """Factor of a Hessian ridge. It rises if parameters oscillate between iterates, and falls otherwise."""
 
     def __init__(self, scale: Array, size: int) -> None:
         ca.Callback.__init__(self)
@@ -294,7 +294,7 @@ class _Watch(ca.Callback):
 
 @dataclass(frozen=True)
 class _Linearization:
-    """Whitened residual, its derivatives by unknowns and by closing the defects, and those of all node states."""
+    """Whitened residual, its derivative by unknowns, its change if all defects are closed, and those of node states."""
 
     cost: float
     defect: float
@@ -316,7 +316,7 @@ class _StepFilter:
         self._points: list[tuple[float, float]] = []
 
     def accepts(self, now: _Linearization, trial: _Linearization, slope: float) -> bool:
-        """Whether to continue from `trial`; the linear model predicts a change of the cost by `slope`."""
+        """Return whether `trial` is accepted; `slope` is the change of the cost that the linear model predicts."""
         margin = _IMPROVEMENT_MARGIN
         if not trial.defect <= self._largest or not np.isfinite(trial.cost):
             return False
@@ -340,7 +340,7 @@ def _step_bounds(problem: EstimationProblem, x: Array, size: Array) -> tuple[Arr
 
 
 class _ShootingIntervals:
-    """Recordings cut at nodes into intervals, each rolled out from its node state, condensed onto the parameters."""
+    """Recordings, divided at nodes into intervals that are rolled out one by one from their node states."""
 
     def __init__(self, problem: EstimationProblem, node_interval: int) -> None:
         symbolic_transcription.check_no_effect_changes_inputs(problem, "multiple shooting")
@@ -349,11 +349,11 @@ class _ShootingIntervals:
             steps = episode.grid.steps
             if steps < node_interval:
                 what = f"recording '{episode.name}' has {steps} steps, fewer than a node interval of {node_interval}"
-                raise SolverError(what, where="solver.node_interval", allowed=f"1 to {steps}")
+                raise SolverError(what, where="solver.node_interval", allowed=f"1 to {steps} time steps")
             if any(s.sensor.effort_joints for s in episode.measurements):
-                message = "multiple shooting without condensing cannot use measured efforts of prescribed joints"
+                message = "multiple shooting with condensing cannot use measured efforts of prescribed joints"
                 where, allowed = f"recording '{episode.name}': joints/effort", "measurements that depend on node states"
-                hint = "set solver.name: gauss_newton, or sensors.joints.effort.use: false"
+                hint = "set solver.condensing: false, solver.name: gauss_newton, or sensors.joints.effort.use: false"
                 raise SolverError(message, where=where, allowed=allowed, hint=hint)
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are searched near those of the problem's initial values, at any point

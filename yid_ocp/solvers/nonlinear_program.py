@@ -2,8 +2,8 @@
 
     min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
 
-f is half the sum of squares (or the Huber loss) of residuals, g the values of constraint terms. The module does not
-depend on mechanics or recordings. A term is one local function evaluated at many places, with assembled derivatives.
+f is half the sum of squares (or the Huber loss) of residuals, g the values of constraint terms. A term is one function
+of few variables, evaluated at many places. The module does not depend on mechanics or recordings.
 """
 
 from __future__ import annotations
@@ -48,9 +48,8 @@ class _ThreadSafeCachedProperty(cached_property[Any]):
 class LocalVariableFunction:
     """A symbolic function y(v; d, s) of local variables v, data d and shared data s, with derivatives by v.
 
-    v are local variables, d data and s data shared by all calls. `jacobian` dy/dv (ny, nv) is derived from the value by
-    default. Derivatives can be compiled. The value stays a CasADi expression, so that terms built on it can be
-    differentiated.
+    All calls share the values of s. `jacobian` is dy/dv (ny, nv), by default derived from `value`. Derivatives can be
+    compiled. The value stays a CasADi expression, so that terms built on it can be differentiated.
     """
 
     def __init__(
@@ -95,14 +94,14 @@ class LocalVariableFunction:
 
 @dataclass(frozen=True)
 class MappedFunctionTerm:
-    """A function of few unknowns that a nonlinear program evaluates at K places, for example at every time step."""
+    """A function of few variables that a nonlinear program evaluates at K places, for example at every time step."""
 
     name: str
     row_names: tuple[str, ...]  # names of the ny outputs
     local_function: LocalVariableFunction
-    variable_indices: IntArray  # each place's local variables among the unknowns, no repetition, (K, nv)
-    data_indices: IntArray  # indices of each place's data among the parameters, (K, nd)
-    shared_data_indices: IntArray  # data that all places share, shape (ns,)
+    variable_indices: IntArray  # indices in w of each place's local variables, without repetition, (K, nv)
+    data_indices: IntArray  # indices in p of each place's data, (K, nd)
+    shared_data_indices: IntArray  # indices in p of data that all places share, (ns,)
 
     @property
     def n_values(self) -> int:
@@ -143,12 +142,12 @@ class MappedFunctionTerm:
 
 @dataclass(frozen=True)
 class ResidualTerm:
-    """A residual term of a program's objective, r = weight (combination values - target)."""
+    """A residual term of a program's objective, r = weight (combination values - target), with the values of `term`."""
 
     term: MappedFunctionTerm
     combination: ca.DM | None = None  # shape (nr, ny K); None takes the values as they are
-    weight_indices: IntArray | None = None  # among the parameters, shape (nr,); None for weights of one
-    target_indices: IntArray | None = None  # among the parameters, shape (nr,); None for targets of zero
+    weight_indices: IntArray | None = None  # indices of the weights in p, (nr,); None for weights of one
+    target_indices: IntArray | None = None  # indices of the targets in p, (nr,); None for targets of zero
     huber_threshold: float = math.inf  # residual beyond which Huber's loss is linear
 
     @property
@@ -168,7 +167,7 @@ class ResidualTerm:
         return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
 
     def _symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Residuals r (nr, 1) at the program's unknowns w and parameters p."""
+        """Residuals r (nr, 1) at the program's variables w and parameters p."""
         matrix, value = self._residual_jacobian_by_term_values(p), self.term._symbolic_outputs(w, p)
         result = value if matrix is None else ca.mtimes(matrix, value)
         if self.target_indices is None:
@@ -177,7 +176,7 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Return the sparse Jacobian (nr, nw) of the residuals with respect to the program's unknowns w."""
+        """Return the sparse Jacobian (nr, nw) of the residuals with respect to the program's variables w."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
         matrix = self._residual_jacobian_by_term_values(p)
@@ -209,15 +208,15 @@ class ResidualTerm:
 
 @dataclass(frozen=True)
 class GaussNewtonHessianRidge:
-    """A term added to the Gauss-Newton Hessian that keeps steps of poorly determined unknowns small.
+    """A term added to the Gauss-Newton Hessian that keeps steps of poorly determined variables small.
 
-    For such unknowns, the curvature that Gauss-Newton neglects can be as large as its own. The ridge adds factor * mean
-    square residual / max(|w_i|, scale_i)^2 to the Gauss-Newton Hessian only. `factor` is a number or a function of the
-    unknowns w, whose value can change between iterates.
+    For such variables, the curvature that Gauss-Newton neglects can be as large as its own curvature. The ridge adds
+    factor * mean square residual / max(|w_i|, scale_i)^2 to the diagonal of the Gauss-Newton Hessian. `factor` is a
+    number or a function of the variables w, whose value can change between iterates.
     """
 
-    index: IntArray
-    scale: Array
+    index: IntArray  # indices i in w of the variables with a ridge
+    scale: Array  # typical size of each of them
     factor: float | ca.Function
 
 
@@ -237,7 +236,7 @@ def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: Int
     keys, place = np.unique(column * size + row, return_inverse=True)
     start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
     sparsity = ca.Sparsity(size, size, start.tolist(), (keys % size).tolist())
-    # one column for every entry, its only row being where it goes
+    # one column for every entry, with a one in the row of the entry's position
     columns = ca.Sparsity(len(keys), len(place), list(range(len(place) + 1)), place.ravel().tolist())
     return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(columns, 1.0)), entries))
 
@@ -253,7 +252,7 @@ class _VectorBlock:
 
 @dataclass
 class ProgramVectorLayout:
-    """The layout of a program's variables or parameters in successive blocks, with values and bounds."""
+    """The layout of the vector of a program's variables or parameters in named blocks, with values and bounds."""
 
     size: int = 0
     blocks: dict[str, _VectorBlock] = field(default_factory=dict)
@@ -272,7 +271,7 @@ class ProgramVectorLayout:
         return np.arange(self.size - len(values), self.size)
 
     def assign_block_name(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Name a block of existing indices of the vector. Nothing is named if there are no indices."""
+        """Name the block of existing entries `index` (rows, columns) of the vector. An empty block gets no name."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
@@ -310,11 +309,11 @@ class NonlinearProgram(ReprMixin):
     `nlp["q"]` is short for `nlp["q[NAME]"]`.
     """
 
-    variables: Mapping[str, _VectorBlock]  # what the column `w` of unknowns is made of
-    parameters: Mapping[str, _VectorBlock]  # what the column `p` of parameters is made of
-    constraint_terms: tuple[MappedFunctionTerm, ...]  # equalities, one below the other in `g`
-    residual_terms: tuple[ResidualTerm, ...]  # their losses make the objective
-    lower: Array  # of `w`, shape (nw,), as `upper` and the guess
+    variables: Mapping[str, _VectorBlock]  # named blocks of the vector `w`
+    parameters: Mapping[str, _VectorBlock]  # named blocks of the vector `p`
+    constraint_terms: tuple[MappedFunctionTerm, ...]  # equalities to zero, one below the other in `g`
+    residual_terms: tuple[ResidualTerm, ...]  # the objective is the sum of their losses
+    lower: Array  # lower bounds of `w`, (nw,), the same shape as `upper` and `initial_guess`
     upper: Array
     initial_guess: Array
     parameter_values: Array  # of `p`, shape (np,)
@@ -349,7 +348,7 @@ class NonlinearProgram(ReprMixin):
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 
     def variable_names(self) -> tuple[str, ...]:
-        """Return the names of all unknowns w, composed of block, row and, if there are several, column."""
+        """Return the names of all variables w, composed of block, row and, if there are several, column."""
         named = np.full(self.w.numel(), "", dtype=object)
         for name, block in self.variables.items():
             for row, places in zip(block.row_names, block.index, strict=True):
@@ -406,12 +405,12 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def jac_r(self) -> ca.MX:
-        """Return the sparse Jacobian of all residuals r with respect to the unknowns w."""
+        """Return the sparse Jacobian of all residuals r with respect to the variables w."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
     @_ThreadSafeCachedProperty
     def jac_g(self) -> ca.MX:
-        """Return the sparse Jacobian of the constraints g with respect to the unknowns w."""
+        """Return the sparse Jacobian of the constraints g with respect to the variables w."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
             row, column = term._jacobian_nonzero_indices()
@@ -425,7 +424,7 @@ class NonlinearProgram(ReprMixin):
 
     @_ThreadSafeCachedProperty
     def grad_f(self) -> ca.MX:
-        """Return the gradient of the objective f with respect to the unknowns w, shape (nw, 1)."""
+        """Return the gradient of the objective f with respect to the variables w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
         for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
@@ -496,7 +495,7 @@ class NonlinearProgram(ReprMixin):
         return ca.MX(pattern, factor * 2 * sum(self._losses, ca.MX(0)) / count / size**2)
 
     def estimated_solver_memory(self, hessian: HessianKind = "gauss_newton") -> float:
-        """Estimate how much more memory [bytes] an interior-point method with a direct linear solver needs."""
+        """Estimate the additional memory [bytes] that an interior-point method with a direct linear solver needs."""
         return _BYTES_PER_ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
 
     def with_user_terms(
@@ -517,7 +516,7 @@ class NonlinearProgram(ReprMixin):
         where, bounds = "NonlinearProgram.with_user_terms", []
         for symbol in ca.symvar(ca.vertcat(scalar, column)):
             if not any(ca.is_equal(symbol, vector) for vector in (self.w, self.p)):
-                message = f"the symbol '{symbol.name()}' is neither an unknown nor a parameter of the program"
+                message = f"the symbol '{symbol.name()}' is neither a variable nor a parameter of the program"
                 allowed, hint = "expressions of nlp.w, nlp.p and of nlp[NAME]", "use nlp[NAME] in place of the symbol"
                 raise SolverError(message, where=where, allowed=allowed, hint=hint)
         for name, side in (("lower", lower), ("upper", upper)):

@@ -6,10 +6,10 @@ The unknowns are, in this order,
 
 with x = (q, p, z). `rest` is the equilibrium at the first posture (free coordinates, internal coordinates, grasp
 forces), and x_0 is a function of it; a given initial state has no `rest`. The constraints are the equations of the
-equilibrium and the rows of every `NlpStepConstraints`. The objective contains the whitened samples, interpolated
-between nodes, and the priors. Recorded inputs and measurements are parameters. With process noise, its errors are
-unknowns too, after the states of their recording, with their standard deviations as priors. At the optimum this is the
-likelihood of `inference.whitening`, up to the linearisation there.
+equilibrium and those of every step (`NlpStepConstraints`). The objective contains the whitened samples, interpolated
+between nodes, and the priors. Recorded inputs and measurements are parameters. With process noise, the errors of
+torques and angles are unknowns too, after the states of their recording, with Gaussian priors. At the optimum the
+objective then corresponds to the likelihood of `inference.whitening`, up to the linearisation there.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from yid_ocp.solvers.nonlinear_program import (
     ResidualTerm,
 )
 
-# Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
+# Smallest factor of the Hessian ridge (`GaussNewtonHessianRidge`).
 MIN_HESSIAN_RIDGE = 0.1
 
 
@@ -66,7 +66,7 @@ def transcribe(
     initial_unknowns : array_like, optional, shape (nx,)
         Unknown vector from which the program's initial guess is made. Default: the problem's initial unknowns.
     use_compiler : bool, optional
-        Whether derivatives of a stage are compiled if possible. Default: as in the problem's step.
+        Whether derivatives of the step equations are compiled if possible. Default: as in the problem's step.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def transcribe(
 
 
 def _about_zero(problem: EstimationProblem) -> EstimationProblem:
-    """The problem with the recorded torques and zero torque offsets, because the offsets are unknowns here."""
+    """The problem without subtracted torque offsets, because the offsets are unknowns of the program."""
     known = [episode.input_errors for episode in problem.episodes]
     if not any(e is not None and np.any(e.torque_bias) for e in known):
         return problem
@@ -96,9 +96,10 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
     """Check that no effect changes recorded inputs or times, as node-state solvers require. Raises `SolverError`."""
     if not problem.are_input_corrections_neutral_and_fixed:
-        message = "an effect changes recorded inputs, times or the reference of the tracking feedback"
-        allowed = "effects that change the mechanics or the readings of sensors"
-        raise SolverError(message, where=where, allowed=allowed, hint="set solver.name: gauss_newton")
+        names = ", ".join(f"{effect.kind}@{effect.location}" for effect in problem.system.effects)
+        message = f"an effect changes recorded inputs, times or the reference of the tracking filter (one of {names})"
+        allowed, hint = "effects on mechanics or sensor readings", "set solver.name: gauss_newton, or remove the effect"
+        raise SolverError(message, where=where, allowed=allowed, hint=hint)
 
 
 def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
@@ -121,14 +122,14 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
 
 
 class _Places(NamedTuple):
-    """Indices of a recording's unknowns and inputs; `errors` of each step's torque, `first` of the first angles."""
+    """Indices of a recording's unknowns (up to `first`) and parameters in the vectors of the program."""
 
-    free: IntArray
+    free: IntArray  # free parameters of the recording
     rest: IntArray
     state: IntArray
     multipliers: IntArray
-    errors: IntArray
-    first: IntArray
+    errors: IntArray  # torque and angle errors of each step
+    first: IntArray  # errors of the first angles
     theta: IntArray
     torque: IntArray
     gain: IntArray
@@ -154,9 +155,9 @@ class _FreeParameterSymbols(NamedTuple):
 
 
 class _DrivenStage(NamedTuple):
-    """One stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data (ubar, K, xbar).
+    """The equations of step k as a function of v = (free, x_k, x_{k+1}, lam_k, errors) and data (ubar, K, xbar).
 
-    `function` gives the rows; `effort` (prescribed joints) and `torque` (driven joints) include derivatives by v.
+    `effort` (of prescribed joints) and `torque` (of driven joints) are pairs of value and derivative by v.
     """
 
     function: LocalVariableFunction
@@ -176,11 +177,11 @@ def _driven_stage(
     noisy: bool,
     use_compiler: bool,
 ) -> _DrivenStage:
-    """The stage with its tracking filter and torque errors, if it has them.
+    """The equations of a step, with its tracking filter and torque errors, if it has them.
 
-    The applied torque is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k. K_k is absent if encoders are
-    measurements, the errors if torques are exact. These are the two forms of `inference.whitening`, with the errors in
-    place of their covariance. `momentum` (nu, nu) is the derivative of the followed momenta by the previous torque.
+    The applied torque is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k. The gain K_k is absent if
+    encoders are measurements; torque errors w_k, b and angle errors v_k are absent if torques are exact. `followed`
+    are indices of the state. `momentum` (nu, nu) is the derivative of the followed momenta by the previous torque.
     """
     nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
     before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
@@ -189,7 +190,7 @@ def _driven_stage(
     matrix = ca.reshape(gain, len(index), nu).T
     by_errors = ca.SX(nu, 0)
     if noisy:
-        # the momentum that was measured has half the impulse of the step before in it: its w is taken for this step's
+        # the measured momentum contains half the impulse of the previous step, whose w is replaced by that of this step
         late = ca.mtimes(matrix[:, nu:], momentum) if len(index) > nu else 0.0
         by_errors = ca.horzcat(*([-ca.SX.eye(nu) - late] * 2), *([-matrix[:, :nu]] if index else []))
     errors = ca.SX.sym("errors", by_errors.shape[1])
@@ -215,7 +216,7 @@ def _driven_stage(
 
 
 class _Maker:
-    """Lays out unknowns and parameters of a problem, and makes its terms."""
+    """A builder of the program: it lays out the unknowns and parameters of a problem, and makes the terms."""
 
     def __init__(self, problem: EstimationProblem, compiled: bool) -> None:
         self._problem, self._compiled = problem, compiled
@@ -233,7 +234,7 @@ class _Maker:
         self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalVariableFunction, bool]] = {}
 
     def program(self, x: Array) -> NonlinearProgram:
-        """The program, with a guess near the problem's unknown vector `x`."""
+        """The program, with an initial guess near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
         nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
         error = partial(mean_square_residual_without_efforts, problem)
@@ -433,7 +434,7 @@ class _Maker:
         return ResidualTerm(term, _constant(between), weight.T[seen], value.T[seen], threshold)
 
     def _reading(self, sensor: Sensor, episode: Episode) -> tuple[LocalVariableFunction, bool]:
-        """Reading of a sensor at a node, and whether it depends on efforts, and so on the next step."""
+        """Function of a sensor's reading at a node, and whether the reading depends on efforts, hence on a step."""
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
             function = sensor_function_with_jacobians(self._problem.system, sensor, self._names)
@@ -504,7 +505,7 @@ class _Maker:
 
 
 def _kind(episode: Episode) -> tuple[bool, bool]:
-    """Whether a recording's stage has the tracking filter, and whether torque errors are unknowns."""
+    """Whether the steps of a recording have the tracking filter, and whether torque errors are unknowns."""
     feedback, errors = episode.tracking_feedback, episode.input_errors
     return feedback is not None and not (errors and errors.has_encoder_measurements), errors is not None
 
