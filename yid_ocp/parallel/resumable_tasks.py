@@ -1,9 +1,9 @@
 """Tasks that run in local processes or on a scheduler's workers, with stored results.
 
 A task is a call of a module-level function with plain data and paths. Its result is one JSON file, which its worker
-writes in one operation. The file name is the hash of the function's name, the sources that it depends on, and the
-arguments. A path enters the hash by file name and content, not by folder. A finished task is therefore never run again,
-whatever happened to the run. Any `concurrent.futures.Executor` is suitable if its workers share the file system.
+writes in one operation. The name of this file is a hash of the function's name, of the sources that it depends on, and
+of the arguments (of a path: file name and content, without folder). A task whose result file exists is not run again,
+also after an interruption. Any `concurrent.futures.Executor` is suitable if its workers share the file system.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from yid_ocp.version import package_source_hash, software_fingerprint, software_
 
 _TASK_FORMAT = "yid-task/1"
 _RESULT_FILE_TIMEOUT = 60.0  # time limit for a file of another machine to become visible [s]
-_WORKER_CHECK_INTERVAL = 60.0  # time without a finished task after which it is checked that there are workers [s]
+_WORKER_CHECK_INTERVAL = 60.0  # time without a finished task after which the scheduler's workers are checked [s]
 _CONNECT_TIMEOUT = 15.0  # timeout for the connection to a scheduler [s]
 _MAX_CLIENT_STARTS = 3  # number of attempts to start a client's event loop
 log = logging.getLogger(__name__)
 _TaskFunction = Callable[..., Any]
 TaskProgressCallback = Callable[[int, int, str], None]
-"""Callback with the number of finished tasks, the number of all tasks, and the name of the last one."""
+"""Callback with the number of finished tasks, the number of all tasks, and the name of the last finished task."""
 
 
 @dataclass(frozen=True)
 class Task:
     """The arguments for one call of a task function, and a name for display."""
 
-    name: str  # for display only, without influence on resuming
-    arguments: Mapping[str, Any]  # text, numbers, None, lists and mappings of them, and `Path` for what is read
+    name: str  # for display only, without influence on the reuse of results
+    arguments: Mapping[str, Any]  # text, numbers, None, lists and mappings of them, and a `Path` for each file read
 
 
 @dataclass(frozen=True)
@@ -58,26 +58,27 @@ class TaskResult:
     value: Any = None
     error: str = ""
     seconds: float = 0.0  # run time of the function
-    was_resumed: bool = False  # whether it is the result of an earlier run
+    was_resumed: bool = False  # whether the result is that of an earlier run
 
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """The workers of a run: local processes, or a Dask scheduler (address or file). Raises `ConfigError` for both."""
+    """The workers of a run: local processes, or those of a Dask scheduler. `ConfigError` if both are given."""
 
-    n_processes: int | None = None
-    scheduler_address: str = ""
+    n_processes: int | None = None  # number of local processes; default: one per processor
+    scheduler_address: str = ""  # HOST:PORT, or the path of a scheduler file
 
     def __post_init__(self) -> None:
         if self.n_processes is not None and self.n_processes < 1:
-            raise ConfigError(f"{self.n_processes} workers", where="--workers", allowed="a whole number from 1")
+            what, allowed = f"{self.n_processes} workers are requested", "a whole number from 1"
+            raise ConfigError(what, where="--workers", allowed=allowed, hint="set a number, or remove the option")
         if self.n_processes is not None and self.scheduler_address:
             what, where = "the number of workers is given together with a scheduler", "--workers and --scheduler"
-            hint = "leave --workers out: the scheduler knows how many workers it has"
+            hint = "remove --workers: the scheduler knows how many workers it has"
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_scheduler_available(self) -> None:
-        """Check that a scheduler answers and its workers are suitable, before long work. Raises `ParallelWorkError`."""
+        """Raise `ParallelWorkError` if a scheduler is given and does not answer, or has an unsuitable worker."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
                 pass
@@ -100,7 +101,7 @@ def run_tasks(
     A task that raises writes `HASH.error.json` and a warning. The other tasks continue, and the next run repeats the
     failed task. After an interruption, finished results are kept. Workers whose sources differ from this process do not
     run tasks. Raises `DataError` if a task's file cannot be read, `OutputError` if the folder cannot be made, and
-    `ParallelWorkError` if a worker is unsuitable (see `WorkerConfig`).
+    `ParallelWorkError` if no scheduler answers or a worker is unsuitable.
 
     Parameters
     ----------
@@ -137,7 +138,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Return the values of all tasks. `ParallelWorkError` for failures with a known cause, else `RuntimeError`."""
+    """Return the values of all tasks. Raises `ParallelWorkError` if one failed for a known cause, or `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]
@@ -147,7 +148,7 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     if first.partition(":")[0] in ours:
         told = "; ".join(line.strip() for line in rest.splitlines())
         what = f"{what}; {told}" if told else what
-        where, hint = f"task '{failed[0].name}'", "correct this, then run the same command: it repeats the failed tasks"
+        where, hint = f"task '{failed[0].name}'", "correct this cause and run the same command: it repeats failed tasks"
         raise ParallelWorkError(what, where=where, allowed="tasks without errors", hint=hint)
     raise RuntimeError(f"{what}; the same command tries them again")
 
@@ -168,9 +169,9 @@ def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _
 
 
 def _task_input(function: _TaskFunction, task: Task, code: str) -> dict[str, Any]:
-    """All inputs of a task as plain data: function, source hash, arguments, file hashes. Its hash is the key."""
+    """All inputs of a task as plain data: function, source hash, arguments, file hashes. Their hash is the key."""
     if "<" in function.__qualname__:
-        raise ValueError(f"{function.__qualname__} does not stand at the top of a module")
+        raise ValueError(f"{function.__qualname__} is not defined at the top of a module, so workers cannot import it")
     name = f"{function.__module__}.{function.__qualname__}"
     described = _mapped(task.arguments, lambda path: {"file": path.name, "sha256": file_sha256(path)})
     return {"function": name, "code": code, "arguments": json.loads(json.dumps(described))}
@@ -241,7 +242,7 @@ def _perform(job: _Job) -> str:
 
 
 def _give_back() -> None:
-    """Return freed memory to the system; Linux's C library keeps half a gigabyte after a solve."""
+    """Return freed memory to the system, because Linux's C library keeps half a gigabyte after a solve."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
@@ -255,7 +256,7 @@ def _drain(
     finished: _TaskFinishedCallback,
     look: Callable[[], None] | None = None,
 ) -> tuple[list[_Job], list[_Job]]:
-    """Run jobs, at most `at_once` concurrently; returns jobs lost with a broken executor, and jobs never started."""
+    """Run jobs, at most `at_once` at a time. Returns jobs lost with a broken executor, and jobs that never started."""
     queue, running, lost = deque(jobs), dict[Future[str], _Job](), list[_Job]()
     try:
         while (queue and not lost) or running:
@@ -374,11 +375,11 @@ def _client(distributed: Any, where: dict[str, str]) -> Any:
 
 
 def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | None) -> None:
-    """Refuse workers with other versions, with several threads, or without this package or access to the same files."""
+    """Raise `ParallelWorkError` if a worker has other versions or several threads, or lacks the package or `folder`."""
     for address, count in client.nthreads().items():
         if count > 1:
             what, allowed = f"a worker runs {count} tasks at once in one process", "one task at a time in every process"
-            hint = "start workers with --nthreads 1, and --nworkers for as many as the machine has processors"
+            hint = "start workers with `--nthreads 1 --nworkers N`, where N is the machine's number of processors"
             raise ParallelWorkError(what, where=address, allowed=allowed, hint=hint)
     here = software_fingerprint()
     for address, entry in client.get_versions()["workers"].items():

@@ -1,6 +1,6 @@
 """Threads and processes on this machine: parallel maps, merged calls, shared caches and process pools.
 
-Merged calls: items run in parallel until all of them wait for a function, which is then called once for all.
+Merged calls: items run in parallel until each of them waits for a function, which one call then evaluates for all.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 
 from yid_ocp.errors import ConfigError
 
-_THREADS_VARIABLE = "YID_OCP_THREADS"  # number of threads per process; by default that of processors
+_THREADS_VARIABLE = "YID_OCP_THREADS"  # number of threads per process; default: the number of processors
 _MAX_CONCURRENT_ITEMS = 8  # largest number of concurrent items, equal to the largest batch size
 _THREAD_SHARE = threading.local()
 _Item = TypeVar("_Item")
@@ -29,7 +29,7 @@ _Answer = TypeVar("_Answer")
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Apply a function to items in all available threads. Returns the results in the order of the items."""
+    """Apply a function to items in parallel, in all available threads. Returns the results in the items' order."""
     entries = list(items)
     workers = min(len(entries), _max_threads())
     if workers < 2:
@@ -48,7 +48,7 @@ def _max_threads() -> int:
     """Number of threads that the caller may use: the limit of the process, or a share within `map_in_threads`."""
     said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
-        where, hint = f"the environment variable {_THREADS_VARIABLE}", "unset the variable, or set a number"
+        where, hint = f"the environment variable {_THREADS_VARIABLE}", "unset the variable, or set a whole number"
         raise ConfigError(f"the number of threads is '{said}'", where=where, allowed="a whole number from 1", hint=hint)
     own = int(said) if said else available_processor_count()
     return min(own, getattr(_THREAD_SHARE, "count", own))
@@ -61,7 +61,7 @@ def _limit_max_threads(count: int) -> None:
 # CasADi marks the nodes of expressions during differentiation: two threads that differentiate expressions with shared
 # symbols get wrong derivatives. Evaluating finished functions is safe.
 CASADI_LOCK = threading.RLock()
-"""Lock to be held while shared CasADi expressions are built or differentiated."""
+"""The lock that a thread must hold while it builds or differentiates shared CasADi expressions."""
 
 
 class CasadiLockedCache(Generic[_Key, _Value]):
@@ -86,26 +86,26 @@ class _Abandoned(BaseException):
 
 @dataclass(eq=False)
 class _Request:
-    """Arguments of one item for one function, and their answers."""
+    """A call of one function by one item, which waits to be merged with calls of other items."""
 
-    rank: int
+    rank: int  # index of the item
     function: Callable[[list[Any]], list[Any]]
-    questions: list[Any]
+    questions: list[Any]  # arguments, one for each answer
     answers: Future[list[Any]] = field(default_factory=Future)
 
 
 @dataclass(eq=False)
 class _March:
-    """Running items and their pending requests."""
+    """The state of one `map_with_merged_calls`: its threads and their pending requests."""
 
-    live: int
-    running: threading.Semaphore
+    live: int  # number of threads that have not finished
+    running: threading.Semaphore  # limits the number of items that run at the same time
     changed: threading.Condition = field(default_factory=threading.Condition)
     waiting: list[_Request] = field(default_factory=list)
     abandoned: bool = False
 
     def ask(self, request: _Request) -> list[Any]:
-        """Hand in a request for `answer_until_done` and return its answers; meanwhile another item may run."""
+        """Submit a request to `answer_until_done` and return its answers. While this thread waits, another may run."""
         self.running.release()
         try:
             with self.changed:
@@ -123,7 +123,7 @@ class _March:
             self.changed.notify_all()
 
     def answer_until_done(self) -> None:
-        """Answer all requests whenever all threads wait, until no thread remains."""
+        """Answer the requests of all threads together each time all threads wait, until all threads have finished."""
         while True:
             with self.changed:
                 self.waiting = [request for request in self.waiting if not request.answers.done()]
@@ -137,7 +137,7 @@ class _March:
                 _answer(group)
 
     def abandon(self) -> None:
-        """End all items that wait for answers, and those that ask later, by an exception `_Abandoned` in each."""
+        """Raise `_Abandoned` in all items that wait for answers, and in items that submit requests later."""
         with self.changed:
             self.abandoned = True
             for request in self.waiting:
@@ -159,7 +159,7 @@ def _answer(requests: Sequence[_Request]) -> None:
 def call_merged_with_other_threads(
     function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
 ) -> list[_Answer]:
-    """Evaluate `questions` in one batch with the questions from other items of `map_with_merged_calls`."""
+    """Return `function(questions)`, computed in one call together with other items of `map_with_merged_calls`."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
@@ -168,10 +168,10 @@ def call_merged_with_other_threads(
 
 
 def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Apply a function to items concurrently, so that simulations of different items run together in one batch.
+    """Apply a function to items, at most as many at once as there are threads, and return the results in order.
 
-    The calls of `call_merged_with_other_threads` are merged. At most as many items run as there are threads. Which
-    calls are merged depends only on the items. An item must not hold a lock during such a call.
+    Calls of `call_merged_with_other_threads` by different items become one call. Which calls are merged depends only on
+    the items. An item must not hold a lock during such a call.
     """
     entries = list(items)
     if len(entries) < 2 or getattr(_THREAD_SHARE, "march", None) is not None:
@@ -230,9 +230,9 @@ class InlineExecutor(Executor):
 
 
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """Make a pool of processes that ignore interrupt signals, by default one per processor.
+    """Make a pool of `workers` processes (default: one per processor) that ignore interrupt signals.
 
-    All processes together use at most the threads of this process.
+    The limit on the threads of this process is divided among them, with at least one thread for each.
     """
     count = workers or available_processor_count()
     context = multiprocessing.get_context("spawn")  # a fork copies the locks of threads that it does not copy
@@ -249,7 +249,7 @@ def _begin_worker(threads: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """Exit when the parent process ends, because the worker would wait for tasks forever."""
+    """Exit when the parent process ends. Otherwise the worker would wait for tasks forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
