@@ -57,18 +57,16 @@ def baxter_foam_y_system(arms: int) -> System:
 class ArmSensorNoise:
     """The standard deviations of the arm's sensor noise. Noise differs in each sample, effort bias in each recording.
 
-    Units are rad (angles), rad/s (velocities), N m (efforts, one value or one per joint) and m (each coordinate of a
-    grasped point). The noise of efforts is in the recording, not in the applied torque. The recording states all
-    standard deviations, for efforts only with `records_effort_std`.
+    Noise of efforts is not in the applied torque. The recording states all stds, for efforts if `records_effort_std`.
     """
 
-    position_std: float = 2e-4
-    velocity_std: float = 5e-3
-    effort_std: float | tuple[float, ...] = 0.0
-    effort_bias_std: float | tuple[float, ...] = 0.0
-    point_std: float = 1e-3
-    records_effort_std: bool = True
-    position_resolution: float = 0.0  # step of the encoders, which count after the noise; none at zero [rad]
+    position_std: float = 2e-4  # of joint angles [rad]
+    velocity_std: float = 5e-3  # of joint velocities [rad/s]
+    effort_std: float | tuple[float, ...] = 0.0  # one value, or one per joint [N m]
+    effort_bias_std: float | tuple[float, ...] = 0.0  # one value, or one per joint [N m]
+    point_std: float = 1e-3  # of each coordinate of a grasped point [m]
+    records_effort_std: bool = True  # whether the recording also states `effort_std` and `effort_bias_std`
+    position_resolution: float = 0.0  # step of the encoders, applied after the noise; zero: continuous [rad]
     lost_joint_sample_fraction: float = 0.0  # fraction of joint samples that are lost, never the first or last two
 
 
@@ -76,7 +74,7 @@ class ArmSensorNoise:
 class VirtualArmImperfections:
     """The properties, such as friction, that arms have in virtual experiments of `blind` but not in their description.
 
-    The nominal model contains the friction law, with free amplitudes, and uncertain link masses.
+    The nominal model of a diagnosis contains the friction law, with free amplitudes, and uncertain link masses.
     """
 
     friction_law: Annotated[
@@ -97,15 +95,14 @@ class VirtualArmImperfections:
 class PointCamera:
     """A slow camera that measures positions of the object's points that no arm holds.
 
-    `pose` (4, 4) is the camera's pose in the world (x right, y down, z forward). By default the camera is 2 m from the
-    object, opposite the robot.
+    By default the camera is 2 m from the object, opposite the robot.
     """
 
     point_std: float = 5e-3  # std of the white noise on each coordinate of a point [m]
     frame_rate: float = 3.0  # mean rate; periods vary by up to a quarter [Hz]
     has_dropouts: bool = True  # whether frames are lost for 1 to 1.5 s about once every 2.5 s of recording
-    hidden_probability: float = 0.1  # that a point is hidden in a frame (NaN)
-    pose: ArrayLike | None = None
+    hidden_probability: float = 0.1  # probability that a point is hidden in a frame (position NaN)
+    pose: ArrayLike | None = None  # pose of the camera in the world, (4, 4); axes x right, y down, z forward
 
 
 @dataclass(frozen=True)
@@ -130,10 +127,10 @@ class VirtualExperimentSettings:
 def run_virtual_experiment(
     system: System, values: Mapping[str, float] | None = None, experiment: VirtualExperimentSettings | None = None
 ) -> Recording:
-    """Simulate a robot that moves the object, and record encoders, torques, points and camera.
+    """Simulate in MuJoCo a robot that moves the object, and return the recording of encoders, torques and points.
 
-    `points_arm` holds the grasped points at the joints' sample times; `points_camera` has its own clock.
-    `true_parameters` holds all stiffness, damping and mass parameters (`values`, by default nominal). Raises
+    The group `points_arm` holds the grasped points at the joints' sample times; `points_camera` has its own clock.
+    `true_parameters` are all stiffness, damping and mass parameters of `values` (default: nominal). Raises
     `ConfigError` if torque noise does not match the joints; other errors are as in `simulate_in_mujoco`.
     """
     chosen = experiment or VirtualExperimentSettings()
@@ -262,7 +259,7 @@ def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera)
     return np.asarray(times)
 
 
-# reading as a function of true position and effort
+# by kind of sensor effect: its channel, and the reading as a function of true position, true effort and parameters
 _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[str, float]], Array]]] = {
     "effort_gain": ("effort", lambda q, u, size: u * size["scale"]),
     "effort_offset": ("effort", lambda q, u, size: u + size["offset"]),
@@ -283,11 +280,11 @@ def recording_with_sensor_error(
     joints = recording.joints
     assert joints is not None
     if joints.effort is None:
-        allowed, hint = "recordings with efforts of the joints", "leave the effect out"
+        allowed, hint = "recordings with efforts of the joints", f"remove the effect {kind}"
         raise ModelError("the recording has no efforts", where=f"{kind}@{location}", allowed=allowed, hint=hint)
     if kind == "effort_delay":
         effort = joints.effort.copy()
-        # the presently recorded effort acts only after the delay
+        # an effort acts only after the delay, so the recording contains it earlier
         for name in joint_names_by_arm(system)[location]:
             column = joints.names.index(name)
             effort[:, column] = np.interp(joints.t + values["delay"], joints.t, joints.effort[:, column])

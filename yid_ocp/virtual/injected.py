@@ -1,9 +1,9 @@
-"""Effects that MuJoCo adds to a virtual experiment but the model lacks, independent of `yid_ocp.effects`.
+"""Effects that a virtual experiment in MuJoCo has but the model lacks, implemented independently of `yid_ocp.effects`.
 
 Effects for which MuJoCo has a term (joint damping, armature, inertias, sites) are set in its model. Other forces are
 computed here in NumPy at every inner step. Sensor and clock errors are applied to the finished recording. The equations
 of `yid_ocp.effects` are not used, except for effects that only change the description of the system (masses, lengths,
-rest angles, gravity, grasp positions). Effects outside the library exist only here.
+rest angles, gravity, grasp positions, servos). Effects outside the library exist only here.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ _Values = Mapping[str, float]
 _AIR_DENSITY = 1.2  # [kg/m^3]
 _FRICTION_SMOOTHING_SPEED = 0.02  # v_s of dry friction [rad/s]
 _NO_FRICTION = 1e-9  # friction before the motion starts; MuJoCo's constraint must exist from the start [N m]
-_FRICTION_TIME_STEPS = 10  # inner steps that are the time constant of the constraint that holds a joint
+_FRICTION_TIME_STEPS = 10  # time constant of MuJoCo's constraint that holds a joint by friction [inner steps]
 _MAX_PAYLOAD_DISTANCE = 1.0  # largest distance of a payload's mass from its frame [m]
-_CREASED_LINK, _CREASE_ANGLE = 1, 0.03  # link before which a tube is creased; angle beyond which it softens [rad]
+_CREASED_LINK, _CREASE_ANGLE = 1, 0.03  # link before which a tube has a crease; angle beyond which it softens [rad]
 _CORD_LENGTH = 0.3  # length of a tether [m]
 _MAGNET_DISTANCE, _MAGNET_POLE_SIZE = 0.06, 0.04  # distance from the tip at equilibrium, size of the pole [m]
-_DRIFT_TIME = 5.0  # over which a drifting stiffness decreases [s]
+_DRIFT_TIME = 5.0  # time in which a drifting stiffness decreases by its size [s]
 _SLIP_TIMES, _SLIP_DURATION = (1.5, 3.5), 0.05  # times and duration of a grasp's slips [s]
 _LOAD_SLIDE_ANGLE, _LOAD_SLIDE_TIME = 0.02, 0.2  # joint angle after which a loose load slides [rad], time constant [s]
 _WALL_DISTANCE = 0.01  # distance of a soft wall from the tip at equilibrium [m]
 _WARM_UP_TIME = 1.5  # time constant with which a cold gear loses its friction [s]
 
-# a change of the system's description; servos are MuJoCo's own actuators, which delay and clip
+# effects that change the system's description; servos are MuJoCo's actuators, which delay commands and limit torques
 _DESCRIPTION_KINDS = (
     *("density", "point_mass", "length_scale", "link_mass", "rest_curvature", "bend_anisotropy", "gravity_tilt"),
     *("grasp_offset", "servo_gain", "servo_delay", "servo_saturation"),
 )
-# a term that MuJoCo's own model has
+# effects that are a term of MuJoCo's own model
 _MUJOCO_MODEL_KINDS = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
-# an error of a sensor or clock
+# effects that are an error of a sensor or clock
 _SENSOR_ERROR_KINDS = (
     *("effort_gain", "effort_offset", "effort_delay", "encoder_offset", "series_elasticity", "backlash"),
     *("camera_translation", "camera_rotation", "camera_scale", "camera_latency", "surface_offset"),
@@ -57,7 +57,7 @@ _SENSOR_ERROR_KINDS = (
 
 
 class _EffectContext:
-    """Properties of the experiment for forces; until the motion starts, the object settles to equilibrium."""
+    """The system, its numerical stiffnesses, and whether the motion has begun (before, the object settles)."""
 
     def __init__(self, system: System, values: Mapping[str, float]) -> None:
         self.system, self.has_motion_begun = system, False
@@ -66,24 +66,24 @@ class _EffectContext:
         self.rest_angles = {s.joint_name: float(self.value(s.rest_angle)[0]) for s in springs}  # [rad]
 
     def segment_springs(self, model: Any, segment: str) -> tuple[Array, Array, Array]:
-        """Ids, stiffnesses and rest angles of a segment's elastic joints."""
+        """MuJoCo ids, stiffnesses [N m/rad] and rest angles [rad] of a segment's elastic joints."""
         links = self.system.layout_of_segment(segment).link_joints
         joints = [joint for link in links for joint in link if joint in self.joint_stiffness]
         stiffness, rest = (np.array([of[j] for j in joints]) for of in (self.joint_stiffness, self.rest_angles))
         return np.array([model.joint(j).id for j in joints]), stiffness, rest
 
     def bend_joint_ids(self, model: Any, segment: str) -> Array:
-        """Ids of the joints that bend a segment about x, then of those about y."""
+        """MuJoCo ids of the joints that bend a segment about x, then of those that bend it about y."""
         links = self.system.layout_of_segment(segment).link_joints
         return np.array([model.joint(link[axis]).id for axis in (0, 1) for link in links])
 
     def link_body_ids(self, model: Any, segment: str) -> list[int]:
-        """Ids of the bodies of a segment's links."""
+        """MuJoCo ids of the bodies of a segment's links, in the order of the links."""
         links = self.system.layout_of_segment(segment).link_joints
         return [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in links]
 
     def end_body_id(self, model: Any, place: str) -> int:
-        """Id of the body at the end of a segment, or of the body that an arm's joint carries."""
+        """MuJoCo id of the last body of a segment, or of the body that an arm's joint carries."""
         named = {segment.name: segment.link_joints[-1][-1] for segment in self.system.segment_layouts}
         return int(model.jnt_bodyid[model.joint(named.get(place, place)).id])
 
@@ -91,15 +91,15 @@ class _EffectContext:
 _ORDINARY_FRICTION: Mapping[str, tuple[float, float]] = {
     "joint_coulomb": (0.004, 0.016),
     "joint_stribeck": (0.0008, 0.0032),
-    # the torque through a gear counts what pulls from outside twice: a hundredth of it is 0.4 N m at a shoulder
+    # the torque through a gear counts outside forces twice: a hundredth of it is 0.4 N m at a shoulder
     "joint_load_friction": (0.01, 0.04),
 }
-"""Amplitudes of ordinary friction that MuJoCo's solver holds, by kind: over the effort limit, or of themselves."""
+"""Smallest and largest amplitude of ordinary dry friction by kind: over the effort limit, or (load friction) itself."""
 _MAX_RATED_EFFORT = 100.0  # larger effort limits are not a motor's rating [N m]
 
 
 def typical_friction_amplitude_range(effect: EffectBase, system: System) -> tuple[float, float]:
-    """Return the smallest and largest amplitude of a joint's ordinary dry friction, in the amplitude's unit."""
+    """Return the smallest and largest amplitude of ordinary dry friction at a joint, in the unit of the amplitude."""
     low, high = _ORDINARY_FRICTION[effect.kind]
     if effect.definitions[0].unit == "1":
         return low, high
@@ -108,11 +108,11 @@ def typical_friction_amplitude_range(effect: EffectBase, system: System) -> tupl
     return low * rated, high * rated
 
 
-_ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]  # from context, model, location and size
+_ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]  # arguments: context, model, location, size
 
 
 def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallback:
-    """A force law(q, v, t) at some joints, as a function of their angles, velocities and time."""
+    """Callback that adds the force law(q, v, t) to the joints `at`, with their angles, velocities and the time."""
 
     def push(_: Any, data: Any) -> None:
         data.qfrc_passive[at] += law(data.qpos[at], data.qvel[at], data.time)
@@ -121,12 +121,12 @@ def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallba
 
 
 def _joint_law(law: Callable[[Any, float, float, float], float]) -> _ForceBuilder:
-    """An effect with the force law(size, q, v, t) of one joint."""
+    """Builder of an effect with the force law(size, q, v, t) of one joint."""
     return lambda scene, model, joint, size: _joint_force(model.joint(joint).id, lambda q, v, t: law(size, q, v, t))
 
 
 def _spring_law(law: Callable[[Any, Array, Array, float], Array]) -> _ForceBuilder:
-    """An effect with the force law(size, angles from rest, stiffnesses, t) of a segment's elastic joints."""
+    """Builder of an effect with the force law(size, angles from rest, stiffnesses, t) of a segment's elastic joints."""
 
     def made(scene: _EffectContext, model: Any, segment: str, size: Any) -> _ForceCallback:
         at, stiffness, rest = scene.segment_springs(model, segment)
@@ -136,14 +136,14 @@ def _spring_law(law: Callable[[Any, Array, Array, float], Array]) -> _ForceBuild
 
 
 def _bend_law(law: Callable[[float, Array], Array]) -> _ForceBuilder:
-    """An effect with the force law(size, q) of a segment's bends, those about x first."""
+    """Builder of an effect with the force law(size, q) of a segment's bending joints, those about x first."""
     return lambda scene, model, segment, size: _joint_force(
         scene.bend_joint_ids(model, segment), lambda q, v, t: law(size, q)
     )
 
 
 def _body_forces(forces: Mapping[int, Callable[[Any], Array]]) -> _ForceCallback:
-    """Forces [N] at the centres of mass of bodies, in the world, as functions of MuJoCo's data."""
+    """Callback that adds forces [N] in the world at centres of mass of bodies, given as functions of MuJoCo data."""
     mujoco = import_mujoco()
 
     def push(model: Any, data: Any) -> None:
@@ -154,9 +154,9 @@ def _body_forces(forces: Mapping[int, Callable[[Any], Array]]) -> _ForceCallback
 
 
 def _attached(offset: Sequence[float], pull: Callable[[float, Array], Array]) -> _ForceBuilder:
-    """An effect with the force pull(size, way) on a tip or an arm's link; `way` [m] leads to a fixed anchor point.
+    """Builder of an effect with the force pull(size, way) on a segment's tip or an arm's link.
 
-    The anchor is the start position plus `offset` for a tip, minus `offset` for an arm's link.
+    `way` [m] leads to an anchor, which is the start position plus `offset` for a tip, minus `offset` for a link.
     """
 
     def made(scene: _EffectContext, model: Any, place: str, size: float) -> _ForceCallback:
@@ -175,7 +175,7 @@ def _attached(offset: Sequence[float], pull: Callable[[float, Array], Array]) ->
 
 
 def _in_motion(build: _ForceBuilder) -> _ForceBuilder:
-    """An effect that is absent until the motion begins."""
+    """Builder of the same effect as `build`, but absent until the motion begins."""
 
     def made(scene: _EffectContext, model: Any, place: str, size: Any) -> _ForceCallback:
         push = build(scene, model, place, size)
@@ -187,9 +187,9 @@ def _in_motion(build: _ForceBuilder) -> _ForceBuilder:
 def _memory_law(
     start: Callable[[Any], Any], advance: Callable[..., Any], law: Callable[[Any, Any, Any, Any], Any]
 ) -> _ForceBuilder:
-    """An effect with the force law(size, stiffnesses, q, z) of a segment's elastic joints, or of one joint.
+    """Builder of an effect with the force law(size, stiffnesses, q, z) of a segment's elastic joints, or of one joint.
 
-    The internal state is z = start(q) at the start of the motion, then advance(size, z, q, v, step).
+    The internal state z is start(q) at the start of the motion, then advance(size, z, q, v, step) after each step.
     """
 
     def made(scene: _EffectContext, model: Any, place: str, size: Any) -> _ForceCallback:
@@ -248,9 +248,9 @@ def _slid(size: _Values, s: float, q: float, v: float, step: float) -> float:
 
 
 def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[InjectedEffect]) -> _ForceCallback:
-    """Dry friction of joints as MuJoCo's own `frictionloss`, whose size is updated at every inner step.
+    """Dry friction of joints as `frictionloss` of MuJoCo, whose largest torque is updated at every inner step.
 
-    It is at most tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|, with the motor torque minus that of weights.
+    This torque is tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|, with the torque through the gear as load.
     """
     names = list(dict.fromkeys(effect.location for effect in effects))
     at = np.array([model.joint(name).id for name in names])
@@ -281,7 +281,7 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
 
 
 def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], Array]:
-    """Torque through the gears of some joints [N m]: motor torque minus that of weights and grasps beyond."""
+    """Function of the torque through gears of joints [N m]: motor torque minus that of weights and grasps beyond."""
     value, servos, drag = scene.value, scene.system.servos, np.zeros(len(at))
     for i, joint in enumerate(at):
         servo = servos.get(model.joint(int(joint)).name)
@@ -294,7 +294,7 @@ def _gear_load(scene: _EffectContext, model: Any, at: Array) -> Callable[[Any], 
         weight = model.body_subtreemass[body, None] * model.opt.gravity
         outside = np.einsum("ij,ij->i", data.xaxis[at], np.cross(reach, weight))
         if data.ne and len(others):
-            # the pull of grasps follows from the object's joints, which have no friction
+            # the forces of grasps follow from the object's joints, which have no friction
             rows = data.efc_J.reshape(-1, model.nv)[: data.ne]
             outside += rows[:, at].T @ np.linalg.lstsq(rows[:, others].T, data.qfrc_constraint[others], rcond=None)[0]
         return np.asarray(data.qfrc_actuator[at] + data.qfrc_applied[at] - drag * data.qvel[at] - outside)
@@ -321,7 +321,7 @@ def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) ->
 
 
 def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None:
-    """Add a point mass, possibly negative, at (mx, my, mz)/mass in a frame."""
+    """Add a point mass, possibly negative, at the position (mx, my, mz)/mass in the frame `place`."""
     mujoco, value, where = import_mujoco(), scene.value, f"payload@{place}"
     frame, reach = scene.system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
     body = int(model.jnt_bodyid[model.joint(scene.system.mechanism.joints[frame.joint_index].name).id])
@@ -329,7 +329,8 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     mass = size["mass"]
     if not np.linalg.norm(reach) <= _MAX_PAYLOAD_DISTANCE * abs(mass):
         what = f"the added mass is {np.linalg.norm(reach) / max(abs(mass), 1e-300):.3g} m from its frame"
-        raise ModelError(what, where=where, allowed=f"at most {_MAX_PAYLOAD_DISTANCE:g} m")
+        allowed = f"a distance |(mx, my, mz)/mass| of at most {_MAX_PAYLOAD_DISTANCE:g} m"
+        raise ModelError(what, where=where, allowed=allowed, hint="give smaller mx, my, mz, or a larger mass")
     point = value(frame.placement.translation) + turn @ reach / mass
     own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])
     axes = Rotation.from_quat(np.roll(model.body_iquat[body], -1)).as_matrix()
@@ -339,7 +340,7 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     moments, axes = np.linalg.eigh(tensor)
     if own + mass <= 0 or moments[0] <= 0:
         what = "the effect removes more mass or inertia than the link has"
-        hint = "remove less mass, or nearer to the link"
+        hint = "give a less negative mass, or one nearer to the link's centre of mass"
         raise ModelError(what, where=where, allowed="a positive mass and inertia of the link", hint=hint)
     axes[:, 2] *= np.linalg.det(axes)
     model.body_mass[body] = own + mass
@@ -471,14 +472,15 @@ OUT_OF_LIBRARY_FORCE_BUILDERS: Mapping[str, _ForceBuilder] = {
     # a grasp that holds, lets the tube slip along its axis, and holds again [m per slip]
     "slipping_grasp": _in_motion(_slipping_grasp),
 }
-"""Effects outside the library, by kind: makers of forces from scene, MuJoCo model, location and size."""
+"""Effects outside the library, by kind: builders of forces from context, MuJoCo model, location and size."""
 
 
 @dataclass(frozen=True)
 class InjectedEffect:
     """An effect that is present in simulated data but not in the model, with kind, location and parameter values.
 
-    `values` are the effect's parameters; a kind outside the library has `size`, in the unit of its force.
+    `values` are the effect's parameters by quantity. A kind outside the library has one, `size`, in the unit of its
+    entry in `OUT_OF_LIBRARY_FORCE_BUILDERS`.
     """
 
     kind: str
@@ -501,11 +503,10 @@ def run_experiment_with_effects(
     """Record a virtual experiment with effects that the system's description lacks.
 
     `system` is the nominal system, with driven joints. The recording stores `values` as `true_parameters`. The
-    experiment's `injected_terms` are replaced. Without `ordinary_friction`, joint friction in `effects` is a smooth
-    force. If `ordinary_friction` is given (it can be empty), MuJoCo's constraint solver simulates it and the joint
-    friction in `effects`, including sticking. Raises `ConfigError` if an effect kind cannot be simulated, and
-    `ModelError` if a payload is too far from its frame or removes more mass than its link has. Other errors are as in
-    `run_virtual_experiment`.
+    experiment's `injected_terms` are replaced. If `ordinary_friction` is None, dry friction of joints in `effects` is a
+    smooth force. If it is given (it can be empty), MuJoCo's constraint solver simulates it and the dry friction in
+    `effects`, including sticking. Raises `ConfigError` if an effect kind cannot be simulated, and `ModelError` if a
+    payload is too far from its frame or removes more mass than its link has. Other errors: `run_virtual_experiment`.
     """
     known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_FORCE_BUILDERS)
     known = known if ordinary_friction is None else tuple(dict.fromkeys((*known, *_ORDINARY_FRICTION)))
@@ -531,7 +532,7 @@ def run_experiment_with_effects(
 
 
 class _InjectedTerms:
-    """Injected effects as `InjectedSimulatorTerms`; amplitudes of `held_frictions` at one joint add up."""
+    """The injected effects as `InjectedSimulatorTerms`. The amplitudes of `held_frictions` at the same joint add up."""
 
     def __init__(
         self,

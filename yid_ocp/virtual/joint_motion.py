@@ -1,4 +1,4 @@
-"""Random multisine motions of the driven joints, from angles at which the grippers meet the object."""
+"""Random multisine motions of the driven joints, and start angles at which the grippers meet the object."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ELBOW_UP_ANGLES: Mapping[str, float] = {
     for joint, value in zip(BAXTER_JOINT_NAMES_WITHOUT_SIDE, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
 }  # initial guess for Baxter [rad]: elbow above the hand, the right arm mirrored
 _SECOND_HARMONIC = 0.35  # amplitude relative to the first harmonic
-_PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
+_PULL = 1e-5  # weight of the distance from the start angles; moves the gripper by less than 1e-9 m [m/rad]
 
 
 class JointOffsetMotion(Protocol):
@@ -45,7 +45,7 @@ class MultisineMotion:
     """A multisine motion of the driven joints about their initial angles that starts from standstill.
 
     The offset of joint j is r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji). The ramp r = 10 s^3 - 15 s^4 +
-    6 s^5, s = min(t / ramp, 1), is twice continuously differentiable.
+    6 s^5 with s = min(t / ramp_time, 1) is twice continuously differentiable.
     """
 
     joints: tuple[str, ...]
@@ -71,22 +71,22 @@ class MultisineMotion:
 class MultisineOptions:
     """The amplitude, speed and frequency limits of a random multisine motion.
 
-    The motion of each arm is scaled separately to the travel of its gripper. With two arms, much more travel than the
-    default makes the foam Y snap between shapes. Each frequency band is divided into equal parts in log frequency, with
-    one sine in each part. The band of `shake` sines should be well below half the sample rate of the torque.
+    The motion of each arm is scaled separately to `gripper_travel`. With two arms, much more travel than the default
+    makes the foam Y snap between shapes. A frequency band is divided into parts of equal width in log frequency, with
+    one sine in each part. The band of the additional `shake` sines should end well below half the torque's sample rate.
     """
 
     gripper_travel: float = 0.11  # largest distance of a gripper from its start [m]
-    max_joint_speed: float = 1.4  # an arm that would exceed it travels less [rad/s]
+    max_joint_speed: float = 1.4  # limit on all joints; an arm that would exceed it travels less [rad/s]
     sines_per_joint: int = 3
     frequency_band: tuple[float, float] = (0.2, 2.0)  # [Hz]
     ramp_time: float = 1.0  # [s]
     duration: float = 5.0  # [s]
-    # torque of each joint's own inertia from additional sines of equal torque; zero: none [N m]
+    # RMS torque by which additional fast sines accelerate each joint's own inertia; zero: no such sines [N m]
     shake_torque_rms: float = 0.0
     shake_frequency_band: tuple[float, float] = (4.0, 9.0)  # [Hz]
     max_shake_speed: float = 0.15  # speed limit of each of these sines, which light wrists reach first [rad/s]
-    has_second_harmonic: bool = False  # whether every sine has one at twice its frequency
+    has_second_harmonic: bool = False  # whether each sine comes with a second one at twice its frequency
 
 
 def random_multisine_motion(
@@ -97,10 +97,10 @@ def random_multisine_motion(
     initial_joint_angles: Mapping[str, float] | None = None,
     excitation: MultisineOptions | None = None,
 ) -> MultisineMotion:
-    """Draw a random multisine motion, scaled to the requested travel of the grippers.
+    """Draw a random multisine motion of the driven joints, scaled to the requested travel of the grippers.
 
-    Amplitudes decrease with frequency (as 1/frequency) and towards the base. By default, parameter values are nominal
-    and initial angles [rad or m] come from `grasping_joint_angles`.
+    Amplitudes decrease with frequency (as 1/frequency) and towards the base. Defaults: `values` are nominal, initial
+    angles [rad or m] come from `grasping_joint_angles`. Without grasps, joints reach `max_joint_speed`.
     """
     chosen = excitation or MultisineOptions()
     rng = np.random.default_rng(seed)
@@ -155,7 +155,7 @@ def _drawn_frequencies(band: tuple[float, float], shape: tuple[int, int], rng: n
 def _shaken(
     motion: MultisineMotion, excitation: MultisineOptions, inertia: Array, rng: np.random.Generator
 ) -> MultisineMotion:
-    """The motion with fast sines added; `inertia` (nj,) of the driven joints [kg m^2]."""
+    """The motion with fast sines added. `inertia` (nj,) is that of the driven joints [kg m^2]."""
     shape = motion.frequency.shape
     frequency = _drawn_frequencies(excitation.shake_frequency_band, shape, rng)
     omega = 2 * math.pi * frequency
@@ -167,7 +167,7 @@ def _shaken(
 
 
 def _scale(excitation: MultisineOptions, tip: ca.Function, q0: Array, columns: Sequence[int], waves: Array) -> float:
-    """Factor on an arm's waves (N, 2, nj), offset and velocity, at which the tip reaches the requested travel."""
+    """Factor on an arm's `waves` (N, 2, nj), offsets and velocities, with which `tip` reaches the requested travel."""
 
     def distance(scale: float) -> float:
         path = np.tile(q0, (len(waves), 1))
@@ -204,8 +204,8 @@ def grasping_joint_angles(
         Start of the search by joint [rad or m]. Default: elbow up for Baxter, else the middle of the joint's range, or
         zero if the joint is unlimited.
     offsets : mapping of grasp to array_like, shape (3,), optional
-        Position of each gripper relative to the undeformed tube end, in the world [m]. Two arms that hold the
-        undeformed Y are fully stretched, which is a singular posture; offsets that bring the grippers closer avoid it.
+        Position of each gripper relative to the grasped point of the undeformed object, in the world [m]. Two arms that
+        hold the undeformed Y are fully stretched, a singular posture. Offsets that bring the grippers closer avoid it.
     """
     tree = system.numeric_mechanism(values)
     value = ExpressionEvaluator(system, values)
@@ -271,6 +271,7 @@ def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[i
     miss = np.abs(result.fun[: gap.numel_out(0)]).max()
     if miss > 1e-7:
         where = ", ".join(f"{grasp.holder_frame} -> {grasp.held_frame}" for grasp in system.grasps)
-        hint, what = "move the object, or give another seed", f"the arms miss the grasped points by {1e3 * miss:.3g} mm"
+        what = f"the grippers miss the grasped points by {1e3 * miss:.3g} mm at the best joint angles found"
+        hint = "place the object nearer to the robot, or give other start angles"
         raise ModelError(what, where=where, allowed="grasps within reach and within the joint limits", hint=hint)
     return at(result.x)

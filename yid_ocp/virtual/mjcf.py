@@ -1,7 +1,7 @@
 """A conversion of a system to the terms of a rigid-body engine, and to a MuJoCo model (MJCF).
 
-An effect is classified by its equations and the parts of the description that it changes, so kinds from plug-ins are
-treated like those of the library.
+Effects are classified by their equations and by the parts of the description that they change, not by their kinds.
+Effects from plug-ins are therefore treated like those of the library.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from yid_ocp.model.system import Effect, MidpointStateSymbols, System
 
 _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of friction torque tau_c [N m]
 
-_N_COMPARED_STATES = 3  # number of states at which equations are compared
+_N_COMPARED_STATES = 3  # number of random states at which an effect's equations are compared with joint terms
 _ROUNDING_TOLERANCE = 1e-9
 MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 # aspects of sensors and recorded torques, which do not enter the mechanics
@@ -44,15 +44,15 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 @functools.cache
 def format_elements_by_model_aspect() -> Mapping[str, Mapping[str, str]]:
-    """Return the aspects of a model that an engine may lack: a description (`is`) and the elements of each format."""
+    """Return, for each model aspect that an engine may lack, its description (`is`) and elements by file format."""
     return dict(YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml")))
 
 
 @dataclass(frozen=True)
 class JointDynamicsTerms:
-    """The stiffness, damping, dry friction, armature and constant force of one joint, in SI units.
+    """The stiffness, damping, dry friction, armature (rotor inertia) and constant force of one joint, in SI units.
 
-    The force is constant - stiffness q - cubic q^3 - damping v - friction.
+    Its force is constant_force - stiffness q - cubic_stiffness q^3 - damping v - dry friction.
     """
 
     stiffness: float = 0.0
@@ -67,7 +67,7 @@ class JointDynamicsTerms:
 
 
 class ExpressionEvaluator:
-    """An evaluator of CasADi expressions at parameter values (default: nominal). Matrices are flattened by columns."""
+    """An evaluator of CasADi expressions at parameter `values` (default: nominal). It flattens matrices by columns."""
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
         self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
@@ -116,7 +116,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ExpressionEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
-    """Find the terms that an effect adds to each joint, and the keys of the model aspects that it changes."""
+    """Find the terms that an effect adds to each joint, and the model aspects that it changes, by key."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
@@ -150,7 +150,7 @@ def system_joint_dynamics_terms(system: System, value: ExpressionEvaluator) -> d
     for joint, coefficient in system.joint_damping.items():
         add(joint, JointDynamicsTerms(damping=float(value(coefficient)[0])))
     for joint, servo in system.servos.items():
-        if servo.motor_kind == "dc":  # its counter-voltage is beyond the limit of its duty
+        if servo.motor_kind == "dc":  # the limit of its duty cycle does not limit the counter-voltage
             add(joint, JointDynamicsTerms(damping=float(value(servo.damping)[0])))
     for spring in system.elastic_joints:
         stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest_angle, spring.damping))
@@ -170,7 +170,8 @@ def _actuation(
 ) -> tuple[float, float, float, float]:
     """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
 
-    The true value is gain x recorded - offset, delayed and with a first-order lag. The last acts on the reading.
+    The true value is gain x recorded - offset, delayed and with a first-order lag. The last of `effects` is applied
+    first.
     """
     true = reading = ca.SX.sym("reading")
     channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
@@ -184,7 +185,7 @@ def _actuation(
 
 
 def _joint_terms(system: System, effect: Effect, value: ExpressionEvaluator) -> dict[str, JointDynamicsTerms] | None:
-    """Springs, dampers and rotors equivalent to an effect's equations, by joint; None if there is no equivalent."""
+    """Springs, dampers and rotors that are equivalent to an effect's equations, by joint. None if none are."""
     n = system.n_coordinates
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
     u, reaction = ca.SX.sym("u", len(system.driven)), ca.SX.sym("reaction", system.n_constraints)
@@ -240,7 +241,7 @@ def mujoco_xml(
     actuators: bool = False,
     gear_play: Mapping[str, float] | None = None,
 ) -> str:
-    """Write a system as a MuJoCo model in MJCF, an XML text.
+    """Return a system as a MuJoCo model in MJCF, an XML text.
 
     Joints keep their names. Consecutive massless joints at one location become one body with several joints, which is
     kinematically equivalent. Every point and grasp end is a site: points under their own name, grasps as
@@ -257,9 +258,9 @@ def mujoco_xml(
         Whether approximations are allowed: sticking for smoothed dry friction, a tendon for a compliant point grasp.
         Otherwise a system that needs them raises an error.
     actuators : bool
-        Whether each driven joint has an actuator of its name. The control is the recorded torque; gain, offset, delay
-        and lag of the actuator give the applied torque. Without actuators, true torques are applied as `qfrc_applied`.
-        A servo always is an actuator, whose control is the command.
+        Whether each driven joint has an actuator of its name, whose control is the recorded torque, and whose gain,
+        offset, delay and lag give the applied torque. Without actuators, apply true torques as `qfrc_applied`. A servo
+        always is an actuator, whose control is the command.
     gear_play : mapping of joint name to float, optional
         Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
     """
@@ -302,7 +303,7 @@ def _bodies(
     world: Element,
     gears: Mapping[str, Mapping[str, str]],
 ) -> dict[int, Element]:
-    """Add bodies with joints, masses and `gears`. Returns the body of each joint by its index (-1: the world)."""
+    """Add bodies with joints, masses and `gears`. Returns the body element of each joint index (-1: the world)."""
     carried = {frame.joint_index: name for name, frame in reversed(sites)}
     elements: dict[int, Element] = {-1: world}
     for j, joint in enumerate(tree.joints):
@@ -310,7 +311,7 @@ def _bodies(
             elements[j] = elements[joint.parent_index]
             if joint.parent_index in carried:
                 what = f"the frame '{carried[joint.parent_index]}' is on a joint without mass"
-                where, hint = f"joint '{joint.name}'", "give the link of the frame a mass"
+                where, hint = f"joint '{joint.name}'", "give a mass to the link that carries the frame"
                 raise ModelError(what, where=where, allowed="frames on links with mass", hint=hint)
         else:
             place = {"name": f"{joint.name}_body", **_pose(joint.placement)}
@@ -326,9 +327,9 @@ def _bodies(
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
             SubElement(elements[j], "joint", {**kind, **gears[name]})
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
-            what = "more than six joints without mass are in one series"
-            hint = "give one of the links between them a mass"
-            allowed = "up to six, with a mass on the link of the last one"
+            what = "more than six joints in series have no mass between them"
+            hint = "give a mass to one of the links between them"
+            allowed = "up to six joints in series, with a mass on the link of the last one"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         body = merge_bodies(joint.bodies)
         if body is not None:
@@ -342,13 +343,13 @@ def _bodies(
 
 
 def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
-    """The tree with bodies of full weight, and by joint the gravity fraction of bodies that have less."""
+    """The tree with bodies of full weight, and the gravity fraction of bodies with another weight, by joint."""
     weights: dict[str, float] = {}
     for joint in tree.joints:
         shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
         if len(shares) > 1:
             what, where = "the ratio of weight to mass differs between bodies of one joint", f"joint '{joint.name}'"
-            hint = "leave out one of the effects that change weights"
+            hint = "remove one of the effects that change weights"
             raise ModelError(what, where=where, allowed="one ratio for all bodies of a joint", hint=hint)
         weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
     return tree.with_gravity_fraction(None), weights
@@ -363,8 +364,8 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
         numbers |= {"stiffness": [terms.stiffness], "springref": [terms.constant_force / terms.stiffness]}
     if terms.cubic_stiffness:
         if terms.constant_force:
-            what, allowed = f"the spring at '{joint.name}' has a cubic part and a rest angle", "only one of them"
-            hint = "leave the cubic part or the rest angle out"
+            what, allowed = f"the spring at '{joint.name}' has a cubic part and a rest angle", "one of these two only"
+            hint = "remove the cubic part or the rest angle: MuJoCo cannot express both at one joint"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         numbers["stiffness"] = [terms.stiffness, 0.0, terms.cubic_stiffness]
     others = {"armature": [terms.armature], "frictionloss": [terms.dry_friction]}
@@ -443,28 +444,28 @@ def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: b
             changed = format_elements_by_model_aspect()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
             allowed = ", ".join(own["is"] for name, own in format_elements_by_model_aspect().items() if name in able)
-            where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out"
+            where, hint = f"effect '{effect.kind}@{effect.location}'", "remove the effect"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
-            what, hint = f"grasp '{grasp.name}' is compliant", "set its compliance to 0"
+            what, hint = f"grasp '{grasp.name}' is compliant, which MuJoCo cannot express", "set its compliance to 0"
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():
         if value._is_zero_at_parameter_values(compliance):
-            hint, what = "leave the effect out", f"the compliance of joint '{joint}' is zero"
+            hint, what = "remove the effect that adds the compliance", f"the compliance of joint '{joint}' is zero"
             raise ModelError(what, where=f"joint '{joint}'", allowed="a compliance above zero", hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):
             what, hint = f"the servo of '{joint}' has a dead band", f"set {joint}.servo_dead_band to 0"
             raise ModelError(what, where=f"joint '{joint}'", allowed=f"{joint}.servo_dead_band: 0", hint=hint)
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
-        what, allowed, hint = "the recorded time is scaled", "a time scale of 1", "leave the effect on the clock out"
+        what, allowed, hint = "the recorded time is scaled", "a time scale of 1", "remove the effect on the clock"
         raise ModelError(what, where="effects of the model", allowed=allowed, hint=hint)
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:
-    """Whether joint j is at the same location as its parent, which carries nothing else."""
+    """Whether joint j shares a body with its parent joint: same location, and a massless link without other joints."""
     joint = tree.joints[j]
     if joint.parent_index < 0 or merge_bodies(tree.joints[joint.parent_index].bodies) is not None:
         return False

@@ -1,7 +1,7 @@
 """Simulation in MuJoCo of a controller that moves driven joints along a motion, or of a replayed recording.
 
-Simulator and estimator share only the description of the system. Equations, integrator and grasps are MuJoCo's own, so
-that estimates are not tested against the estimator's own errors.
+Simulator and estimator share only the description of the system. Equations, integrator and grasps are MuJoCo's, so that
+errors of the estimator's own equations show in tests.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf_text, muj
 
 DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
 _TRACKING_BANDWIDTH = 25.0  # bandwidth of the joint controller [rad/s]; a 10 ms hold leaves it well damped
-_HOLD_STIFFNESS = 2e3  # [N m/rad] while settling; stable explicitly on the lightest wrist
+_HOLD_STIFFNESS = 2e3  # of driven joints while settling; explicit integration is stable on the lightest wrist [N m/rad]
 _HOLD_DAMPING = 60.0  # [N m s/rad]
 _SETTLING_FACTOR = 10.0  # on the object's damping: shortens settling without changing the equilibrium
 _SETTLING_LIMIT = 60.0  # [s]
@@ -39,7 +39,7 @@ _INSTABILITY_WARNINGS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 class InjectedSimulatorTerms(Protocol):
-    """The interface of forces and model changes that the simulator has but the system's description lacks."""
+    """The interface of forces and model changes in MuJoCo that the system's description lacks."""
 
     def edit_model(self, model: Any) -> None:
         """Change the compiled `mujoco.MjModel`."""
@@ -60,8 +60,8 @@ class SimulationOptions:
     time_step: float = DEFAULT_SIMULATOR_TIME_STEP  # must divide the controller's period
     # rate at which torques are computed and held, a multiple of `sample_rate` (the default)
     controller_rate: float | None = None
-    effort_kind: EffortSamplingKind = "command"  # recorded; `command` needs a controller no faster than the recording
-    period_jitter_std: float = 0.0  # std of the controller's ticks about an even clock, at most a third of a period [s]
+    effort_kind: EffortSamplingKind = "command"  # of recorded efforts; `command` needs controller_rate = sample_rate
+    period_jitter_std: float = 0.0  # std of the controller's tick times; deviations end at a third of a period [s]
     jitter_seed: int = 0
 
     def __post_init__(self) -> None:
@@ -75,7 +75,7 @@ class SimulationOptions:
             raise ConfigError(what, where="time_step", allowed="1 / (k * controller_rate) with a whole number k from 1")
         if self.effort_kind not in get_args(EffortSamplingKind):
             said = unknown_name_error_arguments(self.effort_kind, get_args(EffortSamplingKind))
-            raise ConfigError(f"effort_kind = '{self.effort_kind}'", where="effort_kind", **said)
+            raise ConfigError(f"effort_kind = '{self.effort_kind}' does not exist", where="effort_kind", **said)
         if self.effort_kind == "command" and periods > 1:
             what = f"effort_kind = 'command', but the controller ({controller:g} Hz) changes commands within a sample"
             allowed = f"sample or mean; command with controller_rate = {self.sample_rate:g} Hz"
@@ -108,14 +108,14 @@ class SimulationOptions:
 class SimulationResult:
     """The noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
 
-    Depending on `effort_kind`, `effort` is the torque at t_k, its mean from t_k to t_{k+1} [N m], or the servo command
-    at t_k. The last row of `effort` was computed but not applied. Points are `system.point_frames` in the world.
+    `effort` is the torque [N m] of the driven joints at t_k (with `effort_kind` mean: its mean from t_k to t_{k+1}), or
+    the servo command at t_k. Its last row was computed but not applied. Points are `system.point_frames` in the world.
     """
 
-    t: Array  # shape (N + 1,) [s]
-    q: Array  # shape (N + 1, n)
-    v: Array  # shape (N + 1, n)
-    effort: Array  # shape (N + 1, nu)
+    t: Array  # sample times, (N + 1,) [s]
+    q: Array  # joint positions in the order of the system, (N + 1, n) [rad or m]
+    v: Array  # joint velocities, (N + 1, n) [rad/s or m/s]
+    effort: Array  # (N + 1, nu)
     point_positions: Array  # shape (N + 1, np, 3) [m]
     frame_times: Array  # the camera's, rounded to the simulator's step, shape (M,) [s]
     frame_point_positions: Array  # points at the frame times, (M, np, 3) [m]
@@ -132,10 +132,10 @@ def simulate_in_mujoco(
     injected: InjectedSimulatorTerms | None = None,
     gear_play: Mapping[str, float] | None = None,
 ) -> SimulationResult:
-    """Simulate a controller that follows a motion in MuJoCo, from equilibrium at the initial joint angles.
+    """Simulate in MuJoCo a controller that moves the driven joints along a motion, from equilibrium at initial angles.
 
-    Position servos are MuJoCo's own; their commands are the motion about the initial angles. Raises `ModelError` if the
-    system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not settle, or diverges.
+    Position servos are MuJoCo actuators, whose commands follow the motion. Raises `ModelError` if MuJoCo cannot express
+    the system (`mujoco_xml`), if it has prescribed or no driven joints, does not settle, or diverges.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def simulate_in_mujoco(
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
         allowed = f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
-        what, hint = "the motion has other joints than the driven ones", "give a motion of the driven joints"
+        what, hint = "the motion does not move exactly the driven joints", "give a motion of the driven joints"
         raise ModelError(what, where=f"motion of {', '.join(motion.joints) or 'nothing'}", allowed=allowed, hint=hint)
     mujoco = import_mujoco()
     model = mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
@@ -176,25 +176,25 @@ def simulate_in_mujoco(
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
-        hint = "set a shorter time_step, or give a slower motion"
+        hint = f"set a time_step shorter than {chosen.time_step:g} s, or give a slower motion"
         raise ModelError("the simulation diverged", where="MuJoCo", allowed="finite positions and efforts", hint=hint)
     return result
 
 
 @dataclass(frozen=True, eq=False)
 class MujocoModelAndState:
-    """A MuJoCo model and its state, with ids of all joints, of driven (else prescribed) joints and of points."""
+    """A MuJoCo model and its state, with the MuJoCo ids of the system's joints and points."""
 
     mujoco: ModuleType
-    model: Any
-    data: Any
-    joint_ids: IntArray
-    moved_joint_ids: IntArray
-    point_site_ids: list[int]
+    model: Any  # `mujoco.MjModel`
+    data: Any  # `mujoco.MjData`
+    joint_ids: IntArray  # in the order of the system's coordinates
+    moved_joint_ids: IntArray  # of the driven joints, or of the prescribed joints if none is driven
+    point_site_ids: list[int]  # in the order of `system.point_frames`
 
     @staticmethod
     def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoModelAndState:
-        """Make the simulation scene of a compiled model. It moves the driven joints, or else the prescribed joints."""
+        """Make the scene of a compiled MuJoCo model, with a new state and the ids that belong to `system`."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
@@ -217,10 +217,9 @@ def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | 
 
 
 def settle_and_return_holding_torques(scene: MujocoModelAndState, damping: Array) -> Array:
-    """Bring the scene to equilibrium with the driven joints held, and return their torques [N m].
+    """Bring the scene to equilibrium with the moved joints held, and return their holding torques (nj,) [N m].
 
-    `damping` replaces the joint damping while the scene settles, because it can decide which of several equilibria is
-    found.
+    Joints settle with an increased `damping`, which can decide which of several equilibria is found.
     """
     data, driven, held = scene.data, scene.moved_joint_ids, _settling_model(scene, damping)
     target = data.qpos[driven].copy()
@@ -268,7 +267,7 @@ class TrackingController:
         self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
 
     def apply_and_return_input(self, t: float) -> Array:
-        """Apply and return the torques (nu,) [N m] at time t [s], computed from the scene's present state."""
+        """Compute the torques (nu,) [N m] at time t [s] from the scene's present state, apply and return them."""
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
         reference = self._rest[driven] + offset
@@ -287,7 +286,7 @@ class TrackingController:
 
 
 class _ServoCommander:
-    """Controller that commands position servos along a motion about the scene's present joint angles."""
+    """Controller that commands position servos along a motion, relative to the joint angles at its creation."""
 
     def __init__(self, scene: MujocoModelAndState, motion: JointOffsetMotion) -> None:
         self._scene, self._motion = scene, motion
@@ -309,7 +308,7 @@ def _initialize_actuator_history(scene: MujocoModelAndState, commands: Array) ->
 
 
 def _settle_under_servo_commands(scene: MujocoModelAndState, damping: Array, commands: Array) -> None:
-    """Bring the scene to equilibrium under constant servo commands, with `damping` increased meanwhile."""
+    """Bring the scene to equilibrium under constant servo commands. Joints meanwhile have a multiple of `damping`."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
     held = _settling_model(scene, damping)
@@ -324,8 +323,8 @@ def _settle_under_servo_commands(scene: MujocoModelAndState, damping: Array, com
 def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
     """Let a scene settle with the model `held`, and yield its largest velocity [rad/s] every 0.1 s.
 
-    With short steps, a gripper that is not at its grasped point can throw a fine chain about. If the state is lost, the
-    scene restarts, and grasps close at the usual rate in the first 0.1 s.
+    With short steps, a gripper that starts beside its grasped point can accelerate a fine chain so much that the
+    simulation diverges. The scene then restarts, with softer grasps in the first 0.1 s.
     """
     data, step = scene.data, scene.mujoco.mj_step
     start, commands = data.qpos.copy(), data.ctrl.copy()
@@ -340,13 +339,13 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
         held.eq_solref[:] = firm
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
         if _lost(scene):
-            what = "the simulation diverged before the motion began"
-            hint = "set a shorter time_step, or start nearer to the grasp"
+            what = "the simulation diverged before the motion began, while the object settled"
+            hint = "set a shorter time_step, or initial joint angles nearer to the grasp"
             raise ModelError(what, where="MuJoCo", allowed="finite positions and velocities", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)
     what = f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)"
-    hint = "give every coordinate more damping, and enough stiffness to carry the weight"
+    hint = "give every joint of the object more damping, and enough stiffness to carry the weight"
     raise ModelError(what, where="settling before the motion", allowed="an object that comes to rest", hint=hint)
 
 
@@ -356,7 +355,7 @@ def _play(
     simulation: SimulationOptions,
     frames: IntArray,
 ) -> SimulationResult:
-    """Simulate controller period by period, with constant torque in each; `frames` are simulator steps."""
+    """Simulate one controller period after another, with constant inputs in each. `frames`: steps of camera frames."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
     periods, ticks = simulation.controller_periods_per_sample, simulation._tick_steps()
     steps_per_second = simulation._steps_per_period * periods * simulation.sample_rate
@@ -390,55 +389,54 @@ def _play(
 REPLAY_FEEDBACK_BANDWIDTH = 5.0  # against drift of driven joints; low, so that recorded torque dominates [rad/s]
 _SMOOTHING_SAMPLES = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
-_AT_ENDS = 0.2  # duration at both ends that is not compared for prescribed joints [s]: the replay starts anew there
-_INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
+_AT_ENDS = 0.2  # duration at both ends of the replay in which efforts of prescribed joints are not compared [s]
+_INERTIA_EVERY = 20  # steps after which the mass matrix is computed again; it changes slowly
 
 
 @dataclass(frozen=True)
 class ReplayErrorAgainstRecording:
-    """The root mean square difference between a replayed model and the recording, in one channel or group of channels.
+    """The error of a replay: the difference between the replayed model and the recording in one channel or group."""
 
-    The error of a point is the distance. `noise_rms` is expected from sensor noise alone, zero if not recorded.
-    """
-
-    rmse: float
-    noise_rms: float
+    rmse: float  # root mean square difference; for a point, of the distance
+    noise_rms: float  # root mean square difference that sensor noise alone causes; zero if the noise is not recorded
     unit: str
 
     @property
     def rmse_beyond_noise(self) -> float:
-        """The root mean square difference beyond noise. Zero if noise explains all."""
+        """The root mean square difference that noise does not explain: sqrt(rmse^2 - noise_rms^2), at least zero."""
         return float(np.sqrt(max(self.rmse**2 - self.noise_rms**2, 0.0)))
 
 
 def replay_mismatch_by_channel(
     text: str, system: System, recording: Recording
 ) -> dict[str, ReplayErrorAgainstRecording]:
-    """Replay a recording in MuJoCo and measure how far it deviates. `text` is from `mujoco_xml` with actuators.
+    """Replay a recording in MuJoCo and return the errors of the replay by channel. `text` is the model in MJCF.
 
-    Driven joints are actuated by the recorded torque plus weak feedback to the recorded angles
-    (`REPLAY_FEEDBACK_BANDWIDTH`). Without feedback, small torque errors would let the arm drift away. Position servos
-    receive their recorded commands only. Prescribed joints follow the recorded angles, and the required torque is
-    compared with the recorded torque.
+    `text` comes from `mujoco_xml` with actuators. Driven joints get the recorded torque plus weak feedback to the
+    recorded angles (`REPLAY_FEEDBACK_BANDWIDTH`), without which small torque errors would let the arm drift away.
+    Position servos get their recorded commands only. Prescribed joints follow the recorded angles, and the torque that
+    this requires is compared with the recorded torque.
 
-    Returns `joints.position` of driven joints [rad] or `joints.effort` of prescribed joints [N m], all joints together,
-    and `GROUP.POINT` of every point [m]. Raises `ModelError` if the recording lacks the channels that drive the model,
-    the model does not settle, or it diverges; `DataError` if MuJoCo is not installed.
+    Keys: `joints.position` (all driven joints together) [rad] or `joints.effort` (all prescribed joints) [N m], and
+    `GROUP.POINT` for every point [m]. Raises `ModelError` if the recording lacks the channels that drive the model, or
+    if the model does not settle or diverges, and `DataError` if MuJoCo is not installed.
     """
     mujoco, model = import_mujoco(), mujoco_model_from_mjcf_text(text)
     moved = system.driven or system.prescribed
     joints = recording.joints
     if joints is None or not moved or not set(moved) <= set(joints.names):
-        what, hint = "the recording lacks angles of driven or prescribed joints", "import them too"
+        what, hint = "the recording lacks angles of driven or prescribed joints", "import these joints too"
         allowed = f"the angles of {', '.join(moved) or 'one joint or more'}"
         raise ModelError(what, where=f"recording '{recording.name}': joints", allowed=allowed, hint=hint)
     columns = [joints.names.index(name) for name in moved]
     if system.servos and joints.position_command is None:
-        what, where = "servos need commanded positions", f"recording '{recording.name}': joints/position_command"
-        raise ModelError(what, where=where, allowed="recorded commanded positions", hint="import them too")
+        what = "the position servos of the model need commanded positions, which the recording lacks"
+        where, allowed = f"recording '{recording.name}': joints/position_command", "recorded position commands"
+        raise ModelError(what, where=where, allowed=allowed, hint="import the commands too")
     if system.driven and not system.servos and joints.effort is None:
-        what, where = "driven joints need efforts", f"recording '{recording.name}': joints/effort"
-        raise ModelError(what, where=where, allowed="recorded efforts", hint="import them too")
+        what = "the driven joints of the model need efforts, which the recording lacks"
+        where, allowed = f"recording '{recording.name}': joints/effort", "recorded efforts"
+        raise ModelError(what, where=where, allowed=allowed, hint="import the efforts too")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
     effort = None if joints.effort is None else joints.effort[:, columns]
     scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
@@ -460,7 +458,7 @@ def replay_mismatch_by_channel(
 
 
 class _Path:
-    """Recorded angles, smoothed over some samples, as a motion relative to the first angles."""
+    """Motion along recorded angles, smoothed with a Gaussian of `smoothed` samples, relative to the first angles."""
 
     def __init__(self, joints: tuple[str, ...], t: Array, position: Array, smoothed: float) -> None:
         from scipy.ndimage import gaussian_filter1d  # slow to import
@@ -489,7 +487,7 @@ def _step_times(scene: MujocoModelAndState, end: float) -> Array:
 
 
 def _played(scene: MujocoModelAndState, end: float, control: Callable[[int, float], Array | None]) -> _Played:
-    """Step up to a time. `control` sets inputs by step and time, and can return values of the moved joints."""
+    """Simulate up to the time `end`. `control(step, time)` sets inputs; values that it returns replace the angles."""
     mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
     times = _step_times(scene, end)
     values, points = np.empty((len(times), len(at))), np.empty((len(times), len(scene.point_site_ids), 3))
@@ -507,7 +505,7 @@ def _driven(scene: MujocoModelAndState, path: _Path, t: Array, effort: Array | N
     assert effort is not None
     mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
     start = np.array(data.qpos[at])
-    if model.na:  # torques that follow are what they were before
+    if model.na:  # lagging torques start at the first recorded value
         data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
     _initialize_actuator_history(scene, effort[0])
     inertia = np.zeros((model.nv, model.nv))
@@ -551,7 +549,7 @@ def _errors(
 ) -> dict[str, ReplayErrorAgainstRecording]:
     if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
         where, allowed = f"recording '{recording.name}'", "finite positions and efforts"
-        raise ModelError("the replay diverged", where=where, allowed=allowed, hint="set a shorter time step")
+        raise ModelError("the replay in MuJoCo diverged", where=where, allowed=allowed, hint="set a shorter time step")
     found: dict[str, ReplayErrorAgainstRecording] = {}
     t = joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9
