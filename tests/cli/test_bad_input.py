@@ -67,7 +67,7 @@ def edited(file, old, new):
         ("double_pendulum.urdf", "doubel_pendulum.urdf", ("no such URDF file", "double_pendulum.urdf")),
         ("double_pendulum.urdf", "..", ("no such URDF file", "check the path")),
         ("estimate.h5", "estimat.h5", ("no such recording", "recordings.estimate", "did you mean 'estimate.h5'?")),
-        ("recordings:", "sensors: {points: {std: 1}}\nrecordings:", ("no recording has a group 'points'",)),
+        ("recordings:", "sensors: {points: {std: 1}}\nrecordings:", ("no recording has the sensor 'points'",)),
         ("  held_out:", "  held_out: [nothing.h5]\n  held_out:", ("is duplicated", "held_out")),
         ("recordings:", "recordings: [", ("not valid YAML",)),
     ],
@@ -93,11 +93,11 @@ def test_no_such_configuration(cli, pendulum):
 
 def test_nothing_to_solve(cli, pendulum, pendulum_data, left_nothing):
     assert_refused(cli("solve", pendulum, "--set", "parameters={}"), "no parameter is free")
-    assert_refused(cli("solve", pendulum, "--set", "recordings.estimate=[]"), "no recording to estimate on")
+    assert_refused(cli("solve", pendulum, "--set", "recordings.estimate=[]"), "no recording is listed for estimation")
     assert_refused(cli("solve", pendulum, "--set", "model={}"), "neither a robot nor an object")
     assert_refused(cli("solve", pendulum, "--set", "problem.time_step"), "KEY=VALUE")
     same = pendulum_data.folder / "estimate.h5"
-    assert_refused(cli("solve", pendulum, "--set", f"recordings.held_out=[{same}]"), "both estimated on and held out")
+    assert_refused(cli("solve", pendulum, "--set", f"recordings.held_out=[{same}]"), "for estimation and as held out")
     missing = "recordings.estimate=[default:dual_arm_vison_estimate.h5]"
     said = ("no such recording", "did you mean 'dual_arm_vision_estimate.h5'?")
     assert_refused(cli("solve", pendulum, "--set", missing), *said)
@@ -144,7 +144,7 @@ def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothi
         "solve", repository / "configs" / "single_arm_no_vision.yaml",
         "--set", "model.object={kind: foam_y, links: 1, mount: {xyz: [2.5, 0, -0.93]}}",
     )  # fmt: skip
-    assert_refused(done, "grasp 'left' cannot be closed", "mm are missing", "model.grasp.left")
+    assert_refused(done, "grasp 'left' cannot be closed", "mm apart", "model.grasp.left")
     left_nothing()
 
 
@@ -166,7 +166,7 @@ def test_an_output_folder_that_cannot_be(cli, pendulum, tmp_path, monkeypatch, l
     monkeypatch.setattr(f"yid_ocp.workflow.{command}.build_step", lambda *a: pytest.fail("too late"), raising=False)
     monkeypatch.setattr(f"yid_ocp.workflow.{command}.build_problem", lambda *a: pytest.fail("too late"), raising=False)
     (tmp_path / "file.h5").write_text("not a folder")
-    assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5" / "run"), "cannot be made", "--out")
+    assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5" / "run"), "cannot be created", "--out")
     assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5"), "existing file")
     assert_refused(cli(command, pendulum, "--out", tmp_path), "exists and is not empty", "--out")
     left_nothing()

@@ -236,7 +236,7 @@ def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendul
     result = carried_out("check", pendulum, settings=["recordings.estimate=[untold.h5]"]).result
     [said] = [text for text in result["warnings"] if "effort_sampling_kind" in text]
     assert said.startswith("untold: ")
-    assert said.endswith("they are taken as samples")
+    assert said.endswith("(now taken as samples)")
 
 
 def test_check_refines_links_and_time_step(carried_out, written):
@@ -343,7 +343,7 @@ def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulu
 
     monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", unread)
     done = cli("check", pendulum, "--out", "d")
-    assert "warning: double_pendulum.urdf cannot be compared, Pinocchio does not read it: no such joint" in done.out
+    assert "warning: double_pendulum.urdf is not compared, because Pinocchio cannot read it: no such joint" in done.out
 
 
 def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(cli, tmp_path):
@@ -355,7 +355,7 @@ def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(cli, tmp_pat
     (tmp_path / "arm.yaml").write_text("model: {robot: arm.xml, arms: {joints: [j], mode: driven}}\n")
     done = cli("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
     assert done.code == 0, done.err
-    assert "cannot be compared" not in done.out
+    assert "is not compared" not in done.out
     assert "the built model: mass matrix, weight and inverse dynamics are Pinocchio's" in done.out
 
 

@@ -149,7 +149,7 @@ def test_wrong_input_leaves_nothing(config, refused, settings, words):
 def test_a_run_that_failed_and_one_of_another_command_are_refused(config, tmp_path, refused):
     failed, other = solved(tmp_path / "failed", 4.0, 0.1, status="failed"), diagnosed(tmp_path / "diagnosed", 4.0)
     refused(config, [f"plan.parameter_run_folder={failed}"], ("failed: made up",))
-    refused(config, [f"plan.parameter_run_folder={other}"], ("run folder of another command (yid-diagnosis/2)",))
+    refused(config, [f"plan.parameter_run_folder={other}"], ("result of another command (format yid-diagnosis/2)",))
 
 
 def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
@@ -158,7 +158,7 @@ def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, ca
     chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run_folder={folder}")
     assert main(list(chosen)) == 2
     told = capsys.readouterr().err
-    assert "has the effect point_mass@tip, which this model does not have" in told
+    assert "has effects that this one lacks: point_mass@tip" in told
     assert "model.effects" in told
     assert main([*chosen, "--set", "model.effects=[{kind: point_mass, location: tip}]"]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
@@ -213,7 +213,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
             ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml"),
         ),
         (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
-        (["recordings.estimate=[]"], ("no recording to estimate on",)),
+        (["recordings.estimate=[]"], ("no recording is listed for estimation",)),
         (
             ["plan.parameter_run_folder=nowhere"],
             ("no finished run of `solve` or `diagnose`", "plan.parameter_run_folder"),

@@ -188,5 +188,5 @@ parameters: {{"*.damping": {{free: true}}}}
     ).cost == pytest.approx(problem.evaluate(problem.initial_unknowns).cost / 16, rel=1e-6)
     with pytest.raises(ConfigError, match="has no constant 'torque_constan'"):
         load_problem(tmp_path / "run.yaml", ["sensors.motors_left.current.constants={torque_constan: 1}"])
-    with pytest.raises(ConfigError, match=r"no recording has a group 'motors\.current'"):
+    with pytest.raises(ConfigError, match=r"no recording has the sensor 'motors\.current'"):
         load_problem(tmp_path / "run.yaml", ["sensors.motors.current.std=0.2"])

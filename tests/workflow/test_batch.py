@@ -112,7 +112,7 @@ def test_what_cannot_be_a_batch_is_refused(pendulum, tmp_path):
         batch_runs_from_configs([pendulum, pendulum])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes").write_text("")
-    with pytest.raises(OutputError, match="not a batch"):
+    with pytest.raises(OutputError, match="not those of a batch"):
         run_batch(batch_runs_from_configs([pendulum]), tmp_path / "full", workers=HERE)
 
 
@@ -181,15 +181,15 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
     with pytest.raises(OutputError, match=r"other cases \(2 cases, seed 3, for report\): other purpose"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor(), purpose="calibration")
     (folder / "sealed" / "labels.json").write_bytes(text.replace(b"case_001", b"case_002"))
-    with pytest.raises(DataError, match="differ from the commitment"):
+    with pytest.raises(DataError, match="do not match the hashes"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor())
 
 
 def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monkeypatch):
     prescribed = load_config(pendulum)
-    with pytest.raises(ConfigError, match=r"needs arms that are driven(.|\n)*model.arms.mode"):
+    with pytest.raises(ConfigError, match=r"all driven by torques(.|\n)*model.arms.mode"):
         run_blind([prescribed], tmp_path / "proof", 2, 3, workers=InlineExecutor())
-    with pytest.raises(ConfigError, match="two configurations are called pendulum"):
+    with pytest.raises(ConfigError, match="two configurations have the name pendulum"):
         run_blind([driven, driven], tmp_path / "proof", 2, 3, workers=InlineExecutor())
     with pytest.raises(ConfigError, match="seed = -1"):
         run_blind([driven], tmp_path / "proof", 2, -1, workers=InlineExecutor())

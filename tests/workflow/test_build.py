@@ -52,7 +52,7 @@ def test_an_object_mounted_on_a_driven_arm_is_refused(written):
     rod = "{length: 0.3, mass: 0.1, radius: 0.01, links: 2}"
     object_ = f"{{kind: segments, mount: {{parent_frame: panda_hand}}, named_segments: {{rod: {rod}}}}}"
     text = f"model: {{robot: package:panda, arms: {{mode: driven, joints: [panda_joint1]}}, object: {object_}}}\n"
-    with pytest.raises(ConfigError, match=r"(?s)rod_0_.* moves on a driven arm.*grasp"):
+    with pytest.raises(ConfigError, match=r"(?s)rod_0_.* is mounted on a driven arm.*grasp"):
         build_problem(load_config(written(text)))
 
 

@@ -88,7 +88,7 @@ def test_what_an_object_without_a_robot_cannot_have_is_refused_in_words(tmp_path
 
 def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):
     run = settings(tmp_path, None, ("recordings.estimate=[]", "model.frames={}"))
-    with pytest.raises(ConfigError, match="an object without a robot needs a recording that moves it"):
+    with pytest.raises(ConfigError, match="no robot, and no recording drives it"):
         run_simulate(run, tmp_path / "made")
 
 
@@ -133,8 +133,8 @@ def test_the_baselines_effects_stay_in_the_model(run):
         ({"format": "yid-plan/1"}, "another command"),
         ({"format": "yid-diagnosis/1"}, "CHANGELOG.md has the table"),
         ({"status": "failed", "message": "no"}, "the run failed"),
-        ({"covariance": {}}, "has no covariance of its parameters"),
-        ({"covariance": {"names": [], "matrix": []}}, "found no parameter"),
+        ({"covariance": {}}, "no parameters with covariance"),
+        ({"covariance": {"names": [], "matrix": []}}, "determined no parameter"),
     ],
 )
 def test_a_folder_that_says_nothing_of_parameters_is_refused(tmp_path, change, words):
@@ -169,7 +169,7 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path, cli):
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == ["day3"]
     assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
     later = folder_of(tmp_path / "later", baseline={"runs": [str(folders[0])]})
-    for runs, message in (([folders[0], later], "would count twice"), (folders[:1], "one run has no history")):
+    for runs, message in (([folders[0], later], "would count twice"), (folders[:1], "fewer than two runs")):
         refused = cli("report", *runs, "--out", tmp_path / "other")
         assert (refused.code, message in refused.err) == (2, True)
 

@@ -77,7 +77,7 @@ def test_an_interrupted_diagnosis_resumes_its_finished_refits(rubbing, whole, tm
         run_diagnose(run, tmp_path / "run", Interrupting(after=1))
     done, counted.count = counted.count, 0
     assert 0 < done <= once
-    assert "the same command resumes them" in caplog.text
+    assert "the same command reuses them" in caplog.text
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("run")] == ["run.partial"]
     again = run_diagnose(run, tmp_path / "run")
     assert counted.count == once - done
@@ -112,7 +112,7 @@ def test_a_changed_configuration_resumes_nothing(rubbing, tmp_path, monkeypatch,
     caplog.clear()
     with pytest.raises(KeyboardInterrupt):
         run_diagnose(load_config(rubbing, ["diagnosis.significance_level=0.02"]), None, Interrupting(after=1))
-    assert sum("not resumed" in record.getMessage() for record in caplog.records) == 1
+    assert sum("not reused" in record.getMessage() for record in caplog.records) == 1
 
 
 def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(rubbing, whole):

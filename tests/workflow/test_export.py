@@ -208,7 +208,7 @@ def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
 def test_a_format_that_cannot_hold_all_is_refused_before_anything_is_replayed(cli, found, tmp_path) -> None:
     done = cli("export", found, "--out", tmp_path / "y.urdf")  # the ending chooses the format
     assert done.code == 2
-    assert "URDF cannot hold T1.bend, T1.twist, T2.bend" in done.err
+    assert "URDF cannot represent T1.bend, T1.twist, T2.bend" in done.err
     assert "grasp left" in done.err
     assert "--lossy" in done.err
     assert list(tmp_path.iterdir()) == []

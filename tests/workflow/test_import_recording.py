@@ -91,7 +91,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "no such file": ("run.csv", None, "", "no such file"),
     "an unknown format": ("run.xlsx", "x", "", "no reader for '.xlsx' files"),
     "no name to write to": ("run.csv", GOOD, "--out", "the option --out is missing"),
-    "the name of the file that is read": ("run.csv", GOOD, "--out run.csv", "the file name is 'run.csv'"),
+    "the name of the file that is read": ("run.csv", GOOD, "--out run.csv", "'run.csv' does not end in .h5"),
     "an HDF5 that is none": ("run.h5", "x" * 99, "", "not an HDF5 file"),
     "a column that is not there": ("run.csv", GOOD, "--columns q_b=skip", "no column 'q_b'"),
     "more meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t,position:a,skip", "no column '3'"),
@@ -155,7 +155,7 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     assert (recording.point_names, recording.points[0].t[0]) == (("w_rod",), 0.5)
     for flags, what in (
         (["--columns", "x=skip"], "no file has a column 'x'"),
-        (["--episode", "1"], "no file has a format with the option"),
+        (["--episode", "1"], "no format of these files has the option"),
     ):
         assert main(["import", "joints.csv", "mocap.csv", "--out", "no.h5", "--units", "mm", *flags]) == 2
         assert what in capsys.readouterr().err

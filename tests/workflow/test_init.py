@@ -421,12 +421,12 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "branch on nothing": (("--object", "tree", "--branch", "a@b=1,1,1"), "grows on 'b', which", "--branch"),
     "branches of one name": ((*TREE, "--branch", "a=1,1,1"), "two branches are called 'a'", "--branch"),
     "negative length": ((*CABLE, "--length", "-1"), "the length is -1", "--length"),
-    "grams": ((*CABLE, "--mass", "50"), "'cable' has 2e+06 kg/m^3", "--mass"),
+    "grams": ((*CABLE, "--mass", "50"), "'cable' has the density 2e+06 kg/m^3", "--mass"),
     "too many links": ((*CABLE, "--links", "99"), "99 links", "--links"),
     "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
     "grasp of no point": ((*CABLE, "--grasp", "hub"), "is not FRAME=POINT", "FRAME=POINT"),
-    "import flags of a recording": ((*CABLE, "--units", "deg"), "already a recording", "leave"),
+    "import flags of a recording": ((*CABLE, "--units", "deg"), "is a recording already", "leave"),
 }  # fmt: skip
 
 
@@ -450,7 +450,7 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
     write_recording(moved(SHORT), bench / "one.h5")
     assert init(*CABLE, files=["one.h5", "bag.csv"]) == 2
-    assert "the recording lacks joint 'pitch' of one" in capsys.readouterr().err
+    assert "the recording lacks joint 'pitch', which one has" in capsys.readouterr().err
     assert not (bench / "bag.h5").exists()
     (bench / "run.yaml").write_text("kept: true\n")
     assert init(*CABLE) == 2

@@ -119,7 +119,7 @@ def test_the_same_data_twice_count_once(damaged):
     twice = build_problem(load_config(file, ["recordings.estimate=[damaged.h5, again/damaged.h5]"]))
     assert [episode.name for episode in twice.episodes] == [episode.name for episode in once.episodes]
     assert [doubt.cause for doubt in twice.options.data_issues] == ["same_data"]
-    with pytest.raises(DataError, match=r"(?s)both estimated on and held out.*leave out damaged_1 or damaged"):
+    with pytest.raises(DataError, match=r"(?s)listed for estimation and as held out.*leave out damaged_1 or damaged"):
         build_problem(load_config(file, ["recordings.held_out=[again/damaged.h5]"]))
 
 

@@ -132,7 +132,7 @@ def test_a_hidden_folder_that_no_run_made_is_not_emptied(settings, tmp_path, kin
         (theirs / "yid-ocp.lock").symlink_to(tmp_path / "lock")
     with atomic_run_folder(settings, tmp_path / "other"):  # which clears away what killed runs left
         assert (theirs / "data").read_text() == "precious"
-    with pytest.raises(OutputError, match="not made by a run"), atomic_run_folder(settings, tmp_path / "run"):
+    with pytest.raises(OutputError, match="not from a run"), atomic_run_folder(settings, tmp_path / "run"):
         pytest.fail("went on")
     assert (theirs / "data").read_text() == "precious"
     assert not (tmp_path / "run").exists()
@@ -270,7 +270,7 @@ def test_a_file_that_is_missing_or_changed(kinds, pendulum) -> None:
     run = configured(pendulum, "own.py")
     build_system(run)
     own.write_text(EFFECT.format(kind="other"))
-    with pytest.raises(ConfigError, match="changed after it was loaded"):
+    with pytest.raises(ConfigError, match="changed after this process loaded it"):
         build_system(run)
     own.rename(pendulum.parent / "owm.py")
     with pytest.raises(ConfigError, match=r"no such plug-in(.|\n)*did you mean 'owm.py'"):

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _BatchRun:
-    """One run of a batch: its name (and folder), configuration and overrides (`a.b=c` each)."""
+    """One run of a batch: its name (also of its folder), configuration file and overrides of settings (`a.b=c`)."""
 
     name: str
     config_file: Path
@@ -62,18 +62,18 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 def batch_runs_from_configs(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
 ) -> list[_BatchRun]:
-    """List the runs of a batch: one for each configuration or, with a pattern, for each recording that matches it.
+    """List the runs of a batch: one per configuration or, with `recordings`, per configuration and recording.
 
-    With a pattern such as `fleet/*.h5` (`**`: any folders), each run estimates on one recording and has no held-out
-    recording, unless `overrides` (`a.b=c` each) say otherwise. Raises `ConfigError` if a configuration does not exist
-    or is listed twice, or if no recording matches.
+    `recordings` is a pattern such as `fleet/*.h5` (`**`: any folders). Each run then estimates on one matching
+    recording and has no held-out recording, unless `overrides` (`a.b=c` each) change this. Raises `ConfigError` if a
+    configuration does not exist or is listed twice, or if no recording matches.
     """
     paths = [Path(config) for config in configs]
     for i, path in enumerate(paths):
         if not path.is_file():
             near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            hint = nearest_name_question(path.name, near) or "check the path"
-            raise ConfigError("there is no such configuration file", where=str(path), allowed="a YAML file", hint=hint)
+            hint, what = nearest_name_question(path.name, near) or "check the path", "there is no such configuration"
+            raise ConfigError(what, where=str(path), allowed="an existing YAML file", hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
             what, allowed = "the configuration is given twice", "every configuration once"
             raise ConfigError(what, where=str(path), allowed=allowed, hint="leave one of them out")
@@ -83,7 +83,8 @@ def batch_runs_from_configs(
         if not files:
             advice = "put the pattern in quotes, so that the shell does not expand it, and check the folder"
             allowed = "a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder"
-            raise ConfigError("no recording matches", where=f"--recordings {recordings}", allowed=allowed, hint=advice)
+            what, where = "no recording matches the pattern", f"--recordings {recordings}"
+            raise ConfigError(what, where=where, allowed=allowed, hint=advice)
         entries = []
         for path, file in itertools.product(paths, files):
             name = file.stem if len(paths) == 1 else f"{path.stem}-{file.stem}"
@@ -105,12 +106,12 @@ def run_batch(
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
 ) -> CommandOutcome[None]:
-    """Run `solve` or `diagnose` for every run of `batch_runs_from_configs`. Finished runs in the folder are reused.
+    """Run `command` (`solve` or `diagnose`) for each of `members`, from `batch_runs_from_configs`.
 
-    The batch is successful if all runs are; a failed run states its reason. The folder `out` contains `runs/NAME/` (run
-    folders), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which
-    shows `command_line`. Raises `OutputError` if `out` holds something else or cannot be created; `ParallelWorkError`
-    as in `run_tasks`.
+    Finished runs in the folder `out` are reused. The batch is successful if all runs are. The folder contains
+    `runs/NAME/` (run folders), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`, with
+    the reason of each failed run) and `report.html`, which shows `command_line`. Raises `OutputError` if `out` holds
+    other files or cannot be created; `ParallelWorkError` as in `run_tasks`.
     """
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)
@@ -154,7 +155,7 @@ def run_batch(
 def _run_batch_task(
     name: str, config: Path, settings: Sequence[str], inputs: Sequence[Path], command: str, folder: str
 ) -> dict[str, Any]:
-    """Task: one run of the batch in its own folder, replacing an earlier attempt. Returns its entry of batch.json."""
+    """Task: do one run in its folder, which is emptied first. Returns its status, parameters and effects as JSON."""
     del inputs  # part of the key of the result
     target = Path(folder) / name
     if target.exists():
@@ -187,7 +188,7 @@ def _entry(result: TaskResult, folder: Path) -> dict[str, Any]:
 
 
 def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
-    """`yid-history/1` of runs of the same model; None for runs of different models."""
+    """Return drift and outlier tests (`yid-history/1`) of two or more runs of one model. None for other runs."""
     if len(folders) < 2:
         return None
     try:
@@ -202,10 +203,10 @@ def _folder(path: Path) -> Path:
     try:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / _TASKS_FOLDER).is_dir():
             allowed = "a new name, an empty folder, or the folder of a batch to complete"
-            what = "the folder is not empty and not a batch"
+            what = "the folder has files, but not those of a batch"
             raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another name with --out")
         (folder / _RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        what, hint = f"the folder cannot be made: {os_error_reason(error)}", "choose another --out in a writable folder"
+        what, hint = f"the folder cannot be created: {os_error_reason(error)}", "choose an --out in a writable folder"
         raise OutputError(what, where=str(folder), hint=hint) from error
     return folder

@@ -1,6 +1,6 @@
 """The command `blind`: diagnose synthetic cases without their labels, then open the labels and score the answers.
 
-Experiments are variations of configurations. The cases of an experiment are drawn from its ensemble.
+An experiment is a configuration in one of the `EXPERIMENT_VARIATIONS`. A `BlindCaseGenerator` draws its cases.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
-"""Standard deviations of the torques' white noise and constant offsets where an experiment has any [N m]."""
+"""Standard deviations [N m] of the torques' white noise and constant offsets, in experiments with torque noise."""
 _PRESCRIBED_SIGN_SMOOTHING_SPEED = 0.005  # of nominal friction, for joints that stand still under a load [rad/s]
 _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": {"closure": None}}
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 
 
 def _slice_numbers(text: str) -> tuple[int, int]:
-    """K and N of `K/N`. Raises `ConfigError` for any other text."""
+    """Return K and N of the text `K/N`. Raises `ConfigError` for any other text."""
     own, _, of = text.partition("/")
     if not (own.isdigit() and of.isdigit() and 1 <= int(own) <= int(of)):
         hint = "write for example --slice 1/4"
@@ -85,11 +85,11 @@ def run_blind(
     purpose: str = blind.BLIND_ENSEMBLE_PURPOSES[0],
     part: tuple[int, int] = (1, 1),
 ) -> CommandOutcome[None]:
-    """Run a blind validation of the diagnosis in several processes. Finished parts in the folder are reused.
+    """Diagnose `count` synthetic cases without their labels, then score the answers against the labels.
 
-    Models, joint angles and sensors are taken from the runs' first recordings, with as many variations
-    (`EXPERIMENT_VARIATIONS`) as the number of cases allows. The cases depend on `seed` and `purpose` ('report' or
-    'calibration'). With `part` (K, N), only every N-th case is made and diagnosed, in a folder `slice-K-of-N`.
+    Each run gives a model; its first recording gives initial joint angles and sensors. As many `EXPERIMENT_VARIATIONS`
+    are used as `count` allows. `seed` and `purpose` ('report' or 'calibration') determine the cases. With `part` (K,
+    N), only every N-th case is made and diagnosed, in the folder `slice-K-of-N`. Finished parts in `out` are reused.
 
     The folder contains `configs/`, `prepared/` (detectable sizes per experiment), `cases/` (recordings),
     `sealed/labels.json`, `commitment.json` (hashes of the labels, written before the first diagnosis, and of the
@@ -107,8 +107,8 @@ def run_blind(
     names = [entry.name for entry in runs]
     for i, name in enumerate(names):
         if name in names[:i]:
-            what, where = f"two configurations are called {name}", str(runs[i].config_file)
-            raise ConfigError(what, where=where, allowed="a name of its own for each", hint="rename one of the files")
+            what, where = f"two configurations have the name {name}", str(runs[i].config_file)
+            raise ConfigError(what, where=where, allowed="different file names", hint="rename one of the files")
     proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers, part)
     try:
         commitment, cases = proof.commit()
@@ -162,7 +162,7 @@ class _Proof:
         return self.folder / "configs" / f"{name}.yaml"
 
     def commit(self) -> tuple[dict[str, Any], list[Task]]:
-        """The commitment to the labels, and the tasks of all cases, read from the folder or created."""
+        """Return the commitment to the labels, and one diagnosis task per case; draw the cases if there are none."""
         file = self.folder / "commitment.json"
         configs = {entry.name: config_yaml_with_defaults(entry) for entry in self.runs}
         if not file.exists():
@@ -173,7 +173,8 @@ class _Proof:
         if {key: said[key] for key in asked} != asked:
             holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
             hint = "choose another --out, or the same configurations, --cases, --seed, --slice and --calibration"
-            what = f"the folder holds other cases ({holds}): other {', '.join(k for k in asked if said[k] != asked[k])}"
+            differing = ", ".join(key for key in asked if said[key] != asked[key])
+            what = f"the folder holds other cases ({holds}), which differ in: {differing}"
             allowed = "a new folder, or one with the same cases to complete"
             raise OutputError(what, where=str(self.folder), allowed=allowed, hint=hint)
         tasks = []
@@ -223,7 +224,7 @@ class _Proof:
     def best_closures(
         self, cases: Sequence[Task], labels: Sequence[blind.CaseGroundTruth], answers: Sequence[Mapping[str, Any]]
     ) -> dict[str, float]:
-        """Closure by the true effects, for cases with one or two withheld effects and a detected gap."""
+        """Return the closure that the true effects reach, by case: cases with one or two effects and a detected gap."""
         tasks = []
         for case, label, found in zip(cases, labels, answers, strict=True):
             gap = found["result"]["verdict"] not in ("no_gap", "insufficient_data")
@@ -234,7 +235,7 @@ class _Proof:
         return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
     def done(self, function: Callable[..., Any], tasks: Sequence[Task], results: str | Path) -> list[Any]:
-        """Results of a function for all tasks, by experiment, so that a worker builds each experiment once."""
+        """Return the results of `function` in the order of `tasks`. Tasks run by experiment, so each is built once."""
         order = sorted(range(len(tasks)), key=lambda i: str(tasks[i].arguments["experiment"]))
         folder, report = self.folder / results, self.progress.report_parts_done
         found = run_tasks(function, [tasks[i] for i in order], folder, self.workers, report)
@@ -255,7 +256,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
 def _draw_case(
     experiment: Mapping[str, Any], first: Path, detectable: Path, planned: Mapping[str, Any], folder: str
 ) -> dict[str, Any]:
-    """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
+    """Task: simulate and write the recordings of a case. Returns its label, and the data that its diagnosis may use."""
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     ensemble.set_candidate_sensitivities_from_json(read_input_json(detectable))
     case, label = ensemble.draw_recordings_and_ground_truth(blind.PlannedBlindCase(**planned))
@@ -276,7 +277,8 @@ def _diagnose_case_from_recordings_task(
 ) -> dict[str, Any]:
     """Task: diagnose a case from its recordings, the last one held out. Returns {seconds, result, evidence}.
 
-    `evidence` allows the case to be judged again. For calibration, a case without a gap also has `open`.
+    `evidence` allows the case to be judged again. In a calibration ensemble, the answer `no_gap` also has `open`:
+    statistics of a diagnosis with thresholds that always accept the best candidate.
     """
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
@@ -302,7 +304,7 @@ def _diagnose_case_from_recordings_task(
 def _true_effect_closure(
     experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], label: Mapping[str, Any]
 ) -> float | None:
-    """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
+    """Task: return the closure of a case by its refitted true effects; None if the fit fails or is not finite."""
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case = _case(name, recordings, ())
     truth = blind.CaseGroundTruth.from_dict(label)
@@ -320,7 +322,7 @@ def _case(name: str, recordings: Sequence[Path], without: Sequence[str]) -> blin
 
 @dataclass(frozen=True)
 class _ExperimentVariation:
-    """Changes of an experiment of a blind validation relative to its configuration."""
+    """Differences of an experiment from its configuration. `case_fraction`: its share of all cases."""
 
     case_fraction: float
     description: str
@@ -329,7 +331,7 @@ class _ExperimentVariation:
     n_recordings: int = 1
     is_without_object: bool = False
     has_prescribed_arms: bool = False
-    friction: FrictionLawName = "coulomb"  # if the settings vary the law
+    friction: FrictionLawName = "coulomb"  # law of the diagnosed model if the settings vary it
 
     def simulation_overrides(self, arm: VirtualArmImperfections) -> tuple[str, ...]:
         # settings of the object and its sensors do not apply without it
@@ -367,7 +369,7 @@ EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
         has_prescribed_arms=True,
     ),
 }
-"""By name; an experiment is `CONFIGURATION.VARIATION`."""
+"""Variations by name. An experiment has the name `CONFIGURATION.VARIATION`."""
 
 
 @dataclass(frozen=True)
@@ -406,11 +408,11 @@ class _BlindExperiment:
         )
 
     def _write_first_recording(self, file: Path) -> None:
-        """Write the first recording, which defines initial configuration and sensors."""
+        """Write the experiment's first recording, from which all its cases take initial joint angles and sensors."""
         varied, run = EXPERIMENT_VARIATIONS[self.variation], load_config(self.config_file)
         first = read_recordings_of_role(run, count=1)
         if not first:
-            what, allowed = "there is no recording with the start of the arms", "one recording or more"
+            what, allowed = "no recording gives the initial joint angles of the arms", "one recording or more"
             raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
         system = build_system(self.simulation_settings())
         vision = not varied.is_without_object and any(group.camera_pose is not None for group in first[0].points)
@@ -426,8 +428,8 @@ class _BlindExperiment:
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
         hint = "give the object more damping, or start the arms where it hangs in equilibrium"
-        what = f"none of {blind.MAX_DRAWS_PER_CASE} motions can be simulated"
-        where, allowed = f"{self.config_file.name}, {varied.description}", "a motion that MuJoCo can simulate"
+        what = f"MuJoCo could simulate none of {blind.MAX_DRAWS_PER_CASE} random motions"
+        where, allowed = f"{self.config_file.name}, {varied.description}", "one motion that MuJoCo can simulate"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.BlindCaseGenerator]:
@@ -436,7 +438,7 @@ class _BlindExperiment:
 
 @functools.lru_cache(maxsize=1)
 def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.BlindCaseGenerator]:
-    """Settings of the diagnosed model and the ensemble, cached for the next task of the same experiment."""
+    """Return the settings of the diagnosed model and the case generator, cached for tasks of the same experiment."""
     del written
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)
@@ -457,26 +459,26 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
 
 def _require_compatible(run: RunSettings) -> None:
     if run.diagnosis.noise_fraction_of_stated_std < 1 or any(entry.std is not None for entry in run.sensors.values()):
-        what = "the settings have noise levels, but virtual recordings have the noise of `run_virtual_experiment`"
+        what = "the settings state noise levels, but the synthetic recordings of a blind test have a fixed noise"
         allowed, hint = "no noise levels", "leave sensors.*.std and diagnosis.noise_fraction_of_stated_std out"
         raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:
-        what, hint = "a blind test needs arms that are driven by torques", "set model.arms.mode: driven"
+        what, hint = "a blind test needs arms whose joints are all driven by torques", "set model.arms.mode: driven"
         raise run.config_error(what, "model", "arms", "mode", allowed="driven, without servos", hint=hint)
 
 
 def _blind_experiments_and_refinable_subset(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, _BlindExperiment], frozenset[str]]:
-    """Virtual experiments that a configuration allows, by name, and those whose links can be divided further."""
+    """Return the experiments that the configurations allow, by name, and the names of those with divisible links."""
     found: dict[str, _BlindExperiment] = {}
     chains = set()
     for name, config in configs.items():
         whole = load_config(config).model.object is not None
         for variation, varied in EXPERIMENT_VARIATIONS.items():
             if varied.is_without_object and not whole:
-                continue  # as the others are
+                continue  # all its experiments are without an object
             experiment = _BlindExperiment(config, variation, seed, purpose)
             try:
                 system = build_system(experiment.simulation_settings())

@@ -1,4 +1,4 @@
-"""The parts (slices) of a blind validation, which are written with hashes, joined, scored and judged again."""
+"""Functions that write slices (parts) of a blind validation with hashes, and that join, score or rejudge them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SLICE_FORMAT = "yid-blind-slice/1"
 
 
 def write_slice(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write part of a blind validation (labels, answers and settings hash) to `slice.json`. Returns its contents."""
+    """Write a slice of a blind validation (labels, answers, hashes) to `slice.json`, and return what was written."""
     written: dict[str, Any] = to_json_types({"format": _SLICE_FORMAT, **found})
     written["ensemble_sha256"] = _ensemble_sha256(written)
     write_strict_json(folder / "slice.json", written)
@@ -35,7 +35,7 @@ def write_slice(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _ensemble_sha256(part: Mapping[str, Any]) -> str:
-    """Hash of the common properties of one ensemble's slices: plan, settings, seed, sources, number of slices."""
+    """Return a hash of what all slices of one ensemble share: cases, seed, settings, sources, number of slices."""
     common = [part[key] for key in ("cases", "seed", "purpose", "configs", "code", "code_of_cases")]
     text = json.dumps([*common, str(part["slice"]).partition("/")[2]], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -44,7 +44,7 @@ def _ensemble_sha256(part: Mapping[str, Any]) -> str:
 def score_joined_slices(
     files: Sequence[str | Path], out: str | Path, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[None]:
-    """Join slices (separately computed parts) of a blind validation, and score all their cases.
+    """Join slices (separately computed parts) of a blind validation, given as files or folders, and score all cases.
 
     `out` receives the files of a whole ensemble without recordings, so that the ensemble can be judged again. Raises
     `DataError` if a slice belongs to another ensemble or is given twice, or if labels were changed.
@@ -54,15 +54,16 @@ def score_joined_slices(
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
         part = read_input_json(path)
         if part.get("format") != _SLICE_FORMAT:
-            what, hint = "the file is no part of a blind test", "give a folder of `yid-ocp blind`, or its slice.json"
+            what, hint = "the file is no slice of a blind test", "give a folder of `yid-ocp blind`, or its slice.json"
             raise DataError(what, where=str(path), allowed=f"the format {_SLICE_FORMAT}", hint=hint)
         _, digest = blind.labels_json_and_sha256(_labels(part))
         if digest != part["labels_sha256"] or _ensemble_sha256(part) != part["ensemble_sha256"]:
-            what, hint = "labels or settings differ from the commitment", "copy the slice again from where it was made"
-            raise DataError(what, where=str(path), allowed="the hashes in the file", hint=hint)
+            what, hint = "labels or settings do not match the hashes in the file", "copy the original slice again"
+            raise DataError(what, where=str(path), allowed="an unchanged slice.json", hint=hint)
         if found and part["ensemble_sha256"] != found[0]["ensemble_sha256"]:
-            what, hint = "the slice is of another ensemble", "join only slices with the same ensemble_sha256"
-            raise DataError(what, where=str(path), allowed=str(found[0]["ensemble_sha256"]), hint=hint)
+            what, hint = "the slice belongs to another ensemble than the first one", "join slices of one ensemble only"
+            allowed = f"ensemble_sha256: {found[0]['ensemble_sha256']}"
+            raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         if part["slice"] in [own["slice"] for own in found]:
             what, allowed = f"slice {part['slice']} is given twice", "every slice once"
             raise DataError(what, where=str(path), allowed=allowed, hint="leave one of them out")
@@ -92,7 +93,7 @@ def _labels(part: Mapping[str, Any]) -> list[blind.CaseGroundTruth]:
 def score_whole_ensemble(
     parts: Sequence[Mapping[str, Any]], folder: Path, runs: Sequence[RunSettings], progress: Progress
 ) -> CommandOutcome[None]:
-    """Score the diagnoses of blind validation cases against their true labels, and write the result."""
+    """Score all diagnoses in `parts` (contents of slices) against their labels, and write the results to `folder`."""
     first, pairs = parts[0], [pair for part in parts for pair in zip(_labels(part), part["answers"], strict=True)]
     best = {case: value for part in parts for case, value in part["best"].items()}
     pairs.sort(key=lambda pair: pair[0].case)
@@ -115,7 +116,7 @@ def score_whole_ensemble(
     written, pictures = _write_result(folder, result)
     if all(entry.output.write_report for entry in runs):
         progress.begin_stage("writing the report")
-        said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
+        said = f"{written['cases']} synthetic cases, diagnosed without their labels, which were opened afterwards."
         data = ReportData(folder.name, said, written, section_data={"pictures": pictures})
         write_report(folder / "report.html", data)
     return CommandOutcome(folder, written, None)
@@ -163,7 +164,7 @@ def rescore_blind(
 
 
 def _stored_values(folder: Path) -> dict[str, Any]:
-    """Results of a folder's tasks by name, from any version of the package."""
+    """Return the stored task results of a folder by name: the newest of each, from any version of the package."""
     files = sorted(folder.glob("*.json"), key=lambda file: file.stat().st_mtime)
     entries = [read_input_json(file) for file in files if not file.name.endswith(".error.json")]
     return {str(entry["name"]): entry["value"] for entry in entries}

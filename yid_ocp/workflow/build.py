@@ -128,15 +128,16 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 
 
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
-    """Return the measured vertices and clamps of a run's cable. None for an object without its own clamps."""
+    """Return the measured vertices and clamps of a run's cable. None for an object that is not held by clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
         return run.model.object.branch_vertices() if isinstance(run.model.object, ObjectBetweenClamps) else None
 
 
 def arms_are_estimated_states(run: RunSettings) -> bool:
-    """Check whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
+    """Return whether arms of `mode: prescribed` are simulated as driven by measured torques, with estimated states.
 
-    Arms with sensors on links remain prescribed, because such sensors cannot be weighted under process noise.
+    This needs a grasp and recorded efforts. The encoders then correct the states. Arms with sensors on links remain
+    prescribed, because such sensors cannot be weighted under process noise.
     """
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
@@ -160,7 +161,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
                 raise unknown_name_error(run, "joint", name, known, "model", "damping", name)
         if has_object and _OBJECT_DAMPING_KEY not in said:
             allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
-            what = "the damping is given by joint, but not that of the object"
+            what = "model.damping lists dampings of joints, but not that of the object"
             hint = f"set model.damping.{_OBJECT_DAMPING_KEY}"
             raise run.config_error(what, "model", "damping", allowed=allowed, hint=hint)
         of_object = said.get(_OBJECT_DAMPING_KEY, _DEFAULT_JOINT_DAMPING)
@@ -178,7 +179,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 def _clamped_system(run: RunSettings, item: ObjectBetweenClamps, kind: str) -> System:
     for key in ("robot", "grasp", "joint_springs", "frames"):
         if getattr(run.model, key):
-            what, allowed = f"model.{key} is not possible with object.kind: {kind}, which clamps hold", f"no {key}"
+            what, allowed = f"model.{key} is not possible for an object of kind {kind}, which clamps hold", f"no {key}"
             raise run.config_error(what, "model", key, allowed=allowed, hint=f"remove model.{key}")
     recordings = read_recordings_of_role(run)
     if not recordings:
@@ -213,7 +214,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             value = entry.value if given.initial is None else factor * given.initial
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
-                what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible"
+                what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are out of range or reversed"
                 allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
             with add_setting_location_to_errors(run, "parameters", key, "initial"):
@@ -225,7 +226,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
 def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
     if said.kind != "law":
         if said.law_csv is not None or said.depends_on is not None:
-            what, where = f"the effect {said.kind} has `law_csv` or `depends_on`", f"{said.kind}@{said.location}"
+            what, where = f"{said.kind} has `law_csv` or `depends_on`, keys of a law", f"{said.kind}@{said.location}"
             allowed, hint = "`law_csv` and `depends_on` with kind: law", "leave them out, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         made = make_effect(said.kind, said.location, system, dict(said.values))
@@ -278,7 +279,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
             raise unknown_name_error(run, "parameter", key, parameters.names, "parameters", key)
         said = {name: value for name, value in vars(given).items() if value is not None}
         result |= {name: replace(result.get(name, ParameterSettings()), **said) for name in matches}
-    # a published figure is the value of what is fixed
+    # a fixed parameter has the published value without a prior
     fixed = (name for name in sections if not result[name].free)
     return result | {name: replace(result[name], prior_std=None) for name in fixed}
 
@@ -347,13 +348,13 @@ def free_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
 
 
 def divided_joint_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
-    """Return the factor on an elastic joint's parameter that keeps the object's stiffness when links are divided."""
+    """Return the factor on a parameter that keeps the object's stiffness if each link becomes `link_division` links."""
     item = run.model.object
     return 1 if item is None else item.link_division_parameter_factor(name, link_division)
 
 
 def system_with_second_arm_holding_object(run: RunSettings, system: System) -> System | None:
-    """Return the run's system with the second arm holding a free end of the object. None if impossible."""
+    """Return the run's system with the other arm holding a free end of the object. None without such an arm or end."""
     model, joints = run.model, run.model.arms.joints
     if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
         return None
@@ -410,7 +411,7 @@ def _with_extra_frames(
 
 
 def _with_estimable_position(tree: Mechanism, name: str, parent: str) -> Mechanism:
-    """The mechanism with parameters by which a frame is displaced from its position, along its own axes."""
+    """Return the mechanism with three parameters [m] that displace the frame `name` along its own axes."""
     carrier = tree.frames[name]
     entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {parent}") for axis in _AXES]
     offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
@@ -421,7 +422,7 @@ def _with_estimable_position(tree: Mechanism, name: str, parent: str) -> Mechani
 def marker_positions_from_reference_pose(
     run: RunSettings, system: System, recordings: Iterable[Recording]
 ) -> dict[str, dict[str, float]]:
-    """Compute marker positions on the object [m], as parameter values, from each recording's straight reference pose.
+    """Return parameter values for marker positions on the object [m], by recording, from its pose when straight.
 
     Empty if no frame has `use_recorded_straight_position`. Raises `ConfigError` if the object is not fixed in the world
     or a marker is not a point of a recording, and `DataError` if a recording has no `straight` positions.
@@ -430,7 +431,7 @@ def marker_positions_from_reference_pose(
     if not names:
         return {}
     if run.model.object is not None and not run.model.object.is_root_fixed_in_world:
-        what = "the mount of the object moves, so `use_recorded_straight_position` does not determine its position"
+        what = f"the object's mount moves, so positions of the straight object do not determine the frame {names[0]}"
         where = ("model", "frames", names[0], "use_recorded_straight_position")
         hint, allowed = f"set model.frames.{names[0]}.xyz instead", "an object whose mount is fixed in the world"
         raise run.config_error(what, *where, allowed=allowed, hint=hint)
@@ -446,7 +447,7 @@ def marker_positions_from_reference_pose(
         if recording.marker_reference_pose is None:
             hint = f"record them, or give model.frames.{names[0]}.xyz in place of use_recorded_straight_position: true"
             what = "the recording has no marker positions of the straight object"
-            allowed = "positions of the points of its first group, shape (np, 3) [m]"
+            allowed = "a dataset `straight`: positions of all points of the first group, shape (np, 3) [m]"
             raise DataError(what, where=f"recording '{recording.name}': straight", allowed=allowed, hint=hint)
         found[recording.name] = {}
         for name, pose in zip(names, placed, strict=True):

@@ -49,10 +49,10 @@ _EFFECTS_BY_CAUSE = {
     "effort_lag": ("effort_delay", "effort_lag"),
     "clock_offset": ("camera_latency",),
 }
-"""Effects by which a model takes such an error into account."""
+"""Effects that model the error behind an issue, by the cause of the issue."""
 _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia", "tau")
 """Words in the names of parameters that are unobservable at rest."""
-_MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
+_MAX_QUOTED_ISSUES = 3  # issues that an error quotes
 
 
 def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
@@ -134,7 +134,7 @@ def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> No
     for i, name in enumerate(tree.joint_names):
         of_arm = i in driven or name in run.model.arms.passive_joints
         if not of_arm and driven.intersection(tree.ancestor_joint_indices(i)):
-            what = f"{name} of the object moves on a driven arm, whose tracking filter needs the arm's own momentum"
+            what = f"{name} of the object is mounted on a driven arm; the tracking filter needs the arm's own momentum"
             hint = "set model.arms.mode: prescribed; or hold the object by `model.grasp`, not by `model.object.mount`"
             allowed = "a driven arm that holds its object by a grasp"
             raise run.config_error(what, "model", "object", "mount", allowed=allowed, hint=hint)
@@ -157,11 +157,11 @@ def build_problem(
         raise run.config_error("no parameter is free", "parameters", **choice)
     same = sorted(set(run.recordings.estimate) & set(run.recordings.held_out))
     if same:
-        what, hint = f"the recording is both estimated on and held out: {same[0]}", "leave it out of one of the lists"
-        raise run.config_error(what, "recordings", "held_out", allowed="one of the two", hint=hint)
+        what, hint = f"{same[0]} is listed for estimation and as held out", "remove it from one of the two lists"
+        raise run.config_error(what, "recordings", "held_out", allowed="every recording in one list", hint=hint)
     estimate, held_out = read_recordings_of_role(run), read_recordings_of_role(run, "held_out")
     if not estimate:
-        what, allowed = "there is no recording to estimate on", "one recording or more"
+        what, allowed = "no recording is listed for estimation", "one recording or more"
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
     _check_sensors(run, [*estimate, *held_out])
     estimate, held_out, issues = _check_recordings(run, system, free, estimate, held_out)
@@ -176,7 +176,7 @@ def build_problem(
     more = _object_point_issues(problem)
     _raise_for_issues(run, more)
     problem, clocks = problem_with_fitted_point_clocks(problem)
-    if clocks:  # what an uncertain clock alone put in doubt is in doubt no longer
+    if clocks:  # issues that only the uncertain clock caused are dropped
         corrected = ([episode.recording for episode in group] for group in (problem.episodes, problem.held_out))
         _raise_for_issues(run, clocks)
         left = {(doubt.cause, doubt.recording) for doubt in _check_recordings(run, system, free, *corrected)[2]}
@@ -187,7 +187,7 @@ def build_problem(
 
 
 def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Return the smallest possible distance [m] between each grasp's two frames at a recording's first joint angles."""
+    """Return, by grasp, the smallest possible distance [m] of its two frames at a recording's first joint angles."""
     system = problem.system
     if not system.grasps:
         return {}
@@ -208,17 +208,18 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
             if gap > _MAX_GRASP_GAP:
                 where, allowed = run.setting_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
-                raise DataError(f"{what}: {1e3 * gap:.3g} mm are missing", where=where, allowed=allowed, hint=hint)
+                what = f"{what}: its two frames remain {1e3 * gap:.3g} mm apart"
+                raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
     known = {key for recording in recordings for key in recording.sensor_setting_keys}
     for name, said in run.sensors.items():
         if name not in known:
-            what, details = f"no recording has a group '{name}'", unknown_name_error_arguments(name, sorted(known))
+            what, details = f"no recording has the sensor '{name}'", unknown_name_error_arguments(name, sorted(known))
             raise run.config_error(what, "sensors", name, **details)
         if said.effort_sampling_kind is not None and name != JOINT_EFFORT_SENSOR_KEY:
-            what, hint = f"'{name}' has no efforts", f"set it under sensors.{JOINT_EFFORT_SENSOR_KEY}, or leave it out"
+            what, hint = f"'{name}' measures no efforts", f"set it under sensors.{JOINT_EFFORT_SENSOR_KEY} or remove it"
             where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_SENSOR_KEY}"
             raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
@@ -260,8 +261,8 @@ def _check_recordings(
         doubts += _excitation(run, arm, free, kept[0])
     _raise_for_issues(run, doubts)
     if not kept[0]:
-        hint = "record again: " + "; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump"))
-        what, allowed = "no part of the recordings is long enough between gaps", "a recording without gaps"
+        hint = "record without this: " + "; ".join(own.what for own in doubts if own.cause in ("gap", "clock_jump"))
+        what, allowed = "no recording has a usable part between its gaps", "0.5 s from the start or a rest without gap"
         raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(doubts)
 
@@ -292,10 +293,10 @@ def _once(
             used.append(recording)
     for recording in held_out:
         if same := _duplicate(used, recording):
-            what = f"a measurement is both estimated on and held out: {same[0].what}"
+            what = f"the same measurement is listed for estimation and as held out: {same[0].what}"
             where = run.setting_location("recordings", "held_out")
             hint = f"leave out {recording.name} or {same[1].name}"
-            raise DataError(what, where=where, allowed="one of the two", hint=hint)
+            raise DataError(what, where=where, allowed="every measurement in one list", hint=hint)
         if _duplicate(others, recording):
             text = f"{recording.name} is held out twice; it counts once"
             doubts.append(Issue("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
@@ -330,7 +331,7 @@ def _beside_the_model(
 def _excitation(
     run: RunSettings, arm: RecordedJointsModel, free: Sequence[str], recordings: Sequence[Recording]
 ) -> list[Issue]:
-    """Whether the motion can determine the free parameters, as far as the robot alone shows."""
+    """Return issues of recordings whose motion of the robot's joints is too small or slow for the free parameters."""
     asked: dict[str, list[str]] = {}
     for name in free:
         joint, _, quantity = name.rpartition(".")
@@ -389,7 +390,7 @@ def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
 
 
 def issues_to_plain_data(issues: Sequence[Issue]) -> list[dict[str, Any]]:
-    """Convert data quality issues to JSON-ready dicts, most severe first, for the key `issues` of a result."""
+    """Convert data quality issues to JSON-ready dictionaries, most severe first, for the key `doubts` of a result."""
     found = []
     for doubt in _gravest_first(issues):
         own = {"evidence" if key == "limit_violation_ratio" else key: value for key, value in asdict(doubt).items()}

@@ -97,7 +97,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
-            warnings.append(f"{path.name} cannot be compared, Pinocchio does not read it: {error}")
+            warnings.append(f"{path.name} is not compared, because Pinocchio cannot read it: {error}")
     warnings += [entry.words for entry in found.values() if not entry.agrees_within_rounding]
     return {n: {**asdict(e), "agrees": e.agrees_within_rounding, "words": e.words} for n, e in found.items()}
 
@@ -119,11 +119,11 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     if arm is not None:
         recorded = 1.0 / float(np.median(np.diff(arm.t)))
         if recorded < 0.5 * rate:
-            warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
+            warnings.append(f"{episode.name}: joints were sampled at {recorded:.4g} Hz, the model has {rate:.4g} Hz")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
-            said = "set sensors.joints.effort.effort_sampling_kind: nothing says if efforts are samples or commands"
-            warnings.append(f"{episode.name}: {said}; they are taken as {arm.effort_sampling_kind_or_default}s")
+            said = "it is not stated if efforts are samples or commands; set sensors.joints.effort.effort_sampling_kind"
+            warnings.append(f"{episode.name}: {said} (now taken as {arm.effort_sampling_kind_or_default}s)")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None

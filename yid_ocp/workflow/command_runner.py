@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from yid_ocp.solvers.base import Iterate
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
-"""Exit codes of completed commands; the last if a strict command found an issue."""
+"""Exit codes: success, no usable result, wrong input. A strict `check` that finds an issue has the last one."""
 _CommandOutput = TypeVar("_CommandOutput")
 
 
@@ -43,7 +43,7 @@ class CommandOutcome(Generic[_CommandOutput]):
 
 
 def make_command_function(work: Callable[..., CommandOutcome[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
-    """Make a command that calls `work(settings, out, progress, ...)`, where `...` are the arguments `names`."""
+    """Make a command: it calls `work(settings, out, progress, *values)`, with values of the arguments `names`."""
 
     def run(arguments: argparse.Namespace) -> int:
         settings = load_config(arguments.config, arguments.overrides)
@@ -105,9 +105,9 @@ _USUAL_ITERATIONS = 20  # usual number of iterations of a search
 
 
 class _RemainingTime:
-    """Remaining time of a command whose stages state their usual time, else of a stage with counted parts.
+    """Estimator of the remaining time of a command whose stages state their usual time, or else of a single stage.
 
-    The pace is the ratio of spent to usual time over imports and past stages; each counts half as much as the next.
+    The pace is the spent time over the usual time, of imports and past stages; each counts half as much as the next.
     """
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
@@ -132,7 +132,7 @@ class _RemainingTime:
         self._work, self.n_iterates, self._first = work, 0, None
 
     def of_command(self) -> str:
-        """Text of the command's remaining time; empty if its stages do not state their usual time."""
+        """Return the text of the command's remaining time. Empty if its stages do not state their usual time."""
         seconds = self.seconds_left()
         return "" if math.isnan(seconds) else f", about {_format_duration(seconds)} left"
 
@@ -149,7 +149,7 @@ class _RemainingTime:
         return abs(expected - spent) + self._ahead * pace
 
     def of_parts(self, done: int, total: int) -> str:
-        """Text of the remaining time of a stage with this many parts; empty if the command's time is known."""
+        """Return the text of a stage's remaining time, from its done parts. Empty if the command's time is known."""
         now = time.monotonic()
         # stored results of an earlier run took no time
         known, begun = self._first = self._first or (done, now)
@@ -234,7 +234,7 @@ class _BarProgress(Progress):
 
 @contextlib.contextmanager
 def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]:
-    """Show progress on standard error, as bars on a terminal, else as lines (context manager). `--quiet`: nothing."""
+    """Context manager that shows progress on standard error: bars on a terminal, else lines; nothing if `--quiet`."""
     terminal, import_time = sys.stderr.isatty(), time.monotonic() - arguments.begin_time
     if arguments.quiet or (arguments.json and not terminal):
         yield NULL_PROGRESS

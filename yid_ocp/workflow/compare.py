@@ -1,4 +1,4 @@
-"""The command `compare`: several methods on one problem, and the published result of Caldwell (2014)."""
+"""The command `compare`: fit one problem by several methods, beside published results of Caldwell et al. (2014)."""
 
 from __future__ import annotations
 

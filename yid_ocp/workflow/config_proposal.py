@@ -1,4 +1,4 @@
-"""Proposal of a configuration's arms, mode, marker positions, noise and rates from robot and recordings."""
+"""Functions that propose arms, mode, marker positions, noise and rates of a configuration from its recordings."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class _GroupNoise:
 
 @dataclass(frozen=True)
 class ProposedConfigChoices:
-    """The proposed choices for a generated configuration, with reasons."""
+    """What `init` proposes for a new configuration: joints, arms, mode, points and noise, with reasons."""
 
     joints: tuple[str, ...]  # recorded joints that move the object, in the URDF's order
     unused_joints: tuple[str, ...]  # recorded joints that the model does not need or know
@@ -108,7 +108,7 @@ class ProposedConfigChoices:
 
     @property
     def is_identified_from_efforts_only(self) -> bool:
-        """Whether efforts alone identify the model, because the arms are prescribed and no object is observed."""
+        """Whether only efforts can identify the model: its arms are prescribed, and no sensor measures an object."""
         seen = any(not group.startswith("imu") for group in self.point_placements)
         return self.arm_mode == "prescribed" and not (self.has_object and seen)
 
@@ -138,7 +138,7 @@ def propose_config_choices(
     standing : bool
         Whether the object stands on the ground and arms hold its ends.
     """
-    allowed = "joint states of the robot, which say how it was moved"
+    allowed = "a recording with joint states of the robot"
     for other in recordings:
         if other.joints is None:
             hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
@@ -167,7 +167,7 @@ def propose_config_choices(
     joints = tuple(tree.joint_names[j] for j in sorted(needed)) if branches else tree.joint_names
     for other in recordings:
         for name in (name for name in joints if name not in other.joint_names):
-            what, hint = f"the recording lacks joint '{name}' of {first.name}", "record it, or leave this recording out"
+            what, hint = f"the recording lacks joint '{name}', which {first.name} has", "record it, or leave this out"
             raise ConfigError(what, where=other.name, allowed=f"the joints {', '.join(joints)}", hint=hint)
     mode, why = _mode(first, recorded, bool(held), has_object=bool(branches))
     moving = ""
@@ -272,7 +272,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if not has_object:
         return "prescribed", "the arm moves as its encoders say, and the model predicts the efforts that this takes"
     if closed:
-        return "driven", "efforts were recorded, and grasps close loops, which exact encoder angles would overstrain"
+        return "driven", "efforts were recorded, and grasps close loops, which angles taken as exact would strain"
     if seen:
         return "prescribed", f"the object hangs on the arm and {seen} see it, so the arm moves as its encoders say"
     return "prescribed", "no sensor measures the object, so its parameters are estimated from the arm's efforts"
@@ -301,7 +301,7 @@ def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: fl
 
 
 def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
-    """Slope of each channel over a window, and its std from the residuals of the line; zeros if unknown."""
+    """Return the absolute slope of each channel's line over a window, and its std; zeros for fewer than 4 samples."""
     period = float(np.median(np.diff(t))) if len(t) > 1 else math.inf
     # the first five frames of a slow camera do not show whether its points started at rest
     window = max(window, min(5 * period, 2 * window))
@@ -316,9 +316,9 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 
 
 def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
-    """Find a time [s] of standstill, late in a recording, at which the held-out part starts. None without standstill.
+    """Return a time [s] at which a recording can be split: standstill in its third quarter, and motion after it.
 
-    From standstill, the held-out part can be predicted from equilibrium, and so tests the model on held-out data.
+    The part after it can be held out, because its prediction can start from equilibrium. None without such a time.
     """
     first, duration = min(group.t[0] for group in recording.joint_and_point_groups), recording.duration
     for part in np.arange(0.75, 0.5, -0.01) if duration > 0 else ():
@@ -333,7 +333,7 @@ def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | 
 def _places(
     tree: Mechanism, recording: Recording, branches: Sequence[FlexibleSegment], holder: str, standing: bool
 ) -> dict[str, tuple[_PointPlacement, ...]]:
-    """Locations of all points: a frame or segment of the same name, else, on an arm, from measured positions."""
+    """Return the place of every point, by group: by its name or, if an arm holds the object, by its positions."""
     names = [branch.name for branch in branches]
     standing = standing or not branches  # an arm alone has no object with points
     frames = {f"w_{name}" for name in names} | set(tree.frames)
@@ -362,7 +362,7 @@ def _places(
 def _samples_to_place_by(
     tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[FlexibleSegment], holder: str
 ) -> PointGroup:
-    """Samples of a group, only those at standstill if points are too far away in motion (a late clock)."""
+    """Return the samples of a group; only those at standstill if a late clock puts points too far from the holder."""
     at = _poses(tree, recording, holder, group.t)[:, :3, 3]
     apart = np.linalg.norm(group.position - at[:, None], axis=2)
     farthest = float(np.max(apart, initial=0.0, where=np.isfinite(apart)))
@@ -397,7 +397,7 @@ def _near(
     branches: Sequence[FlexibleSegment],
     holder: str,
 ) -> tuple[str, str]:
-    """Most probable frame of a point, from its positions relative to the holder, and the reason."""
+    """Return the most probable frame of a point (empty if unknown), from its distance to the holder, and the reason."""
     seen = np.isfinite(position).all(axis=1)
     if not seen.any():
         return "", "it was never seen"
@@ -510,7 +510,7 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
 
 
 def _time_step(period: float) -> float:
-    """A step of at most `_MAX_TIME_STEP` that coincides with the samples of a clock, or divides its period."""
+    """Return a time step [s] of at most `_MAX_TIME_STEP`: whole sample periods or, for slow clocks, a part of one."""
     if period <= _MAX_TIME_STEP:
         step = period * max(1, math.floor(_MAX_TIME_STEP / period + 1e-3))
     else:

@@ -95,7 +95,7 @@ def run_diagnose(
             )
         except KeyboardInterrupt:
             if len(refits):
-                log.warning("%d finished refits are in %s; the same command resumes them", len(refits), refits.file)
+                log.warning("%d finished refits are in %s; the same command reuses them", len(refits), refits.file)
             raise
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
@@ -122,7 +122,7 @@ def run_diagnose(
 
 
 def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
-    """The final model for result.json: its parameters and effects, and the free parameters' covariance."""
+    """Return the final model for result.json: its parameters, also of effects, and the free ones' covariance."""
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.screening.detectability} - {effect.label for effect in fit.effects}
@@ -166,7 +166,7 @@ def _flags(run: RunSettings) -> list[str]:
 
 
 def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> EstimationProblem:
-    """Problem with all stated standard deviations scaled by `diagnosis.noise_fraction_of_stated_std` to noise alone."""
+    """Return the problem with all stated stds times `diagnosis.noise_fraction_of_stated_std`, so that noise remains."""
     share, options = run.diagnosis.noise_fraction_of_stated_std, problem.options
     if share == 1:
         return problem
@@ -197,7 +197,7 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
 
 
 def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
-    """Groups and fields of `SensorOptions` whose standard deviations the problem uses."""
+    """Return the standard deviations that the problem uses, each as a sensor group and a field of `SensorOptions`."""
     levels = {(samples.sensor.group_name, "std") for episode in problem.episodes for samples in episode.measurements}
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     encoders = problem.options.sensors.get(JOINT_POSITION_GROUP_NAME)
@@ -245,7 +245,7 @@ def _course(name: str, fit: RefittedModel, episode: Episode, outcome: EpisodePre
 
 
 def _unknown_force_scene(finding: DiagnosisResult) -> list[AnimationData]:
-    """The nominal model in its worst-explained recording, with the largest unknown forces and offsets."""
+    """Return an animation of the recording with the largest unknown forces and offsets, by the nominal model."""
     fit, smoothed = finding.nominal_model, finding.smoother_result
     if smoothed is None or not smoothed.smoothed_unknowns:
         return []
@@ -284,7 +284,7 @@ class _SingleJsonFileRefitStore(RefitStore):
         return len(self._known)
 
     def stored_refit(self, name: str) -> StoredFit | None:
-        """The stored refit of that name, or None. Reuse is logged."""
+        """Return the stored refit of that name, or None. Reuse is logged."""
         found = self._known.get(name)
         if found is not None:
             self._folder.log_event("resumed", refit=name)
@@ -319,6 +319,6 @@ class _SingleJsonFileRefitStore(RefitStore):
                 return {name: files.dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
             reason = "other inputs, another configuration or another version"
         except (DataError, ValueError, LookupError, TypeError, AttributeError):
-            reason = "something that cannot be read"
-        log.warning("the refits in %s are from %s and are not resumed", self.file, reason)
+            reason = "a file that cannot be read"
+        log.warning("the refits in %s are from %s and are not reused", self.file, reason)
         return {}

@@ -54,7 +54,7 @@ _PREDICTION_TOPICS: Mapping[str, Mapping[str, str]] = {
     SOLVE_TRAJECTORIES_FORMAT: {"predicted": "predicted"},
     DIAGNOSIS_TRAJECTORIES_FORMAT: {"before": "nominal", "after": "with_effects"},
 }
-"""Arrays of a sensor's group, and the first part of the topics that contain them."""
+"""Arrays of a sensor's group and the first part of their topics' names, by format of trajectories.h5."""
 _RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
 _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bias": "vector"}  # by kind of unknown
 
@@ -101,7 +101,7 @@ def _shift_notes(begin: str, shift: float) -> list[str]:
 
 @dataclass(frozen=True)
 class _CalibratedModel:
-    """Final model of a run: settings with found effects, parameter values and stds."""
+    """Final model of a run: settings with and without the found effects, parameter values and their stds."""
 
     settings: RunSettings
     nominal_settings: RunSettings
@@ -109,7 +109,7 @@ class _CalibratedModel:
     parameter_stds: Mapping[str, float | None]
 
     def system(self, labels: Iterable[str] | None = None, nominal: bool = False) -> System:
-        """The system with the labelled effects (default: all); `nominal`: with the effects of the nominal model."""
+        """Return the system with the effects `labels` (default: all); if `nominal`, only those of the nominal model."""
         run = self.nominal_settings if nominal else self.settings
         if labels is None:
             return build_system(run)
@@ -219,15 +219,15 @@ def _refuse_losses(
     lost += [name for name in absent if name.rpartition(".")[0] not in effects]
     lost += [f"grasp {name}" for name in grasps]
     if lost and not is_lossy:
-        what = f"{form.upper()} cannot hold {', '.join(lost)}"
+        what = f"{form.upper()} cannot represent {', '.join(lost)}"
         hint = "accept a file without them by --lossy; its manifest has the reasons"
-        raise ConfigError(what, where=f"--format {form}", allowed="a format that holds all, or --lossy", hint=hint)
+        raise ConfigError(what, where=f"--format {form}", allowed="a format that represents all, or --lossy", hint=hint)
 
 
 def _expressible(
     calibrated: _CalibratedModel, full: System, form: str
 ) -> tuple[System, dict[str, FeatureExportSupport]]:
-    """The system without effects that a format cannot represent, and the representation of each effect."""
+    """Return the system without effects that a format cannot represent, and how the format represents each effect."""
     said = models.export_support_by_effect(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
         told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
@@ -251,7 +251,7 @@ def _expressible(
 
 
 def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Progress) -> dict[str, Any]:
-    """Errors of the exported and the nominal model on recordings that were not fitted."""
+    """Return the errors of the exported and the nominal model on held-out recordings, or on fitted ones if none are."""
     which = "held_out" if calibrated.settings.recordings.held_out else "estimate"
     try:
         recordings = read_recordings_of_role(calibrated.settings, which)
@@ -315,7 +315,7 @@ def _replayed(
 
 
 def _fall(pairs: Sequence[tuple[ReplayErrorAgainstRecording, ReplayErrorAgainstRecording]]) -> float | None:
-    """Mean fraction by which errors beyond noise fall, from pairs before and after; None if there were no errors."""
+    """Return the mean relative fall of errors beyond noise, from pairs (before, after). None without such errors."""
     parts = [1 - a.rmse_beyond_noise / b.rmse_beyond_noise for b, a in pairs if b.rmse_beyond_noise > 0]
     return sum(parts) / len(parts) if parts else None
 
@@ -375,7 +375,7 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
 
 
 def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTopicTimeSeries]:
-    """Joints of a group as one topic, points as one topic each; position differences are vectors."""
+    """Yield the time series of a sensor: one topic for all joints, or one per point (residuals as vectors)."""
     channels, t = _texts(sensor.attrs["channels"]), np.array(sensor["t"])
     if values.shape[1] == len(channels):
         quantity = channels[0].split(".")[1]
@@ -388,7 +388,7 @@ def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTop
 
 
 def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
-    """Unknown forces, pushes, offsets and biases at the start of each interval and the end of the last one."""
+    """Yield unknown forces, pushes, offsets and biases, at the start of each interval and the end of the last one."""
     edges = np.array(group["edges"]) + float(group.attrs.get("start", 0.0))
     mean = np.array(group["mean"])
     if not len(mean):

@@ -23,7 +23,7 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Fit every friction law with one kind of motion left out in turn, and write the run folder.
 
-    Successful if the warranted law's fit to all recordings converged. Raises `DataError` for one kind of motion.
+    Successful if the warranted law's fit to all recordings converged. Raises `DataError` if no law can be tested.
     """
     joints = None if run.model.friction is None else run.model.friction.joints
     with atomic_run_folder(run, out, "friction") as folder:
@@ -40,7 +40,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         if len(kinds) < 2:
             allowed = "two recordings or more in which the motors are on"
             hint = "list more under recordings.estimate or recordings.held_out"
-            what = "a law is tested on recordings that are not fitted, but there is only one recording"
+            what = "a law is tested on recordings that are not fitted, but fewer than two can be used"
             raise DataError(what, where=run.setting_location("recordings"), allowed=allowed, hint=hint)
         problems = friction_law_comparison.problems_with_common_samples(problems)
         for (law, settings), problem in zip(by_law.items(), problems, strict=True):

@@ -1,4 +1,4 @@
-"""The command `identifiability`: compute the Fisher information of recordings and of changed experiments."""
+"""The command `identifiability`: which parameters recordings, or changed experiments, determine."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ from yid_ocp.workflow.solve import solve_and_decide_cable_memory
 class IdentifiabilityOptions:
     """The options of an identifiability analysis beyond the run's settings.
 
-    `evaluation_point` is the solution, or the initial values without solving. `start_knowledge`: initial states are
-    `assumed` as in the settings, so that verdicts equal the verdicts of `solve`, or all `unknown` and estimated.
+    `evaluation_point`: parameter values of the analysis, from a solve or the `initial` ones. `start_knowledge`: initial
+    states are `assumed` as in the settings, so that verdicts equal those of `solve`, or all `unknown` and estimated.
     `grasp_offset_std` is the prior standard deviation of grasp positions [m]; None keeps the grasps of the settings.
     `interval_parameters` get profile likelihoods; `auto` means all in a small problem and none in a large one.
     """
@@ -206,7 +206,7 @@ class _IdentifiabilityTasks:
     progress: Progress
 
     def with_profile_likelihoods(self, analysis: IdentifiabilityResult, names: Sequence[str]) -> IdentifiabilityResult:
-        """The analysis with profile likelihoods of the named parameters, one task per parameter."""
+        """Return the analysis with profile likelihoods of the parameters `names`, one task per parameter."""
         found = self._done(_profile_likelihood_task, {name: {"name": name} for name in names})
         parameters, profiles = dict(analysis.parameters), dict(analysis.profiles)
         for name, told in zip(names, found, strict=True):
@@ -217,7 +217,7 @@ class _IdentifiabilityTasks:
     def evaluate_experiment_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
-        """Information gained by sets of changes, one task per setup (`ChangeSetsEvaluationFunction`)."""
+        """Return the expected result of the experiment with each set of changes; one task per changed setup."""
         groups: dict[str, list[int]] = {}
         for i, changes in enumerate(sets):
             setup = sorted({change.setup_change for change in changes if change.setup_change})
@@ -249,7 +249,7 @@ def _profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, 
 def _change_set_outcomes(
     common: Mapping[str, Any], sets: Sequence[Sequence[str]], inflation: float
 ) -> list[dict[str, Any]]:
-    """Task: expected information of the experiment for each set of changes, as plain data."""
+    """Task: return the expected information of the experiment with each set of changes, as plain data."""
     run, problem = _problem(common)
     other = system_with_second_arm_holding_object(run, build_system(run))
     two_arms = None if other is None else system_with_grasp_offset_effects(other)

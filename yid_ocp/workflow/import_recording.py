@@ -48,7 +48,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         allowed, hint = "--out RECORDING.h5, or --preview", "add --out RECORDING.h5"
         raise ConfigError("the option --out is missing", where="--out", allowed=allowed, hint=hint)
     if not has_native_recording_suffix(arguments.out):
-        what, hint = f"the file name is '{arguments.out}'", f"write --out {Path(arguments.out).with_suffix('.h5')}"
+        what, hint = f"'{arguments.out}' does not end in .h5", f"write --out {Path(arguments.out).with_suffix('.h5')}"
         raise ConfigError(what, where="--out", allowed="NAME.h5", hint=hint)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
@@ -58,7 +58,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         if len(files) > 1:
             recording = replace(_merged(files, options, offsets, progress), name=Path(arguments.out).stem)
         elif offsets:
-            what, hint = "there is one file, which has no other clock", "leave --clock-offset out"
+            what, hint = "--clock-offset aligns several files, but there is only one", "leave --clock-offset out"
             raise ConfigError(what, where="--clock-offset", allowed="with two files or more", hint=hint)
         else:
             recording = read_third_party_recording(files[0], options, progress)
@@ -98,7 +98,7 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
 
 
 def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Options of several files together; entries of mappings and lists are concatenated."""
+    """Merge the reader options of several files. Entries of mappings and lists are concatenated."""
     combined: dict[str, Any] = {}
     for name, value in ((name, value) for options in proposals for name, value in options.items()):
         held = combined.get(name)
@@ -112,7 +112,7 @@ def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: Progress) -> list[str]:
-    """A tested command that imports files, and issues of its result, or else the missing information."""
+    """Return lines with a command that imports the files (after a trial) and issues found, or with what is missing."""
     try:
         if len(files) > 1:
             own = {name: value for name, value in options.items() if name != "file_clock_offsets"}
@@ -127,7 +127,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
 
 
 def recording_issue_lines(recording: Recording) -> list[str]:
-    """Describe the issues of a recording itself, such as units, clocks, few samples, no motion or channels."""
+    """Return lines about the issues of a recording that show without a model: units, clocks, few samples, no motion."""
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
@@ -140,11 +140,11 @@ def recording_issue_lines(recording: Recording) -> list[str]:
 def _merged(
     files: Sequence[str], options: Mapping[str, Any], offsets: Mapping[str, float] | None, progress: Progress
 ) -> Recording:
-    """One recording from several files. An option applies to every file that supports it."""
+    """Return one recording from several files. An option applies to every file whose format has it."""
     known = {file: () if has_native_recording_suffix(file) else reader_option_names_for_file(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):
-            what = f"no file has a format with the option '{name}'"
+            what = f"no format of these files has the option '{name}'"
             allowed = ", ".join(sorted(set().union(*known.values())))
             raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint="leave it out")
     late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
@@ -167,7 +167,7 @@ def _merged(
         raise DataError(what, where="--columns", allowed=allowed, hint="correct the name, or leave it out")
     stems = [Path(file).stem for file in files]
     if len(set(stems)) < len(stems):
-        what, allowed = "two of the files have the same name", "a name of its own for each"
+        what, allowed = "two files have the same name, apart from folder and ending", "different names"
         raise DataError(what, where=", ".join(files), allowed=allowed, hint="rename one of them")
     parts = [replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)]
     merged = merge_recordings(parts, offsets)
@@ -213,7 +213,7 @@ def _flag(key: str) -> str:
 
 
 def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
-    """`KEY=VALUE` entries as a mapping; for columns also values without a key, in order; a point alone is itself."""
+    """Return `KEY=VALUE` entries as a mapping. Columns may have values only, in order; `POINT` means `POINT=POINT`."""
     if option == "column_meanings" and not any("=" in entry for entry in entries):
         return {str(i + 1): entry for i, entry in enumerate(entries)}
     pairs: dict[str, Any] = {}

@@ -42,7 +42,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):
         hint = f"write --out {out.parent / (out.stem + '.yaml')}"
-        raise ConfigError(f"the file name is '{out.name}'", where="--out", allowed="NAME.yaml or NAME.yml", hint=hint)
+        raise ConfigError(f"'{out.name}' is not a YAML file", where="--out", allowed="NAME.yaml or NAME.yml", hint=hint)
     read_urdf(robot)
     item = _object_from_arguments(arguments)
     with stderr_progress_display(arguments) as progress:
@@ -76,7 +76,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 
 
 def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettings | None:
-    """The described object, if any. `ConfigError`, with the option, if a number is missing or impossible."""
+    """Return the object that the options describe, None without --object. Raises `ConfigError` for invalid numbers."""
     templates, word = init_object_templates(), arguments.object
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
@@ -110,8 +110,8 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
         width, height = own.cross_section_size or (math.sqrt(math.pi) * (own.radius or math.nan),) * 2
         density = own.mass / (own.length * width * height)
         if density < 5 or density > 20_000:
-            what, allowed = f"'{own.name}' has {density:.2g} kg/m^3", "5 kg/m^3 (foam) to 20000 kg/m^3 (tungsten)"
-            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint="give kg and m")
+            what, allowed = f"'{own.name}' has the density {density:.2g} kg/m^3", "5 (foam) to 20000 kg/m^3 (tungsten)"
+            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint="use the units kg and m")
     return item
 
 
@@ -134,21 +134,21 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
             recording = import_recording.read_third_party_recording(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
         elif options:
-            what = f"{file.name} is already a recording, which takes no options of readers"
+            what = f"{file.name} is a recording already, so options of the import do not apply"
             where, allowed = ", ".join(map(import_recording._flag, options)), "options with files of other formats"
             raise ConfigError(what, where=where, allowed=allowed, hint="leave these options out")
         else:
             made[file] = None
     if len(made) < len(arguments.files):
-        what, where = "two of the files have the same name", ", ".join(arguments.files)
-        raise DataError(what, where=where, allowed="a name of its own for each", hint="rename one of them")
+        what, where = "two files have the same name, apart from folder and ending", ", ".join(arguments.files)
+        raise DataError(what, where=where, allowed="different names", hint="rename one of them")
     return made
 
 
 def _split(
     made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ProposedConfigChoices, out: Path
 ) -> dict[Path, Recording | None]:
-    """A single recording split in two files at an intermediate standstill; the second file is held out."""
+    """Split a single recording at a standstill into a part to estimate on and a held-out part, with their files."""
     time = held_out_split_time(recordings[0], proposal.joints) if len(recordings) == 1 else None
     if time is None:
         return made
@@ -163,7 +163,7 @@ def _split(
 
 
 def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
-    """Write recordings, configuration (loaded as a check before it gets its name) and schema; all or nothing."""
+    """Write recordings, configuration and schema. If the configuration cannot be loaded, none of them remains."""
     before = {file for file in made if file.exists()}
     try:
         for file, recording in made.items():
@@ -207,7 +207,7 @@ def _summary_lines(
 
 
 def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices) -> Recording:
-    """The recording with points renamed to the frames at which they probably are."""
+    """Return the recording with points renamed to the frames at which they probably are."""
     points = []
     for group in recording.points:
         placed = proposal.point_placements.get(group.name, ())
@@ -218,7 +218,7 @@ def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices
 
 
 def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -> str | None:
-    """Page with the recorded arm motion, the undeformed object, marked frames and points. Returns its path, if any."""
+    """Write a page with the recorded motion, undeformed object, frames and points. Returns its path if there is one."""
     run, page = load_config(out), out.with_suffix(".html")
     system = build_system(run)
     scene = recording_animation(recording.name, system, system.parameters.vector(), recording, has_straight_object=True)
@@ -243,7 +243,7 @@ def _config_text(
     recordings: Sequence[str],
     imports: Mapping[str, Any],
 ) -> str:
-    """Commented YAML; every setting has a comment on its line or the line above."""
+    """Return the configuration as YAML text, with a comment on the line of every setting or above it."""
     import jinja2  # slow to import
 
     loader = jinja2.PackageLoader("yid_ocp.workflow")
@@ -277,7 +277,7 @@ def _number(value: float) -> str:
 
 
 def _wrapped_list(values: Iterable[str], column: int) -> str:
-    """A list, on several lines from a column on if one line is too long."""
+    """Return a YAML list; a long one has several lines, which begin at `column`."""
     rows, row = [], ""
     for value in map(_value, values):
         if row and len(row) + len(value) > 90:
@@ -289,7 +289,7 @@ def _wrapped_list(values: Iterable[str], column: int) -> str:
 
 
 def _of_object(item: InitialObjectSettings, proposal: ProposedConfigChoices) -> dict[str, Any]:
-    """Initial dampings of an object, frames of points whose places are uncertain, and further frames for sensors."""
+    """Return values for the template: dampings of the object, frames of uncertain points, and all measured frames."""
     tips = [f"w_{segment.name}" for segment in item.settings.segment_definitions()]
     of_points = [places for group, places in proposal.point_placements.items() if "." not in group]
     marked = [place for places in of_points for place in places if place.frame]
@@ -301,7 +301,7 @@ def _of_object(item: InitialObjectSettings, proposal: ProposedConfigChoices) -> 
 
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
-    """Settings that differ from their defaults or concern every reader, with their descriptions."""
+    """Yield YAML lines of the settings that differ from their defaults (and of a few others), with descriptions."""
     for key, option in options_by_key(cast(Any, type(settings))).items():
         value = getattr(settings, option.field_name)
         if key == "mount" or (value == option.default_value and key not in _ALWAYS_WRITTEN_SETTINGS):
@@ -319,7 +319,7 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
 
 
 def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], str, Sequence[Any]]]:
-    """Every group with its settings, their reason and the places of its points."""
+    """Yield every sensor group with its settings as YAML, their reason, and the places of its points."""
     for group, noise in proposal.noise_by_group.items():
         places, entries, said = proposal.point_placements.get(group, ()), [], f"noise: {noise.reason}"
         if noise.std is not None:

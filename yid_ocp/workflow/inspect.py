@@ -1,4 +1,4 @@
-"""The command `inspect`: show equations, sparsity patterns and linearisation of a run's model."""
+"""The command `inspect`: show the equations, sparsity patterns and linearisation of a run's model."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _LinearisationPoint:
 def _run_inspect(
     run: RunSettings, out: str | Path | None, progress: Progress, entries: Sequence[str], export: str | None
 ) -> CommandOutcome[None]:
-    """Write result.json, equations.txt, sparsity.png and linearisation.h5, and further files on request."""
+    """Write result.json, equations.txt, sparsity.png and linearisation.h5; if `export`, also functions of the step."""
     with atomic_run_folder(run, out, "inspect") as folder:
         folder.record_run_start(run, "inspect", [part for name in entries for part in ("--entry", name)])
         progress.begin_stage("building the model and its compiled step")
@@ -70,7 +70,7 @@ def _run_inspect(
         point = _point(step, problem)
         matrices, rows = _linearised(step, point)
         _write_matrices(folder.path / "linearisation.h5", step, {**vars(point), **matrices})
-        progress.begin_stage("looking for what enters where")
+        progress.begin_stage("finding which variables each equation depends on")
         patterns = _patterns(symbols, matrices, rows, point)
         picture = folder.path / "sparsity.png"
         draw_sparsity_patterns(picture, [[patterns[name] for name in row] for row in _PATTERN_LAYOUT])
@@ -118,7 +118,7 @@ run_and_return_exit_code = make_command_function(_run_inspect, "entries", "expor
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint:
-    """Initial state of the first recording: equilibrium at its first angles, or fitted to its first points."""
+    """Return the point of linearisation: the first recording's start, an equilibrium or fitted to its first points."""
     system, sizes = step.system, step.sizes
     theta = system.parameters.vector()
     known = np.zeros(len(system.driven) + len(system.prescribed))
@@ -141,7 +141,7 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
 
 
 def _linearised(step: Step, point: _LinearisationPoint) -> tuple[dict[str, Array], StepResidualsAndJacobians]:
-    """Jacobians A, B_u and B_theta of the step at a point, and the linearised equations of the step."""
+    """Return the derivatives A, B_u, B_theta of the next state (by state, inputs, parameters), and of all equations."""
     n, path = step.sizes["n"], point.prescribed_positions
     q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
     found = step.jacobians(q, p, point.torque, point.theta, (path, path) if len(path) else None, z)
@@ -154,7 +154,7 @@ def _linearised(step: Step, point: _LinearisationPoint) -> tuple[dict[str, Array
 
 
 def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
-    """Values of all columns of the equations, for the step from the linearisation point."""
+    """Return the values of all variables of the equations, in a step from the point of linearisation."""
     n, still = step.sizes["n"], point.prescribed_positions
     q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
     q1, _, lam, status = step(q, p, point.torque, point.theta, (still, still), z)
@@ -186,7 +186,7 @@ def _dependence(
     point: _LinearisationPoint,
     rows: StepResidualsAndJacobians,
 ) -> tuple[step_diagnostics.ParameterEquationsAndResponses, ...]:
-    """Equations and sensors that depend on each parameter; along the recordings if the problem frees it."""
+    """Return the equations and sensors that depend on each parameter; for free ones also over whole recordings."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
     found = step_diagnostics.parameter_equations_and_responses(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)

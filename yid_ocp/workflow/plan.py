@@ -41,9 +41,9 @@ _Plan = TargetMotionPlan | InformativeMotionPlan
 def run_plan(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CommandOutcome[_Plan]:
-    """Plan a motion for the goal `plan.goal`; write it as recording, CSV and JSON, with result and report.
+    """Plan a motion for `plan.goal`, and write it as recording, CSV and JSON, with result and report.
 
-    The command is successful if the goal is reached within all limits; otherwise the run folder holds the reason.
+    The outcome is successful if the motion reaches the goal within all limits; otherwise result.json has the reason.
     """
     with atomic_run_folder(run, out, "plan") as folder:
         folder.record_run_start(run, "plan")
@@ -84,9 +84,9 @@ def _compile_step_for_planning(run: RunSettings) -> Step:
 
 
 def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapping[str, float] | None:
-    """Joint positions at the start of the motion, from the settings or else from the first recording.
+    """Return the joint positions at the start of the motion, from the settings or else from the first recording.
 
-    None: those of the first grasp of the undeformed object, which two arms hold fully stretched, so that it may snap.
+    None without both: the arms then grasp the undeformed object. Two arms hold it fully stretched, so it may snap.
     """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
@@ -102,7 +102,7 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
 def identified_parameters_with_covariance(
     run: RunSettings, step: Step
 ) -> tuple[Array, ParameterCovarianceBeforePlan, dict[str, Any]]:
-    """Return the parameters, their covariance and their source, which is a run folder of `solve` or the settings."""
+    """Return parameter values (ntheta,), their covariance and their source: a run folder of `solve` or the settings."""
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run_folder is None:
@@ -179,7 +179,7 @@ def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict
         raise run.config_error(what, *where, allowed=allowed, hint="give the run folder that the command printed")
     result, formats = read_result_file(file), [ESTIMATE_RESULT_FORMATS[command] for command in commands]
     if result.get("format") not in formats:
-        what = f"{folder} is a run folder of another command ({result.get('format')})"
+        what = f"{folder} has a result of another command (format {result.get('format')})"
         hint = f"give a run folder of {' or '.join(commands)}"
         raise run.config_error(what, *where, allowed=" or ".join(formats), hint=hint)
     if result.get("status") == "failed":
@@ -189,7 +189,7 @@ def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict
 
 
 def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[InformativeMotionPlan, dict[str, Any]]:
-    """The most informative motion, and the source of its parameters: settings or a run folder."""
+    """Return the most informative motion, and the source of its parameters: the settings or a run folder."""
     problem = build_problem(run)
     known = problem.system.parameters
     values = {name: float(problem.theta[known.index(name)]) for name in problem.free}
@@ -208,13 +208,13 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
 def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collection[str]) -> None:
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
-        what = f"{run.plan.parameter_run_folder} has the effect {', '.join(lacking)}, which this model does not have"
+        what = f"the model of {run.plan.parameter_run_folder} has effects that this one lacks: {', '.join(lacking)}"
         allowed, hint = "a run of `solve` on the same model", "list the same effects under model.effects"
         raise run.config_error(what, "plan", "parameter_run_folder", allowed=allowed, hint=hint)
 
 
 def _parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Parameter values of a solve or diagnosis result, and effect sizes of a diagnosis, in display units."""
+    """Return the parameter values of a solve or diagnosis result, and of a diagnosis also its effects' values."""
     if "parameters" in result:
         return {name: entry["value"] for name, entry in result["parameters"].items()}, {}
     sizes = {}
@@ -243,7 +243,7 @@ def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> 
 def discrimination_plan_settings(
     confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path
 ) -> dict[str, Any] | None:
-    """Make settings of `plan` for a motion that distinguishes confusable effects. None if there are none."""
+    """Return settings of `plan` for a motion that distinguishes the first confusable effects. None without any."""
     if not confusable:
         return None
     labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]

@@ -1,4 +1,4 @@
-"""Outputs of predictions: trajectories, held-out errors with baselines, and estimated torque offsets."""
+"""Outputs of a fit: files of trajectories and predictions, estimated torque offsets, and texts to copy."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 
 def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
-    """Return every joint's torque offset in every recording, also held-out ones: `value`, `std`, `prior_std` [N m].
+    """Return torque offsets by recording (also held-out ones) and joint: `value`, `std`, `prior_std` [N m].
 
-    The problem's whitening filters are fixed near `x` (nx,). The result is empty without filters, or without offsets in
-    the model.
+    They are estimated at the unknowns `x` (nx,), near which the whitening filters were linearised. The result is empty
+    if the problem has no filters, or if no offset is allowed.
     """
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
@@ -59,11 +59,11 @@ def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[st
 
 
 def estimate_texts_by_format(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
-    """Make texts to copy, such as YAML lines, from the estimates of identifiable parameters. Empty if there are none.
+    """Return texts to copy, with the estimates of identifiable parameters. Empty without such a parameter.
 
-    The result holds `values` with total standard deviations, `joints` (number of links and range of joint stiffness [N
-    m/rad], per segment and deformation), lines of `yaml` and `mjcf`, rows of `latex`, the command that exports the
-    model of the run `folder`, and what to cite.
+    The keys are `values` (lines NAME = VALUE ± STD), `joints` (number of links and range of joint stiffness [N m/rad],
+    by segment and deformation), lines of `yaml` and `mjcf`, rows of `latex`, `export` (the command that exports the
+    model of the run `folder`) and `cite` (what to cite).
     """
     found = {n: e for n, e in solution.parameters.items() if e.free and e.verdict == "identifiable"}
     if not found:
@@ -113,7 +113,7 @@ def _has_torque_bias(episode: Episode) -> bool:
 def predicted_configuration_trajectory(
     name: str, problem: EstimationProblem, episode: Episode, prediction: EpisodePrediction, theta: Array
 ) -> ConfigurationTrajectory:
-    """Return the trajectory of a predicted recording for an animation. `theta` (ntheta,) holds all parameters."""
+    """Return a predicted motion as trajectory `name` of an animation. `theta` (ntheta,) holds all parameters."""
     system, q = problem.system, prediction.rollout.state[:, : problem.system.n_coordinates]
     own = problem.predictor.theta_with_episode_values(episode, theta)
     return ConfigurationTrajectory(name, system, own, episode.grid.node_times, q)
@@ -130,10 +130,10 @@ def write_solve_trajectories(
 ) -> None:
     """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1` (HDF5).
 
-    `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m) [N
-    s], `torque` (N, nu) [N m] or, for servos, `command` (N, nu) [rad or m] (NaN while a motor is off), `effort` (N, nc)
-    [N m], the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with
-    `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`. Raises `OutputError` if writing fails.
+    `unknowns/`: `x`, `covariance`, attribute `names`. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n),
+    `multipliers` (N, m) [N s], `torque` (N, nu) [N m] or, for servos, `command` (N, nu) [rad or m] (NaN while a motor
+    is off), `effort` (N, nc) [N m], attributes `joints` (n names), `driven` (nu), `prescribed` (nc); for every sensor
+    `GROUP/` with `t`, `measured`, `predicted`, `std`, attributes `channels`, `unit`. Raises `OutputError` on failure.
     """
     pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:

@@ -1,4 +1,4 @@
-"""Run folders, which are created under a temporary name and renamed when complete."""
+"""Run folders, which are written under a temporary name and renamed when they are complete."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class RunFolder:
 
     final_path: Path  # name of the complete folder
     path: Path  # present path
-    resume_folder: Path  # where an interrupted run can leave data for the next run of its name; not created here
+    resume_folder: Path  # where an interrupted run leaves data for the next run with this name; not created here
     _log: TextIO = field(repr=False)
     input_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of every file that the run reads, by name
     _command_line: str = ""
@@ -58,7 +58,7 @@ class RunFolder:
         self.log_command_start([command, *said, *flags])
 
     def log_command_start(self, words: Sequence[str]) -> None:
-        """Log the start of a command and its inputs. The command line `words` reproduces its result."""
+        """Log the start of a command and its inputs. The command line `yid-ocp` with `words` reproduces its result."""
         self._command_line = shlex.join(["yid-ocp", *words])
         self.log_event("start", command=words[0], versions=software_and_plugin_versions(), inputs=self.input_hashes)
 
@@ -114,7 +114,7 @@ def _grouped(notes: list[str]) -> list[str]:
 
 @contextlib.contextmanager
 def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
-    """Create a run folder that appears under its name only if the block succeeds (context manager).
+    """Context manager that yields a run folder, which appears under its name only if the block succeeds.
 
     The name is `out`, or `NAME-COMMAND-YYYYmmdd-HHMMSS` in `output.runs_folder`. The name is reserved first, so that
     two runs never write to one folder. Remains of killed runs next to the folder are deleted. Raises `OutputError` if
@@ -123,9 +123,9 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
     stem = "-".join(filter(None, (run.name, command)))
     targets = _targets(run, out, stem)
     made = [parent for parent in targets[0].parents if not parent.exists()]
-    with interruption.defer_interruption():  # no folder without an owner
+    with interruption.defer_interruption():  # every new folder gets an owner
         try:
-            with _refusing("made", targets[0], "choose a writable folder with --out"):
+            with _refusing("created", targets[0], "choose a writable folder with --out"):
                 target, lock = _reserved(targets)
                 temporary = Path(lock.lock_file).parent
                 lines = (temporary / "log.jsonl").open("w", encoding="utf-8")
@@ -156,7 +156,7 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
 
 
 def _name_requested_folder(error: YidError, target: Path, *hidden: Path) -> None:
-    """Let an error name the requested folder instead of the hidden one."""
+    """Replace the hidden folder by the requested folder `target` in the texts of an error."""
     for path in map(str, hidden):
         if path in error.what + error.where:
             error.what, error.where = (text.replace(path, str(target)) for text in (error.what, error.where))
@@ -164,7 +164,7 @@ def _name_requested_folder(error: YidError, target: Path, *hidden: Path) -> None
 
 
 def _publish(folder: RunFolder, lock: FileLock) -> None:
-    """Give the complete folder its name, or the next free one if it was taken, so that no result is lost."""
+    """Rename the complete folder to its final name, or to the next free one if another run took that name."""
     temporary, target = folder.path, folder.final_path
     with _refusing("written", target, _FULL_HINT):
         folder._log.close()
@@ -186,7 +186,7 @@ def _publish(folder: RunFolder, lock: FileLock) -> None:
 
 
 def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
-    """The first name not used by another run, and its lock, a file in the unfinished folder."""
+    """Return the first of `targets` that no other run uses, and its lock, a file in the hidden unfinished folder."""
     parent = targets[0].parent
     for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():  # left by killed runs
         with contextlib.suppress(OSError):
@@ -202,7 +202,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
             allowed = "no folder of this name, or the folder of an interrupted run"
-            hint, what = "move it, or choose another --out", "the hidden folder for this run was not made by a run"
+            hint, what = "move it, or choose another --out", "the hidden folder of this name is not from a run"
             raise OutputError(what, where=str(temporary), allowed=allowed, hint=hint)
         lock = _locked(temporary)
         if lock is None:
@@ -218,7 +218,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
 
 
 def _is_of_a_run(temporary: Path) -> bool:
-    """Whether a hidden folder may be emptied: not a link, owned by this user, empty or with a run's lock."""
+    """Return whether a hidden folder may be emptied: no link, owned by this user, and empty or with a run's lock."""
     lock = temporary / _LOCK
     try:
         info = temporary.lstat()
@@ -239,7 +239,7 @@ def _remove_all_but_lock(temporary: Path) -> None:
 
 
 def _locked(temporary: Path) -> FileLock | None:
-    """The lock of an unfinished folder; None if another process holds it or deletes the folder."""
+    """Return the acquired lock of an unfinished folder. None if another process holds it or deletes the folder."""
     lock = FileLock(temporary / _LOCK, is_singleton=False, thread_local=False)
     try:
         lock.acquire(timeout=0)
@@ -313,7 +313,7 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
 
 
 def current_local_time_text() -> str:
-    """Return the local date and time with UTC offset, as text."""
+    """Return the local date and time with UTC offset, as text such as 2026-01-31 12:00:00+01:00."""
     return datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
 
 

@@ -1,4 +1,4 @@
-"""Readers of earlier runs' estimates, as a baseline of a diagnosis and for the command `report`."""
+"""Functions that read and compare estimates of earlier runs: baseline of a diagnosis, and the command `report`."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
         effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
-        what = "the result has no covariance of its parameters"
+        what = "the result has no parameters with covariance that can be read"
         allowed = "keys parameters and covariance, as this version writes them"
         raise DataError(what, where=str(file), allowed=allowed, hint="run the command again") from error
     if not names:
-        what, hint = "the run found no parameter", "give a run in which a parameter was found"
-        raise DataError(what, where=str(file), allowed="one found parameter or more", hint=hint)
+        what, hint = "the run determined no parameter", "give a run that estimated one with a standard deviation"
+        raise DataError(what, where=str(file), allowed="one parameter or more in `covariance`", hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
         raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint="run the command again")
@@ -78,7 +78,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
 
 
 def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Group the values of effect parameters by effect label and by parameter name without label."""
+    """Return the values of effect parameters as {effect label: {name without label: value}}; others are left out."""
     found: dict[str, dict[str, float]] = {}
     for name, value in parameters.items():
         label, _, quantity = name.rpartition(".")
@@ -88,7 +88,7 @@ def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> d
 
 
 def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
-    """Return settings with effects added to the model at their values, by label. Existing effects are kept."""
+    """Return settings whose model also has `effects` (values by label). Effects that it has already are unchanged."""
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
     added = [EffectSettings(kind=kind, location=location, values=values) for (kind, _, location), values in parts]
@@ -100,7 +100,7 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
     file = Path(folder) / "result.json"
     result = read_result_file(file)
     if result.get("format") not in ESTIMATE_RESULT_FORMATS.values():
-        what = f"the run folder is of another command ({result.get('format')})"
+        what = f"the run folder has a result of another command (format {result.get('format')})"
         hint = "give a run folder of `solve` or `diagnose`"
         raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
     if result.get("status") == "failed":
@@ -116,10 +116,10 @@ def read_result_file(file: Path) -> dict[str, Any]:
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), allowed=allowed, hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
-        what, hint = "the file is not a result of a run", "run the command again"
+        what, hint = "the file does not hold the result of a run", "run the command again"
         raise DataError(what, where=str(file), allowed="an object in JSON", hint=hint)
     if result.get("format") in _OLD_FORMATS:
-        what = f"the run is of an earlier version ({result['format']}), whose keys had other names"
+        what = f"an earlier version wrote this result ({result['format']}), with other names of keys"
         what, hint = f"{what}; {_RENAMED_KEYS_HINT}", "diagnose again with this version"
         raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
     return result
@@ -135,7 +135,7 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
         except DataError as error:
             raise run.config_error(error.what, *where, allowed=error.allowed, hint=error.hint) from error
         if any(Path(folder).resolve() == Path(other.run_name).resolve() for other in found):
-            what, hint = f"{folder} is given twice, and would count twice", "leave one of them out"
+            what, hint = f"the baseline run {folder} is given twice", "leave one of them out"
             raise run.config_error(what, *where, allowed="every run once", hint=hint)
         if differing := _difference(run, _settings(folder)):
             what = f"{folder} is a run of another model: model.{differing} differs"
@@ -144,19 +144,19 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
         found.append(own)
     dependent = _dependent(run.diagnosis.baseline_run_folders)
     if dependent:
-        allowed, hint = "runs without a common baseline", "give the later run only"
+        allowed, hint = "runs that are not a baseline of each other", "give the later run only"
         raise run.config_error(dependent, "diagnosis", "baseline_run_folders", allowed=allowed, hint=hint)
     return tuple(found)
 
 
 def _dependent(folders: Sequence[str | Path]) -> str:
-    """Message on a run that is the baseline of another one and would count twice; empty if there is none."""
+    """Return a message about a run that is the baseline of another one of `folders`. Empty if there is none."""
     known = [Path(folder).resolve() for folder in folders]
     for folder in known:
         said = read_result_file(folder / "result.json").get("baseline") or {}
         for own in said.get("runs", ()):
             if Path(own).resolve() in known:
-                return f"{folder} has {own} as its baseline already, which would count twice"
+                return f"{own} would count twice, because it is a baseline of {folder}"
     return ""
 
 
@@ -164,7 +164,7 @@ def require_runs_of_one_model(folders: Sequence[Path]) -> None:
     """Check that all run folders have the same model and none is the baseline of another. Raises `ConfigError`."""
     dependent = _dependent(folders)
     if dependent:
-        allowed, hint = "independent runs", "diagnose without --baseline for a history, or leave one run out"
+        allowed, hint = "runs that are no baseline of each other", "diagnose without --baseline, or leave one run out"
         raise ConfigError(dependent, where="arguments of `report`", allowed=allowed, hint=hint)
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
     for folder, settings in known[1:]:
@@ -176,7 +176,7 @@ def require_runs_of_one_model(folders: Sequence[Path]) -> None:
 
 
 def _difference(run: RunSettings, there: RunSettings | None) -> str:
-    """The first section of the model that differs between two runs; empty if none is known to differ."""
+    """Return the first section of `model` that differs between two runs. Empty if none differs, or `there` is None."""
     if there is None:
         return ""
     for key in _COMPARED_MODEL_SECTIONS:
@@ -211,7 +211,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 
 
 def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
-    """Load recordings that lack the sought effect, from settings or baseline. Returns a reason if reading fails."""
+    """Return recordings without the sought effect (of settings or baseline), and the reason if they are unreadable."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):
         file = resolve_default_recording(path)
@@ -234,17 +234,17 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
 def require_recordings_not_in_baseline(
     run: RunSettings, problem: EstimationProblem, runs: Sequence[RunEstimates], without: Sequence[Recording]
 ) -> None:
-    """Check that no recording of the run is a baseline or reference recording as well. Raises `ConfigError`."""
+    """Raise `ConfigError` if a recording of the run is also one of the baseline or reference recordings `without`."""
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
             where = ("diagnosis", "baseline_run_folders")
-            what = f"{episode.name} is also a recording of the baseline, and would count twice"
+            what = f"the recording {episode.name} would count twice, because the baseline has it too"
             if not runs or run.recordings.without_effect:
                 where = ("recordings", "without_effect")
-                what = f"{episode.name} is one of the reference recordings"
+                what = f"the recording {episode.name} is also a reference recording"
             hint = "leave it out of one of the two"
-            raise run.config_error(what, *where, allowed="recordings of another time", hint=hint)
+            raise run.config_error(what, *where, allowed="other recordings", hint=hint)
 
 
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
@@ -254,13 +254,13 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 
 
 def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
-    """Compare runs of one model in chronological order, or two runs of the same recordings. Writes JSON and a page."""
+    """Compare runs of one model as a history, or overlay two runs of the same recordings. Writes JSON and a page."""
     if len(paths) < 2:
-        what, hint = "one run has no history", "add run folders of other days"
+        what, hint = "fewer than two runs are given", "add run folders, for example of other days"
         raise ConfigError(what, where="arguments of `report`", allowed="two or more run folders", hint=hint)
     twice = [str(path) for i, path in enumerate(paths) if path.resolve() in [p.resolve() for p in paths[:i]]]
     if twice:
-        what, hint = "the run is given twice, and would count twice", "leave one of them out"
+        what, hint = "the run is given twice", "leave one of them out"
         raise ConfigError(what, where=twice[0], allowed="every run once", hint=hint)
     if len(paths) == 2 and _have_same_recordings(paths):
         return _overlay_runs(paths, out, progress)
@@ -296,7 +296,7 @@ def run_drift_and_outliers_to_dict(found: DriftAndOutlierTests) -> dict[str, Any
 
 
 def _have_same_recordings(folders: Sequence[Path]) -> bool:
-    """Whether two runs have the same recordings. `ConfigError` if they share only some of them."""
+    """Return whether two runs have the same recordings. Raises `ConfigError` if they share only some of them."""
     inputs = [read_result_file(folder / "result.json").get("inputs", {}) for folder in folders]
     known = [{digest: path for path, digest in own.items() if has_native_recording_suffix(path)} for own in inputs]
     if not known[0].keys() & known[1].keys():
@@ -314,13 +314,13 @@ def _have_same_recordings(folders: Sequence[Path]) -> bool:
 
 def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Overlay two runs of the same recordings and write `overlay.json` and report.html."""
-    progress.begin_stage("overlaying what both runs predict")
+    progress.begin_stage("overlaying the predictions of both runs")
     labels = [folder.name if folders[0].name != folders[1].name else str(folder) for folder in folders]
     results, roles = [read_estimation_result(folder) for folder in folders], dict[str, list[str]]()
     known = [_stored_predictions(folder, roles) for folder in folders]
     pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
     if not pairs:
-        what, allowed = "the runs have no predicted channel in common", "one common channel or more"
+        what, allowed = "the runs predict no common channel of a sensor", "one common channel or more"
         raise DataError(what, where=str(folders[1]), allowed=allowed, hint="compare runs that use the same sensors")
     pairs.sort(key=lambda pair: "estimate" in roles[pair[0].recording])
     channels = [
@@ -348,7 +348,7 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
 
 
 def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Values of parameters that are free in one of two runs, and their difference [larger std] or None."""
+    """Return values of parameters that are free in a run, with their difference, also in units of the larger std."""
     parameters: dict[str, Any] = {}
     for name in dict.fromkeys(name for own in found for name, entry in own.items() if entry.get("free", True)):
         known = {label: own[name] for label, own in zip(labels, found, strict=True) if name in own}
@@ -364,7 +364,7 @@ def _overlaid_parameters(labels: Sequence[str], found: Sequence[Mapping[str, Any
 
 
 def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple[str, str], ChannelPrediction]:
-    """Predictions in a run's trajectories.h5, by recording and channel, with the role of each recording."""
+    """Return predictions in a run's trajectories.h5 by recording and channel. Adds each recording's role to `roles`."""
     found: dict[tuple[str, str], ChannelPrediction] = {}
     with open_hdf5_after_read_check(folder / "trajectories.h5") as file:
         is_solve = file.attrs["format"] == SOLVE_TRAJECTORIES_FORMAT
@@ -385,7 +385,7 @@ def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple
 def _overlaid_motions(
     folders: Sequence[Path], labels: Sequence[str], found: Sequence[Mapping[str, Any]]
 ) -> list[AnimationData]:
-    """Measured motion and motions of both runs' models; empty if a model or recording is no longer readable."""
+    """Return animations of measured and predicted motions of both runs. Empty if a model or file cannot be read."""
     told: dict[str, list[ConfigurationTrajectory]] = {}
     try:
         runs = [load_config(folder / "config.yaml") for folder in folders]
@@ -400,6 +400,6 @@ def _overlaid_motions(
                         path = ConfigurationTrajectory(*model, np.array(group["t"]), np.array(group["q"]))
                         told.setdefault(name, []).insert(0, path)  # the last one is drawn in the first color
     except YidError as error:
-        log.warning("the page shows no motion: %s", error)
+        log.warning("the report shows no animation: %s", error)
         return []
     return [animation_of_trajectories(r.name, told[r.name], r) for r in recordings if len(told.get(r.name, ())) == 2]

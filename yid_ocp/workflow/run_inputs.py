@@ -1,4 +1,4 @@
-"""Readers of a run's files, recordings and plug-ins, and error messages that say where a setting is."""
+"""Functions that read a run's files, recordings and plug-ins, and errors with the location of a setting."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def load_plugins(run: RunSettings) -> None:
         path, where = Path(plugin), run.setting_location("plugins", i)
         name, digest = str(path.resolve()), file_sha256(path)
         if _loaded.get(name, digest) != digest:
-            what, hint = "the plug-in changed after it was loaded", "start a new Python process"
-            raise ConfigError(what, where=where, allowed="the loaded file", hint=hint)
+            what, hint = "the plug-in changed after this process loaded it", "start a new Python process"
+            raise ConfigError(what, where=where, allowed="the loaded version", hint=hint)
         if name not in _loaded:
             with _registering(f"plug-in {path.name}", where, f"correct {path.name}", path):
                 _run(path, digest)
@@ -63,16 +63,16 @@ def _distribution(entry: metadata.EntryPoint) -> str:
 
 @functools.cache
 def _installed() -> Sequence[metadata.EntryPoint]:
-    """Entry points when a run first asks for them: looking through all packages takes 5 ms."""
+    """Return the entry points of installed plug-ins. They are cached, because the search takes 5 ms."""
     return sorted(metadata.entry_points(group=_ENTRY_POINT_GROUP), key=lambda entry: entry.name)
 
 
 def _run(path: Path, digest: str) -> None:
-    """Import a file under a unique module name, so that two files of the same name do not conflict."""
+    """Import a plug-in file under a unique module name, so that two files of the same name do not conflict."""
     name = f"yid_ocp_plugin_{path.stem}_{digest[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise ImportError("this is no Python file")
+        raise ImportError("the file is not a Python module")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look for the module of their class
     try:
@@ -84,7 +84,7 @@ def _run(path: Path, digest: str) -> None:
 
 @contextlib.contextmanager
 def _registering(name: str, where: str, hint: str, path: Path | None = None, known: bool = False) -> Iterator[None]:
-    """Convert errors of a plug-in that the block runs, and remove its registrations after an error."""
+    """Context manager in which a plug-in runs: its errors become `ConfigError`, after which nothing of it is kept."""
     from yid_ocp.report.sections import REPORT_SECTIONS  # which few runs with plug-ins need before their report
 
     registries: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNEL_KINDS, REPORT_SECTIONS)
@@ -93,9 +93,7 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
         yield
         unchanged = all(set(registry) == names for registry, names in zip(registries, before, strict=True))
         if unchanged and not known:
-            allowed = (
-                "code under @EFFECTS.register(NAME), @SENSOR_READERS.register(NAME) or @register_report_section(...)"
-            )
+            allowed = "@EFFECTS.register(NAME), @SENSOR_READERS.register(NAME) or @register_report_section(...)"
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
     except (Exception, SystemExit) as error:
         for registry, names in zip(registries, before, strict=True):
@@ -117,7 +115,7 @@ def _line(error: BaseException, path: Path) -> int | None:
 
 @contextlib.contextmanager
 def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
-    """Add the location of a setting to errors raised in a block (context manager)."""
+    """Context manager that adds the location of the setting `path` to errors raised in its block."""
     try:
         yield
     except YidError as error:
@@ -133,7 +131,7 @@ def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[s
 
 
 def input_files_by_name(run: RunSettings) -> dict[str, Path]:
-    """Return all input files of a run (configuration, plug-ins, robot, recordings), by their name in the settings.
+    """Return all input files of a run (configuration, plug-ins, robot, object, recordings), by name in the settings.
 
     Raises `ConfigError` if a file does not exist. The message has the setting and the most similar existing file.
     """
@@ -184,7 +182,7 @@ def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: in
 
 
 def uniquely_named_recordings(recordings: Iterable[Recording], taken: Iterable[str] = ()) -> list[Recording]:
-    """Make recording names unique: append a number to a name that is in `taken` or repeated."""
+    """Return recordings with unique names: a name that is repeated or in `taken` gets a number."""
     names, found = [*taken], list[Recording]()
     for recording in recordings:
         name = f"{recording.name}_{len(names)}" if recording.name in names else recording.name

@@ -70,9 +70,9 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
     if run.model.robot is None:
-        allowed = "a recording with the start, clamps and times to use"
-        hint = "list one, or set model.robot for a virtual experiment"
-        what = "an object without a robot needs a recording that moves it"
+        allowed = "a recording with initial state, motion of the clamps and sample times"
+        hint = "list a recording, or set model.robot for a virtual experiment"
+        what = "the model has no robot, and no recording drives it"
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint=hint)
     progress.begin_stage("simulating a virtual experiment in MuJoCo")
     simulation = SimulationOptions(run.problem.duration or _DEFAULT_DURATION)
@@ -89,7 +89,7 @@ def _predicted(run: RunSettings, system: System, progress: Progress, seed: int |
     options = replace(problem_options(run, step.system, recordings), local_parameters=(), prior_stds={})
     problem = EstimationProblem(step, recordings, (), options)
     episode, theta = problem.episodes[0], problem.theta
-    progress.begin_stage(f"rolling out {episode.grid.steps} steps")
+    progress.begin_stage(f"simulating {episode.grid.steps} steps")
     outcome = problem.predictor.predict_episode(episode, theta, np.zeros(len(problem.initial_unknowns)), False)
     if isinstance(outcome, str):
         return outcome, []

@@ -32,8 +32,8 @@ def run_solve(
 ) -> CommandOutcome[Solution]:
     """Estimate and validate the parameters, and write the run folder. Successful if the solver converged.
 
-    If the solver failed, the run folder holds the reason and the best point. With `is_live`, a table of cost and
-    parameters is reported at every iterate, which a terminal updates.
+    If the solver failed, the run folder holds the reason and the best parameters found. With `is_live`, a terminal
+    shows a table of cost and parameters that is updated in every iteration.
     """
     with atomic_run_folder(run, out) as folder:
         folder.record_run_start(run, "solve")
@@ -69,7 +69,7 @@ run_and_return_exit_code = make_command_function(run_solve, "live")
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> estimation.CableMemoryChoice:
-    """Fit the problem with the run's solver, and decide whether a cable's shape memory is part of the fit."""
+    """Fit the problem with the run's solver, for a cable with or without its shape memory, and return the choice."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.solve(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
@@ -79,7 +79,7 @@ def solve_and_decide_cable_memory(
 def _iterate_logger(
     problem: EstimationProblem, folder: RunFolder, progress: Progress, is_live: bool = False
 ) -> IterationCallback:
-    """Callback that logs every iterate in the run folder and reports it, with a table if `is_live`."""
+    """Return a callback that logs and reports every iterate, also as a table if `is_live`."""
     iterates: list[Iterate] = []
 
     def iterate(entry: Iterate) -> None:
@@ -94,7 +94,7 @@ def _iterate_logger(
 
 
 def _iterate_table(problem: EstimationProblem, iterates: Sequence[Iterate]) -> list[Sequence[str]]:
-    """Cost and parameters: initial, present, last step and history; largest last steps first."""
+    """Return table rows of cost and parameters (start, now, last step, course), largest relative steps first."""
     courses = {name: [float(entry.x[i]) for entry in iterates] for i, name in enumerate(problem.shared_parameters)}
     steps = {name: own[-1] - own[-2] if len(own) > 1 else 0.0 for name, own in courses.items()}
     ordered = sorted(courses, key=lambda name: -abs(steps[name]) / max(abs(courses[name][-1]), 1e-12))
@@ -108,7 +108,7 @@ def _iterate_table(problem: EstimationProblem, iterates: Sequence[Iterate]) -> l
 
 
 def _sparkline(values: Sequence[float]) -> str:
-    """The last values as a row of bars between their minimum and maximum."""
+    """Return the last values as a text of bars between their minimum and maximum."""
     shown = values[-_SPARKLINE_WIDTH:]
     low, high = min(shown), max(shown)
     return "".join(_BARS[round((len(_BARS) - 1) * (value - low) / ((high - low) or 1.0))] for value in shown)
@@ -147,5 +147,5 @@ def solution_to_result_dict(
 def discretisation_shifts_to_dict(
     shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Convert the shifts that discretisation causes in estimates, with `std` from noise, to a dictionary."""
+    """Return the shifts of estimates by finite links and time steps as dictionaries, with their `std` from noise."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}

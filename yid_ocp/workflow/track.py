@@ -1,4 +1,4 @@
-"""The command `track`: track points in depth-camera frames, in parallel, and write a recording."""
+"""The command `track`: track points of the object in depth-camera frames, in parallel, and write a recording."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _run_track(
 
 
 def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
-    """Frames to draw: some of all, evenly spread, and as many dropped frames, each with another reason."""
+    """Return frames to draw: `count` evenly spread ones, and up to `count` dropped ones with different reasons."""
     chosen = {int(i) for i in np.linspace(0, len(frames) - 1, count + 2)[1:-1]}
     reasons = [frames[k].drop_reason.partition(":")[0] for k in sorted(chosen)]
     for k, frame in enumerate(frames):
@@ -121,7 +121,7 @@ def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
 def _track_result(
     frames: Sequence[FrameReport], common: SequenceEstimates, things: Sequence[ForeignObject], found: TrackResult | None
 ) -> dict[str, Any]:
-    """`yid-track/1` without issues, inputs and versions; `found` is None if no frame is good."""
+    """Return a `yid-track/1` result without issues, inputs and versions. `found` is None if no frame is good."""
     spent = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     return {
         "format": "yid-track/1",
@@ -186,13 +186,13 @@ def _truth_errors(
 
 
 def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFramesWithTruth]:
-    """Recording and camera frames of a virtual experiment; its true values are the initial parameter values."""
+    """Return recording and camera frames of a virtual experiment, whose truth are the initial parameter values."""
     from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_from_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
     if not system.driven:
-        what, allowed = "a virtual experiment drives joints, but the model drives none", "a model with driven joints"
+        what, allowed = "a virtual experiment needs driven joints, and the model has none", "a model with driven joints"
         hint = "set track.frames_path to frames of a camera, or model.arms.mode: driven"
         raise run.config_error(what, "track", "virtual_frames", allowed=allowed, hint=hint)
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
@@ -238,7 +238,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
 
 
 def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Recording | None]:
-    """Tracker of the frames in files, and the recording with the joints, or None if none is listed."""
+    """Return the tracker of the frames in files, and the recording with the joints (None if none is listed)."""
     recording = _read_joints(run)
     sequence, scene = _read_frames(run, "frames_path"), _camera_scene(run, system)
     background = None if run.track.background_frames_path is None else _read_frames(run, "background_frames_path")
@@ -266,7 +266,7 @@ class _FrameTasks:
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
         require_task_values([result for result in results if "abruptly" not in result.error])
         return [
-            tracker.frame_report_before_processing(i, common.camera_calibration, f"work on it failed: {result.error}")
+            tracker.frame_report_before_processing(i, common.camera_calibration, f"its process failed: {result.error}")
             if "abruptly" in result.error
             else files.dataclass_from_plain_data(FrameReport, result.value)
             for i, result in zip(tracker.frame_order, results, strict=True)
@@ -296,7 +296,7 @@ class _FrameTasks:
 def _frame_tasks(
     run: RunSettings, system: System, folder: RunFolder, progress: Progress
 ) -> tuple[_FrameTasks, VirtualFramesWithTruth | None]:
-    """Tracking tasks of frames in files, first written if a virtual camera renders them, and their true motion."""
+    """Return the tracking tasks, and the true motion if a virtual camera renders the frames (which are written)."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
     joints = resolve_default_recording(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
@@ -306,7 +306,7 @@ def _frame_tasks(
     else:
         progress.begin_stage("simulating a virtual experiment in MuJoCo")
         recording, made = _simulate_recording_and_camera_frames(run, system)
-        progress.begin_stage("filming it")
+        progress.begin_stage("rendering its camera frames")
         work.mkdir(parents=True, exist_ok=True)
         frames, joints = own_files = work / "frames", work / f"{run.name}.h5"
         write_frame_folder(made.sequence, frames)
@@ -329,7 +329,7 @@ def _frame_tasks(
 
 
 def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """Task: sequence calibration of a run as plain data, or the reason why it failed."""
+    """Task: calibrate the sequence. Returns the values common to all frames as plain data, or the error."""
     del inputs  # part of the key of the result
     try:
         tracker = _tracker(files.read_input_text(config), config)
@@ -346,7 +346,7 @@ def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[s
 
 
 def _tracker(text: str, config: Path) -> FrameTracker:
-    """The tracker for all frames of a process; a changed file (`text`) makes a new tracker."""
+    """Return the tracker of this process. It is made again if the configuration (`text` of the file) changed."""
     if not _LAST_TRACKER or _LAST_TRACKER[0][0] != (text, config):
         run = load_config(config)
         _LAST_TRACKER[:] = [((text, config), _frame_tracker(run, build_system(run))[0])]
