@@ -1,7 +1,7 @@
-"""Comparison of a diagnosis with earlier runs, and predictions of recordings made without the effects found.
+"""Comparison of a diagnosis with earlier runs, and predictions of reference recordings without the found effects.
 
-In a linear model with the prior N(m, C0), an estimate x with covariance C shifts by x - m. If nothing changed, the
-shift has the covariance C0 - C. A misfit that multiplies the data's noise variance by k adds (k - 1) C (1 - C/C0).
+In a linear model with the prior N(m, C0) from earlier runs, let x be an estimate with covariance C. If nothing changed,
+the shift x - m has the covariance C0 - C. A misfit that multiplies the noise variance by k adds (k - 1) C (1 - C/C0).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from yid_ocp.solvers import Status
 
 _SHIFT = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
 _SHIFT += " changed=has_changed"
-_MIN_INFORMED_FRACTION = 0.05  # relative reduction of a prior's variance below which the data do not inform a parameter
+_MIN_INFORMED_FRACTION = 0.05  # relative fall of a prior's variance, below which the data do not inform a parameter
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class _ParameterShift:
 
 @dataclass(frozen=True)
 class ParameterShiftsSinceBaseline:
-    """The change of every parameter since the earlier runs, and the agreement of these runs with each other."""
+    """The change of every parameter since the earlier runs, and how well these runs agree with each other."""
 
     is_baseline_explained: bool  # whether the model explained the earlier runs' recordings
-    between_runs_p_value: float  # of the differences between earlier runs; one for one run
+    between_runs_p_value: float  # p-value of the differences between earlier runs; 1 for a single run
     parameter_shifts: tuple[_ParameterShift, ...]
 
     @property
@@ -81,13 +81,13 @@ def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> Es
             effect, at, _ = name.rpartition(".")
             what = f"the effect {effect}" if at and "@" in effect else f"the parameter '{name}'"
             hint = "add it under model.effects" if "@" in effect else nearest_name_question(name, parameters.names)
-            what = f"the baseline has {what}, which this model does not have"
+            what = f"the baseline has {what}, which this model lacks"
             raise ConfigError(what, where=baseline.run_name, allowed="a run of the same model", hint=hint)
         if name in problem.options.local_parameters:
-            what = f"'{name}' has its own value in every recording, so a baseline gives no information about it"
+            what = f"the baseline cannot give a prior of '{name}', which has its own value in every recording"
             where = f"parameters.{name}.per_recording"
             hint = "leave `per_recording` out, or diagnose without --baseline"
-            raise ConfigError(what, where=where, allowed="false with a baseline", hint=hint)
+            raise ConfigError(what, where=where, allowed="`per_recording: false`", hint=hint)
     values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
     values |= dict(zip(names, map(float, baseline.values), strict=True))
     prior = MultivariateGaussianPrior(names, nearby_positive_definite_covariance(baseline.covariance))
@@ -100,10 +100,10 @@ def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> Es
 
 @dataclass(frozen=True)
 class EarlierRunsBaseline:
-    """The combined estimates of earlier runs, and reference recordings made without the effect that is sought."""
+    """The combined estimates of earlier runs, and reference recordings made without the sought effect."""
 
     combined_estimates: RunEstimates | None  # all earlier runs together
-    between_runs_p_value: float
+    between_runs_p_value: float  # p-value of the differences between these runs; 1 for one run or none
     reference_recordings: tuple[Recording, ...]
 
     @staticmethod
@@ -115,7 +115,7 @@ class EarlierRunsBaseline:
         return EarlierRunsBaseline(known, chi2_p_value(chi2, degrees), without)
 
     def parameter_shifts_of_fit(self, fit: RefittedModel, limits: Thresholds) -> ParameterShiftsSinceBaseline | None:
-        """Compute how far the parameters of a fit have moved from the earlier runs. None if there are no runs."""
+        """Return the changes of the parameters of `fit` since the earlier runs, and their tests. None without runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
             return None
@@ -139,23 +139,23 @@ class EarlierRunsBaseline:
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
     def fit_parameters_differ_from_baseline(self, fit: RefittedModel, limits: Thresholds) -> bool:
-        """Check whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
+        """Return whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
         found = self.parameter_shifts_of_fit(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
     def errors_on_recordings_with_and_without_effects(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> CounterfactualErrorsOfFoundEffects | None:
-        """Test the found effects on recordings made with and without them, for example before and after a repair.
+        """Return prediction errors that test the effects of `last`, for example before and after a repair.
 
-        Reference recordings are predicted without the effects of `last`, and the diagnosed recordings with them. If
-        there are no earlier runs, the parameters without the effects are estimated on the reference recordings. Returns
-        None without effects or reference recordings.
+        Reference recordings are predicted by `last` without its effects, and the diagnosed recordings by the parameters
+        of the earlier runs with these effects. Without earlier runs, these parameters are estimated on the reference
+        recordings. Returns None without effects or reference recordings.
         """
         without, known = self.reference_recordings, self.combined_estimates
         if not last.effects or not without:
             return None
-        progress.begin_stage("predicting the world without the effects", 1.0, 1.5)
+        progress.begin_stage("predicting recordings without the effects", 1.0, 1.5)
         shared = nominal.problem.shared_parameters
         now = {name: last.values[name] for name in shared}
         effects = {name: last.values[name] for effect in last.effects for name in effect.parameters.names}
@@ -171,7 +171,7 @@ class EarlierRunsBaseline:
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
-    """Variance of every unknown from the stated noise and priors alone."""
+    """Return the variance of every unknown by name, from the stated noise and priors alone."""
     problem = fit.problem
     jacobian = residual_and_jacobian_without_weak_priors(problem, fit.evaluation)[1] * problem.unknown_scales
     variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
@@ -184,7 +184,7 @@ _ChannelErrors = Mapping[str, tuple[float, str]]
 
 @dataclass(frozen=True)
 class _PredictionErrors:
-    """Prediction errors on recordings that no fit used, without diagnosis and counterfactual."""
+    """Prediction errors on recordings of one kind, by the model without a diagnosis and by the counterfactual model."""
 
     recordings: tuple[str, ...]
     without_diagnosis: _ChannelErrors
@@ -193,7 +193,7 @@ class _PredictionErrors:
 
     @property
     def rmse_by_unit(self) -> dict[str, tuple[float, float]]:
-        """Root mean square over the channels of each unit: (without a diagnosis, counterfactual)."""
+        """The root mean square error of all channels by unit: (without a diagnosis, counterfactual)."""
 
         def rms(errors: _ChannelErrors, unit: str) -> float:
             return float(np.sqrt(np.mean([e**2 for e, of in errors.values() if of == unit])))
@@ -218,7 +218,7 @@ class _PredictionErrors:
 
 @dataclass(frozen=True)
 class CounterfactualErrorsOfFoundEffects:
-    """The prediction errors on reference recordings without effects, and on diagnosed recordings with effects."""
+    """The prediction errors on reference recordings without the effects, and on diagnosed recordings with them."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model
     effects_removed: _PredictionErrors
@@ -233,7 +233,7 @@ class CounterfactualErrorsOfFoundEffects:
 def _predicted(
     last: RefittedModel, recordings: Sequence[Recording], plain: Mapping[str, float], other: Mapping[str, float]
 ) -> _PredictionErrors:
-    """Prediction errors of two models; other parameters have the problem's values, and effects are neutral."""
+    """Return the errors of predictions with the parameters `plain` and `other`; effects in neither are neutral."""
     try:
         problem = _on(last, recordings)
         first, second = (_errors(problem, values, last.effects) for values in (plain, other))
@@ -247,7 +247,7 @@ def _nothing(recordings: Sequence[Recording], message: str) -> _PredictionErrors
 
 
 def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProblem:
-    """The problem with its compiled step and all candidates on other recordings, to predict or to estimate on."""
+    """Return the problem of `last` (step, candidates) with other recordings, both as estimation and held-out ones."""
     own, none = last.problem, MultivariateGaussianPrior()
     options = replace(own.options, prior_stds={}, local_parameters=(), multivariate_prior=none, known_initial_states={})
     values = dict(zip(own.system.parameters.names, map(float, own.theta), strict=True))
@@ -265,7 +265,7 @@ def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Se
 
 
 def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:
-    """The nominal parameters, estimated on the recordings without the effects."""
+    """Return the nominal parameters, estimated on the recordings `without` the effects."""
     problem = _on(last, without).with_free_parameters_without_recompiling(shared)
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:

@@ -1,4 +1,4 @@
-"""Random blind-test cases of one experiment. Their labels are sealed before any recording is diagnosed."""
+"""Random cases of a blind test: plan, synthetic recordings, sealed labels, and their diagnosis without labels."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
     "left_out": 0.06,
     "finer_chain": 0.06,
 }
-"""Fraction of the cases in every category."""
+"""Fraction of all cases in each category (`CaseGroundTruth.category`)."""
 BLIND_ENSEMBLE_PURPOSES = ("report", "calibration")
-"""Purposes of an ensemble; the same seed draws different cases for each."""
-_MIN_CASES_PER_EXPERIMENT = 3  # with fewer cases, an experiment is not worth its compilation
+"""Purposes of an ensemble. One seed gives different cases for each purpose."""
+_MIN_CASES_PER_EXPERIMENT = 3  # experiments with fewer cases are left out, because each must be compiled
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class PlannedBlindCase:
     number: int
     experiment: str
     category: str  # key of `BLIND_CASE_CATEGORY_SHARES`
-    multiple: float | None  # multiple of the detectable size; None if not applicable
-    is_brisk: bool = False  # whether it moves with three times the acceleration
+    multiple: float | None  # effect size as a multiple of the detectable size; None if not applicable
+    is_brisk: bool = False  # whether the motion has three times the usual acceleration
 
 
 def plan_blind_cases(
@@ -72,9 +72,9 @@ def plan_blind_cases(
 ) -> list[PlannedBlindCase]:
     """Plan `count` blind-test cases in random order, each with an experiment, effect category and effect size.
 
-    `weights` holds the share of cases of each experiment. An experiment with less than `_MIN_CASES_PER_EXPERIMENT`
-    cases gets none; if all have less, the largest gets all. Objects of the experiments in `chains` can be simulated
-    with finer links. `purpose` selects the random stream. Raises `ConfigError` if `count` is below 1.
+    `weights` holds the share of cases of each experiment. An experiment whose share is less than
+    `_MIN_CASES_PER_EXPERIMENT` cases gets none; if this holds for all, the largest gets all. The category `finer_chain`
+    needs an experiment in `chains`. `seed` and `purpose` determine the order. Raises `ConfigError` if `count` < 1.
     """
     if count < 1:
         raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
@@ -103,7 +103,7 @@ def plan_blind_cases(
 
 
 def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
-    """Distribute a number in given proportions, by the largest remainders."""
+    """Return whole numbers with the sum `count` in the proportions `parts` (method of largest remainders)."""
     total = sum(parts.values())
     exact = {key: count * part / total for key, part in parts.items()}
     found = {key: int(value) for key, value in exact.items()}
@@ -113,7 +113,7 @@ def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
 
 
 MAX_DRAWS_PER_CASE = 64
-"""Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""
+"""Largest number of draws (motion, object, effects) for a case. With eight, 1 of 300 cases was not simulated."""
 _STIFFNESS_SPREAD_FACTOR = 1.5  # factor by which true stiffnesses lie above or below the problem's start, at most
 _PRIOR_DEVIATIONS = (0.6, 1.0)  # deviation of a parameter with a prior from its initial value, in stds of the prior
 _BRISK_FREQUENCY_FACTOR = 1.41  # together with the second harmonic, triples the accelerations
@@ -133,9 +133,9 @@ _OUT_OF_LIBRARY_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "stiffness_drift": ("segment", 0.2, 0.5, ""),
     "one_way_damping": ("segment", 0.3, 1.0, ""),
 }
-"""Effects outside the library, by kind: type of location, smallest and largest size, reference of relative sizes."""
+"""Effects outside the library, by kind: type of location, smallest and largest size, what relative sizes refer to."""
 _GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.05
-"""Travel of a single gripper, and of several grippers on one object, which snaps over in a sixth of motions of 8 cm."""
+"""Travel [m] of a single gripper, and of several on one object, which snaps over in a sixth of motions of 0.08 m."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ class CaseGroundTruth:
     case: str
     category: str  # null, single, pair, outside, left_out or finer_chain
     injected: tuple[InjectedEffect, ...]
-    multiple: float | None  # actual multiple of the detectable size; None if not applicable
-    truth: Mapping[str, float]  # nominal parameters
+    multiple: float | None  # true size over the detectable size; None if not applicable
+    truth: Mapping[str, float]  # true values of the nominal parameters
     experiment: str = ""  # experiment of the case
 
     def to_dict(self) -> dict[str, Any]:
@@ -167,11 +167,11 @@ class UnlabelledCase:
     name: str
     estimation_recordings: tuple[Recording, ...]
     held_out_recording: Recording
-    excluded_kinds: tuple[str, ...]  # excluded kinds, mostly unrelated to the case
+    excluded_kinds: tuple[str, ...]  # includes the true kind only in the category left_out
 
 
 def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
-    """Return the true labels of cases as JSON text, with the SHA-256 hash that is published before the diagnosis."""
+    """Return the labels of cases as JSON text, and its SHA-256 hash, which is written before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
@@ -179,7 +179,7 @@ def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
     """Read the sealed labels of cases from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
-        what, hint = "the labels differ from the commitment", "use the labels file that was written with the commitment"
+        what, hint = "the labels differ from the commitment", "use the file labels.json that was written with it"
         raise DataError(what, where="sealed labels", allowed=f"text with SHA-256 {commitment[:12]}...", hint=hint)
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
 
@@ -190,16 +190,16 @@ class SyntheticRecordingConditions:
 
     estimation_count: int = 1  # number of estimation recordings; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
-    simulation: SimulationOptions = field(default_factory=SimulationOptions)  # duration of each, and the engine's step
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)  # duration of each, and MuJoCo's time step
     has_camera: bool = False  # whether a camera sees the object
-    # friction that the engine simulates with sticking, together with injected friction; None: smooth forces
+    # friction that MuJoCo simulates with sticking, like injected friction; None: both are smooth forces
     ordinary_friction: Sequence[InjectedEffect] | None = None
-    is_brisk: bool = False
+    is_brisk: bool = False  # whether the motion has three times the usual acceleration
     purpose: str = BLIND_ENSEMBLE_PURPOSES[0]  # one of `BLIND_ENSEMBLE_PURPOSES`
 
 
 _Detectable = tuple[EffectBase, Mapping[str, float], Array]
-"""A candidate, values of its shape parameters, and F (p, p): amplitudes a move the residual by |F a| [data stds]."""
+"""A candidate, its shape parameters, and F (p, p): amplitudes a change the whitened residual by |F a|."""
 
 
 class BlindCaseGenerator:
@@ -208,11 +208,11 @@ class BlindCaseGenerator:
     Parameters
     ----------
     problem : EstimationProblem
-        It defines system, options and free parameters of all cases. Its first recording gives the initial joint angles.
+        Defines the system, options and free parameters of all cases. Its first recording gives the first joint angles.
     finer : callable, optional
-        Function that returns the system with a given multiple of its links.
+        Function that returns the system with each link divided into a given number, for the category `finer_chain`.
     simulated_system : System, optional
-        The simulated system, if not the problem's: the same system with driven arms.
+        The same system with driven arms, which is simulated. Default: the system of the problem.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class BlindCaseGenerator:
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
-            what, allowed = "a blind test needs driven arms", "a robot with driven and without prescribed joints"
+            what, allowed = "a blind test needs driven arms only", "a robot with driven and without prescribed joints"
             raise ConfigError(what, where="model.arms.mode", allowed=allowed, hint="set model.arms.mode: driven")
         if seed < 0:
             raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
@@ -240,18 +240,18 @@ class BlindCaseGenerator:
         self.conditions = replace(conditions or SyntheticRecordingConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
-            what, hint = "MuJoCo can represent none of the candidates", "add one of the allowed kinds"
+            what, hint = "the blind test can inject none of the candidates", "add one of the allowed kinds"
             raise ConfigError(what, where="diagnosis.candidates", allowed=", ".join(INJECTABLE_EFFECT_KINDS), hint=hint)
 
     def _rng(self, *path: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, BLIND_ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
     def _draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
-        """True values of free parameters, log-uniform or according to a prior, and of all ordinary friction."""
+        """Draw true values of the free parameters (log-uniform, or from a prior) and of all ordinary friction."""
         system, priors = self.problem.system, self.problem.options.prior_stds
         start = dict(zip(system.parameters.names, map(float, self.problem.theta), strict=True))
         drawn = {name: start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1) for name in self.problem.free}
-        for name in (own for own in drawn if own in priors):  # in their order: a set's differs from process to process
+        for name in (own for own in drawn if own in priors):  # a set would have another order in each process
             drawn[name] = start[name] + priors[name] * rng.uniform(*_PRIOR_DEVIATIONS) * rng.choice([-1.0, 1.0])
         for effect in self._ordinary_friction:
             drawn |= {name: start[name] for name in effect.shape_parameter_names}
@@ -261,7 +261,7 @@ class BlindCaseGenerator:
 
     @property
     def _ordinary_friction(self) -> tuple[EffectBase, ...]:
-        """Friction of the nominal model that MuJoCo simulates in its own terms."""
+        """Friction of the nominal model that is not in the simulated system, because MuJoCo simulates it itself."""
         known = {(effect.kind, effect.location) for effect in self.simulated_system.effects}
         own = (effect for effect in self.problem.system.effects if isinstance(effect, EffectBase))
         return tuple(effect for effect in own if (effect.kind, effect.location) not in known)
@@ -274,7 +274,7 @@ class BlindCaseGenerator:
         name: str,
         planned: PlannedBlindCase | None = None,
     ) -> Recording:
-        """Simulate one recording with injected effects. It contains no description and no ground truth."""
+        """Simulate one recording with the true values `truth` and injected effects. It does not contain these."""
         nominal, posture = self.simulated_system, self.initial_configuration
         finer = self._finer if planned is not None and planned.category == "finer_chain" else None
         system = nominal if finer is None else finer(2)
@@ -291,7 +291,7 @@ class BlindCaseGenerator:
         return replace(made, name=name, description="", source="", true_parameters={})
 
     def _linearize_clean_recordings(self) -> ProjectedCandidatesLinearization:
-        """The candidates' signatures on recordings without effects."""
+        """Return the candidates' signatures on recordings without effects."""
         rng = self._rng(0)
         names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
         *clean, other = [
@@ -306,21 +306,21 @@ class BlindCaseGenerator:
 
     @cached_property
     def _detectable(self) -> tuple[_Detectable, ...]:
-        """Sensitivity of every candidate."""
+        """Every candidate with its sensitivity on recordings without effects."""
         return tuple(
             (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
             for s in self._linearize_clean_recordings().signatures
         )
 
     def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
-        """Return the sensitivities of all candidates, which define their detectable sizes, in JSON-compatible form."""
+        """Return the sensitivities of all candidates, from which detectable sizes follow, in JSON-compatible form."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
     def set_candidate_sensitivities_from_json(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Load candidate sensitivities that another generator exported with `candidate_sensitivities_to_json`."""
+        """Set sensitivities that `candidate_sensitivities_to_json` of another generator of this experiment returned."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -330,13 +330,13 @@ class BlindCaseGenerator:
     def _nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
-        # motions differ between cases, and a filter for the first one could remove those of others
+        # motions differ between cases; a filter for the first recording could remove motion of the others
         cutoff = max(nominal.options.path_cutoff, select_path_cutoff(recordings, nominal.system.prescribed))
         options = replace(nominal.options, path_cutoff=cutoff)
         return EstimationProblem(nominal.step, list(recordings), nominal.free, options, values)
 
     def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:
-        """Draw recordings and ground truth of a planned case from its seed. Raises `ModelError` if no draw succeeds."""
+        """Return the recordings of a planned case, and its label. Raises `ModelError` if no draw can be simulated."""
         name = f"case_{planned.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_DRAWS_PER_CASE):
@@ -349,11 +349,11 @@ class BlindCaseGenerator:
                     for purpose in (*purposes, "held_out")
                 )
             except ModelError:
-                continue  # the motion throws the object about; draw another
+                continue  # this motion cannot be simulated; draw another
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
-        what, allowed = f"none of {MAX_DRAWS_PER_CASE} motions can be simulated", "a motion that MuJoCo can simulate"
+        what, allowed = f"MuJoCo could simulate none of {MAX_DRAWS_PER_CASE} random motions", "one simulated motion"
         where, hint = f"{name} of {planned.experiment}", "use another --seed: one seed always draws the same motions"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
@@ -374,7 +374,7 @@ class BlindCaseGenerator:
         return tuple(e for i, (e, _) in enumerate(drawn) if e.label not in labels[:i]), drawn[0][1]
 
     def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
-        """An effect of the library at a multiple of its detectable size, or the nearest size within its range."""
+        """Draw an effect of the library at `wanted` times its detectable size, or the nearest size within its range."""
         groups: dict[str, dict[str, list[_Detectable]]] = {}
         for entry in self._detectable:
             if entry[0].kind in INJECTABLE_EFFECT_KINDS:
@@ -392,7 +392,7 @@ class BlindCaseGenerator:
     def _sized(
         self, entry: _Detectable, rng: np.random.Generator, wanted: float
     ) -> tuple[InjectedEffect, float] | None:
-        """Amplitudes in random proportion at a multiple of the detectable size, limited to the range."""
+        """Draw amplitudes at `wanted` times the detectable size, limited to the range. None without sensitivity."""
         (effect, shape, factor), names = entry, entry[0].amplitude_parameter_names
         neutral = np.array([effect.neutral_values[n] for n in names])
         low, high = np.array([effect.prior_ranges[n] for n in names]).T - neutral
@@ -428,7 +428,7 @@ class BlindCaseGenerator:
         return InjectedEffect(kind, location, {"size": size})
 
     def _largest_torque(self, joint: str) -> float:
-        """Largest torque of a joint in the problem's first recording [N m]; 10 if none is recorded."""
+        """Return the largest torque [N m] of a joint in the problem's first recording; 10 if it has no torques."""
         recorded = self.problem.episodes[0].recording.joints
         if recorded is None or recorded.effort is None or joint not in recorded.names:
             return 10.0
@@ -445,7 +445,7 @@ def record_random_motion(
     rng: np.random.Generator,
     conditions: SyntheticRecordingConditions,
 ) -> Recording:
-    """Simulate and record a random multisine motion of `simulated`, planned with the nominal system."""
+    """Return a recording of `simulated` in a random multisine motion, which is planned with the nominal system."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
     if conditions.is_brisk:
@@ -471,13 +471,13 @@ def first_recorded_driven_joint_positions(system: System, recording: Recording) 
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
     if joints is None or missing:
-        what, hint = f"the first recording has no position of joint '{missing[0]}'", "import the joint too"
+        what, hint = f"the first recording lacks the driven joint '{missing[0]}'", "import this joint too"
         raise ConfigError(what, where="recordings.estimate", allowed="a recording of all driven joints", hint=hint)
     return {name: float(joints.position[0, names.index(name)]) for name in system.driven}
 
 
 def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
-    """Scale joint stiffness and damping so that they describe the same tubes with more links."""
+    """Return `truth` with stiffness and damping of joints scaled so that `finer` describes the same tubes."""
     start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
@@ -501,7 +501,7 @@ def diagnose_blind_case(
     candidates: CandidateNamesOrAll = "all",
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
 ) -> DiagnosisResult:
-    """Diagnose a blind-test case from its recordings and excluded effect kinds, without knowing its label."""
+    """Diagnose a blind-test case from its recordings and excluded kinds of effects, without its label."""
     problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]
     return diagnose(problem, candidates, held_out, thresholds=thresholds, exclude=case.excluded_kinds)
 

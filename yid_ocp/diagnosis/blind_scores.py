@@ -1,4 +1,4 @@
-"""Scores of blind diagnoses against their labels, and calibration of thresholds from an ensemble of cases.
+"""Scores of blind diagnoses against their labels, and calibration of thresholds on an ensemble of cases.
 
 Given n values of a statistic on cases of one kind, a further case lies at or below their k-th smallest with a
 probability of at least k/(n + 1) (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715).
@@ -41,8 +41,8 @@ from yid_ocp.model.parameters import Parameter, Parameters
 _FORMAT = "yid-blind/1"
 _CATEGORIES = tuple(BLIND_CASE_CATEGORY_SHARES)
 _OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")  # categories whose true effect is not among the candidates
-_MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
-_NOT_JUDGED = "not_judged"  # verdict of a recorded case if other thresholds need a refit that was not made
+_MAX_CONFUSABLE_SET = 3  # largest number of confusable effects that counts as a right answer
+_NOT_JUDGED = "not_judged"  # verdict of a recorded case if changed thresholds need a refit that was not made
 _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable", _NOT_JUDGED)
 
 
@@ -52,19 +52,19 @@ class BlindCaseScore:
 
     case: str
     category: str
-    truth: str
+    truth: str  # labels of the injected effects, joined by " + "; "-" without any
     verdict: str
-    answer: str
-    multiple: float
+    answer: str  # labels of the effects that the diagnosis names, likewise
+    multiple: float  # true size over the detectable size; NaN if not applicable
     gap: bool  # whether a gap was reported
     kind_first: bool  # whether the first candidate has the true kind at the true location
     kind_second: bool  # whether the true kind is among the first two candidates
-    location_first: bool
-    confusable: tuple[str, ...]  # set that was named as not separable
-    # whether the answer is right: no_gap for a clean case, the true effect alone or in a set of at most three, each
-    # effect of a pair likewise, unknown at the right location for an effect outside the library
+    location_first: bool  # whether the first location of the gap is that of a true effect
+    confusable: tuple[str, ...]  # effects that the diagnosis calls confusable with the first named one
+    # whether the answer is right. Clean case: `no_gap`. Effect outside the library: `unknown` with the true location.
+    # Otherwise: each true effect is named, alone or in a confusable set of at most three
     right: bool
-    closure: float  # fraction of the held-out gap closed by the effects added
+    closure: float  # fraction of the held-out gap that the named effects close
     best: float  # closure by a refit of the true effects
     # per parameter of an accepted true effect: relative error, and whether the 95 % interval contains the truth
     errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
@@ -72,19 +72,19 @@ class BlindCaseScore:
     experiment: str = ""
     z: Mapping[str, float] = field(default_factory=dict)  # (estimate - truth)/std of the same parameters
     p_value: float = math.nan  # p-value of the null test on the held-out recordings
-    probability: float = math.nan  # that the named sets hold the cause; NaN in answers of older versions
-    is_cause_in_sets: bool = False  # whether they do, with one set for each true effect
+    probability: float = math.nan  # stated probability that the cause is named; NaN in answers of older versions
+    is_cause_in_sets: bool = False  # whether the cause is named: each true effect, alone or in a confusable set
 
     @property
     def _named_effect_labels(self) -> tuple[str, ...]:
-        """Labels of the effects named by the diagnosis: the confusable set, or the first effect added."""
+        """Labels of the first effect that the diagnosis names, and of the effects confusable with it."""
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
 
 def score_blind_case(
     label: CaseGroundTruth, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
 ) -> BlindCaseScore:
-    """Score a blind diagnosis (`yid-diagnosis/2`) against its label. `best` is from `true_effects_gap_closure`."""
+    """Score a diagnosis result (`yid-diagnosis/2`) against its label. `best`: closure by the true effects, if known."""
 
     def labels(entries: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
         return tuple(f"{e['kind']}@{e['location']}" for e in entries)
@@ -146,7 +146,7 @@ def _or_nan(value: float | None) -> float:
 def _found(
     true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]], most: float = _MAX_CONFUSABLE_SET
 ) -> bool:
-    """Whether each true effect has its own named effect: itself, or one in a set of at most `most` with it."""
+    """Return whether every true effect is named: itself, or by another one in a confusable set of at most `most`."""
     if not true:
         return True
     small = [group for group in groups if len(group) <= most]
@@ -157,7 +157,7 @@ def _found(
 
 
 def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
-    """Count, total, rate and its 95 % interval (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404)."""
+    """Return count, total, rate and its 95 % interval (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404)."""
     count, total = sum(map(bool, hits)), len(hits)
     if not total:
         return {"count": 0, "of": 0, "rate": None, "low": None, "high": None}
@@ -167,7 +167,7 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 
 
 def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Compute rates over all cases, such as false alarms, detections and correct answers. A rate without cases is None.
+    """Return a summary of scores: rates of false alarms, detections and right answers. A rate without cases is None.
 
     Cases that are not judged are excluded from all rates and counted as `not_judged`.
     """
@@ -227,7 +227,7 @@ def _rates(intervals: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Cases, cases not judged, false alarms and correct answers of one experiment."""
+    """Return the numbers of cases and unjudged cases, and the rates of false alarms and right answers."""
     every, own = own, [m for m in own if m.verdict != _NOT_JUDGED]
     return {
         "cases": len(every),
@@ -238,7 +238,7 @@ def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 
 def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Confusion matrix with counts: kinds of single effects or categories (rows), first kinds or verdicts (columns)."""
+    """Return counts of cases by truth (kind of a single effect, or category) and answer (first kind, or verdict)."""
     true = [m.truth.partition("@")[0] if m.category == "single" else m.category for m in marks]
     answered = [m.verdict if m.answer == "-" else m.answer.partition("@")[0] for m in marks]
     pairs = list(zip(true, answered, strict=True))
@@ -249,9 +249,9 @@ def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 
 def _calibration_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """The empirical coverage of intervals and of p-values of clean recordings, and of the probabilities of named sets.
+    """Return how often intervals, p-values of clean cases and stated probabilities of the cause are right, by level.
 
-    Probabilities are compared in five bins of equal counts with how often the sets hold the cause.
+    The probabilities are sorted into five bins of equal counts. Each bin is compared with its fraction of right sets.
     """
     z = [abs(value) for m in marks if m.category == "single" for value in m.z.values()]
     p = [m.p_value for m in marks if m.category == "null" and math.isfinite(m.p_value)]
@@ -268,16 +268,16 @@ def _calibration_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 
 def _probabilities_and_outcomes(marks: Sequence[BlindCaseScore]) -> Array:
-    """Probabilities of the named sets, ascending, and whether they hold the cause (1 or 0), (n, 2)."""
+    """Return stated probabilities of the cause, ascending, and whether the cause is named (1 or 0), shape (n, 2)."""
     named = sorted((m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-" and m.probability >= 0)
     return np.array(named, float).reshape(-1, 2)
 
 
 def _log_odds_regression(marks: Sequence[BlindCaseScore]) -> dict[str, float]:
-    """Logistic regression of whether named sets hold the cause on the log odds of their probabilities.
+    """Return the line from stated log odds, that the cause is named, to log odds that agree with the outcomes.
 
-    The log odds that agree with the outcomes are `offset` + `slope` x the stated ones. Priors 0 ± 1 and 1 ± 0.5 keep
-    both finite where all sets are right.
+    These are `offset` + `slope` x the stated ones, by logistic regression. The priors 0 ± 1 of the offset and 1 ± 0.5
+    of the slope keep both finite if all answers are right.
     """
     probabilities, outcomes = _probabilities_and_outcomes(marks).T
     log_odds, sides = scipy.special.logit(probabilities), 2 * outcomes - 1
@@ -291,7 +291,7 @@ def _log_odds_regression(marks: Sequence[BlindCaseScore]) -> dict[str, float]:
 
 
 _CALIBRATION_FORMAT = "yid-calibration/1"
-_TARGET_COVERAGE = 0.95  # fraction of the cases that a threshold is to leave on their side
+_TARGET_COVERAGE = 0.95  # fraction of the cases that must lie on the intended side of a threshold
 
 _Statistics = Mapping[str, Any]
 _Statistic = Callable[[_Statistics, Thresholds, str], float]
@@ -312,7 +312,7 @@ def thresholds_always_accepting_best_candidate(limits: Thresholds) -> Thresholds
 
 
 def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
-    """chi2/n - 1 of the residual, if it is significant at all."""
+    """Return chi2/n - 1 of a significant residual, and minus infinity for any other."""
     if said["chi2_per_dof"] is None:
         return math.inf  # the model could not follow the recording
     return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.gap_significance_level else -math.inf
@@ -323,9 +323,10 @@ def _of(name: str) -> _Statistic:
 
 
 def _odds(said: _Statistics, limits: Thresholds, truth: str) -> float:
-    """Log odds of the most likely single effect against the true effect alone.
+    """Return the log odds of the most likely single effect against the true effect alone.
 
-    Refits count that leave only noise, if that of the true effect does; only then does likelihood separate them.
+    Only refits that leave noise alone are compared, because likelihood separates only these. Minus infinity if the
+    refit of the true effect leaves more.
     """
     most, behind = 1 + limits.min_excess_chi2_per_dof, said["behind"].items()
     known = {label: own["squares"] for label, own in behind if own["left"] is not None and own["left"] < most}
@@ -334,7 +335,7 @@ def _odds(said: _Statistics, limits: Thresholds, truth: str) -> float:
 
 @dataclass(frozen=True)
 class _CalibrationRule:
-    """Rule that derives one threshold from a statistic of the cases."""
+    """Rule by which a statistic of cases (`of`: clean, right or refitted ones) gives the threshold `setting`."""
 
     setting: str
     statistic: _Statistic
@@ -352,22 +353,22 @@ _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "explained": _CalibrationRule("min_explained_fraction", _of("explained"), "named", "least", 0.75),
     "carried": _CalibrationRule("always_allowed_transfer_z", _of("carried"), "named", "most", 3.0),
 }
-"""All rules, by what they look at."""
+"""All rules by name. `_STATISTIC_TEXTS` describes their statistics."""
 _STATISTIC_TEXTS = {
     "gap": "chi2/n - 1 of a significant residual",
-    "candidate": "p of the best candidate",
-    "evidence": "rise of the log evidence by the best place",
-    "rival": "log odds of the likeliest effect against the truth",
+    "candidate": "p-value of the best candidate",
+    "evidence": "rise of the log evidence by the best location",
+    "rival": "log odds of the most likely effect against the true one",
     "closure": "lower end of the closure by the best effect",
     "explained": "explained part of the gap",
-    "carried": "standard deviations between recordings",
+    "carried": "difference between recordings in standard deviations",
 }
 
 
 def _conformal_quantile(
     sample: Sequence[float], side: Literal["most", "least"], coverage: float = _TARGET_COVERAGE
 ) -> tuple[float, float]:
-    """Return the conformal quantile of a sample and its coverage."""
+    """Return the value below (`side` "least": above) which the fraction `coverage` of cases lies, and its coverage."""
     n = len(sample)
     if not n:
         return math.nan, 0.0
@@ -385,8 +386,9 @@ def calibrate_thresholds(
 ) -> dict[str, Any]:
     """Compute diagnosis thresholds as conformal quantiles of the statistics of a blind test (`yid-calibration/1`).
 
-    `labels`, `marks` and `answers` belong to the same cases. An answer holds the `result` with its `statistics` and, if
-    no gap was detected, `open`: the statistics with permissive thresholds. `limits` are the thresholds of the answers.
+    `labels`, `marks` (scores) and `answers` belong to the same cases. An answer holds the `result` with its
+    `statistics` and, if no gap was detected, `open`: statistics from `thresholds_always_accepting_best_candidate`.
+    `limits` are the thresholds of the answers.
     """
     every = zip(labels, marks, answers, strict=True)
     known = ((label, mark, entry["result"].get("statistics"), entry.get("open") or {}) for label, mark, entry in every)
@@ -426,7 +428,7 @@ def calibrate_thresholds(
 
 
 def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Recommended settings: quantiles rounded outwards to two digits, within each rule's limit."""
+    """Return thresholds by setting: quantiles rounded away from the cases to two digits, within each rule's limit."""
     settings: dict[str, float] = {}
     for own in rules.values():
         most, value, limit = own["side"] == "most", own["quantile"], float(own["limit"])
@@ -438,7 +440,7 @@ def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, f
 
 
 def _rounded(value: float, up: bool) -> float:
-    """A number rounded up or down to two digits."""
+    """Return a number rounded up or down to two significant digits."""
     if value == 0:
         return 0.0
     digits = 1 - math.floor(math.log10(abs(value)))
@@ -448,11 +450,11 @@ def _rounded(value: float, up: bool) -> float:
 
 
 _EVIDENCE_FORMAT = "yid-evidence/3"  # 2 had no chi2 of one fit to all recordings
-_MIN_RECORDED_OVERLAP = 0.5  # fraction of a signature from which the overlap of two candidates is recorded
+_MIN_RECORDED_OVERLAP = 0.5  # smallest overlap of two candidates' signatures that is recorded, as a fraction
 
 
 def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
-    """Return all numbers that decide a diagnosis, so that `rejudge_diagnosis_evidence` can judge it again."""
+    """Return all numbers on which a diagnosis depends as JSON-compatible data for `rejudge_diagnosis_evidence`."""
     record, plain = result.record, to_lossless_plain_data
     pairs = {name: [[[e.label for e in both], fall] for both, _, fall in own] for name, own in record.pairs.items()}
     candidates = {entry.effect.label: entry.effect for entry in result.screening.detectability}
@@ -487,11 +489,11 @@ def _screening_to_json(screened: ScreeningResult) -> dict[str, Any]:
 
 
 class _UnrecordedRefitError(LookupError):
-    """Raised when rules require a refit that the recorded search did not make."""
+    """An error that is raised when the rules require a refit that the recorded search did not make."""
 
 
 class _RecordedSearch(RefitContext):
-    """Takes results from the record alone; a missing one raises `_UnrecordedRefitError`."""
+    """A search that takes results from a record only. A missing result raises `_UnrecordedRefitError`."""
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], Any]) -> Any:
         if name not in answers:
@@ -500,7 +502,7 @@ class _RecordedSearch(RefitContext):
 
 
 class _RecordedCase:
-    """The output of `diagnosis_evidence_to_dict`, as the objects that the rules need."""
+    """The objects that the rules need, restored from the output of `diagnosis_evidence_to_dict`."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         self._effects = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
@@ -546,13 +548,14 @@ def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBas
 def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Judge a recorded diagnosis again with changed thresholds, from the data of `diagnosis_evidence_to_dict`.
 
-    The thresholds of the recorded diagnosis are used, as far as they still exist, with `changes`. The verdict is
-    `not_judged` if the changed thresholds need a refit that was not made. Steps before the first screening (events,
-    time step) are not repeated. `DataError` if another version recorded the case.
+    Thresholds that `changes` does not name are those of the recorded diagnosis. The verdict is `not_judged` if the
+    changed thresholds need a refit that was not made. Steps before the first screening (events, time step) are not
+    repeated. Raises `DataError` if the case was recorded in another format.
     """
     if data.get("format") != _EVIDENCE_FORMAT:
-        what, hint = f"another version made this evidence (format '{data.get('format')}')", "record the cases again"
-        raise DataError(what, where="evidence in the recorded answer of a case", allowed=_EVIDENCE_FORMAT, hint=hint)
+        hint = "run `yid-ocp blind` again, or use --rescore of the version that made the cases"
+        what = f"another version of yid_ocp recorded this answer (evidence format '{data.get('format')}')"
+        raise DataError(what, where="key `evidence` of a file in answers/", allowed=_EVIDENCE_FORMAT, hint=hint)
     known = {entry.name for entry in fields(Thresholds)}
     kept = {name: value for name, value in data["thresholds"].items() if name in known}
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))
