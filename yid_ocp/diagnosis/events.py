@@ -1,9 +1,9 @@
-"""Search for events such as pushes, snags and wrong samples, each with location and time window.
+"""Search for events: short forces (pushes, snags) and wrong samples, each with location and time window.
 
-At prescribed joints with compared efforts, the unknown force is measured minus required torque, sample by sample.
-Elsewhere it is the smoother's linear model of the force at one coordinate, with all other unknowns at their estimates.
-`detect_force_pulses` searches both for pulses on a background that depends on load. One to three outlying samples of a
-sensor are an event of that sensor. Events are removed before anything else is judged.
+At prescribed joints with compared efforts, the unknown force is the required minus the measured torque. At other
+coordinates it is an unknown of the smoother's linear model, with all other unknowns at their estimates. In both,
+`detect_force_pulses` searches for pulses on a background that depends on load. One to three outlying samples of a
+sensor are an event of that sensor. A diagnosis removes events before its other steps.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 from yid_ocp.sensors.joints import quantization_step
 
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
-"""A recording, its prediction and the parameters theta of that."""
+"""A recording, its prediction and the parameters theta of the prediction."""
 
-_INVERSE_DYNAMICS_RTOL = 0.03  # relative torque error of a good model
+_INVERSE_DYNAMICS_RTOL = 0.03  # assumed error of a good model, as a fraction of the torque
 _FORCE_INTERVAL = 0.05  # interval of constant unknown force in the search for events [s]
 _MAX_SPAN_POINTS = 250  # maximum number of points of a force history processed together
 _MAX_WRONG_SAMPLES = 3  # largest number of consecutive wrong samples; more are a gap or a stuck channel
-_STENCIL_STEPS = (4, 7, 10)  # distances of the samples through which a smooth curve is fitted around a wrong sample
-_NEIGHBOUR_COUNT = 20  # samples on either side with which one is compared
+_STENCIL_STEPS = (4, 7, 10)  # distances [samples] of the points of a cubic around a sample that may be wrong
+_NEIGHBOUR_COUNT = 20  # number of samples on either side with which a sample is compared
 _MIN_NEIGHBOUR_RATIO = 3.0  # ratio of a wrong sample's deviation to the largest one of its neighbours
-_MIN_RECURRENCE_OVERLAP = 0.5  # of the longer of two windows; overlap from which they are the same time
-_MAX_RECURRING_FRACTION = 0.5  # of all forces; fraction of recurring forces from which some belong to the motion
+_MIN_RECURRENCE_OVERLAP = 0.5  # smallest overlap of two windows at the same time, as a fraction of the longer one
+_MAX_RECURRING_FRACTION = 0.5  # fraction of recurring forces above which some belong to the motion
 _WRONG_SAMPLE_Z = 8.0  # smallest deviation, in stds of noise and robust stds of its neighbours
 
 
@@ -68,19 +68,19 @@ class ForceOrFaultEvent:
 
     recording: str
     location: str
-    channel: str  # coordinate on which a force acted, or channel that was wrong
+    channel: str  # coordinate on which the force acted, or channel with the wrong samples
     kind: str  # "force" or "sample"
     start_time: float  # since the start of the recording [s]
     end_time: float
-    # largest signed value, in `unit`: of the force beyond model and recording, or of measured minus true
+    # in `unit`: signed value of largest size, of the force beyond model and recording, or of measured minus true value
     peak_value: float
     impulse: float  # integral over time [unit x s]
-    impulse_std: float  # standard deviation of the impulse, counting what the model is allowed to be wrong by
+    impulse_std: float  # standard deviation of the impulse, which includes the assumed model error
     unit: str
     detected_pulse: DetectedForcePulse | None = None  # shape of a force
 
     def _overlap(self, other: ForceOrFaultEvent) -> float:
-        """Time for which both events last, in any recordings [s]; negative if they do not overlap."""
+        """Return the common time [s] of two events, each since its recording began; negative without overlap."""
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
     def to_dict(self) -> dict[str, Any]:
@@ -91,16 +91,16 @@ class ForceOrFaultEvent:
 
 @dataclass(frozen=True)
 class _Overspeed:
-    """Time after which a recording is ignored because a joint moves faster than `Thresholds.max_joint_speed`."""
+    """Time after which efforts are ignored, because a joint moves faster than `Thresholds.max_joint_speed`."""
 
     recording: str
     joint: str
-    start_time: float
+    start_time: float  # since the start of the recording [s]
 
 
 @dataclass(frozen=True)
 class EventSet:
-    """All events of a diagnosis, sorted by recording and time, with joint overspeeds and force estimates."""
+    """All events of a diagnosis, sorted by recording and time, with overspeeds of joints and force estimates."""
 
     disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
@@ -110,13 +110,13 @@ class EventSet:
         return bool(self.disturbances or self.overspeeds)
 
     def has_same_force_and_fault_events(self, other: EventSet) -> bool:
-        """Check whether both sets have the same number of events, in the same channels and at overlapping times."""
+        """Return whether both sets have equally many events, in the same channels and at overlapping times."""
         pairs = list(zip(self.disturbances, other.disturbances, strict=False))
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
     def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
-        """Return two sets: the force events, and all other events (sensor faults and overspeeds)."""
+        """Return two sets: the force events, and all others (wrong samples and overspeeds)."""
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 
@@ -125,7 +125,7 @@ class EventSet:
         return tuple(event for event in self.disturbances if event.recording == recording)
 
     def _end_of(self, recording: str) -> float:
-        """Time after which a recording is ignored [s]; infinite if all of it is used."""
+        """Return the time [s] after which efforts and events of a recording are ignored; infinite without overspeed."""
         return min((fall.start_time for fall in self.overspeeds if fall.recording == recording), default=math.inf)
 
 
@@ -139,11 +139,11 @@ def find_force_and_fault_events(
     smoothed: SmoothedUnknownsResult | None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> EventSet:
-    """Find short forces and sensor faults in all recordings, and keep those that are statistically significant.
+    """Return significant short forces, wrong samples and overspeeds in the estimation and held-out recordings.
 
-    The false-discovery rate refers to all time windows together. `problem` is whitened by sensor noise and has all
-    samples. `x` (nx,) is its fit, and `evaluation` its evaluation, with a Jacobian if `smoothed` is given. Forces that
-    move the model are searched only where the smoother found unknown forces.
+    The false-discovery rate of forces refers to all time windows together. `problem` is whitened by sensor noise and
+    has all samples. `x` (nx,) is its fit, and `evaluation` that of `x`, with a Jacobian if `smoothed` is given. Forces
+    that move the model are searched only where the smoother found unknown forces.
     """
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
     told = [(e, result, problem.unpack_episode_unknowns(x, i)[0]) for i, (e, result) in enumerate(fitted)]
@@ -174,7 +174,7 @@ def find_force_and_fault_events(
 
 
 def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thresholds) -> Iterator[_Overspeed]:
-    """First time at which a joint of the robot exceeds the speed limit."""
+    """Yield the first time at which a joint of the robot exceeds the speed limit, if there is one."""
     episode, result, _ = run
     names, h = problem.system.mechanism.joint_names, episode.grid.time_step
     places = [names.index(name) for name in arm_joint_names(problem.system)]
@@ -186,14 +186,14 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
 
 
 def _before_overspeed(history: ForceHistory, ends: EventSet) -> ForceHistory | None:
-    """A history up to the recording's overspeed, without the ends distorted by a filter; None if too short."""
+    """Return a history up to the recording's overspeed, without the end that a filter distorts. None if too short."""
     until = ends._end_of(history.recording) - zero_phase_effort_filter(history.filter_cutoff).end_distortion_duration
     keep = np.flatnonzero(history.t <= until)
     return None if len(keep) < 10 else history.subset_at_time_indices(keep)
 
 
 def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: IntArray) -> tuple[Array, Array]:
-    """Assumed model error of every coordinate's torque, and the torque that friction can hold, (M, n)."""
+    """Return the assumed model error of all coordinates' torques, and the torque that friction can hold, (M, n)."""
     episode, result, theta = run
     terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
     joints = episode.recording.joints
@@ -206,7 +206,7 @@ def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: In
 def _read_forces(
     problem: EstimationProblem, run: _RecordingRollout, torques: CompiledInverseDynamics, limits: Thresholds
 ) -> Iterator[ForceHistory]:
-    """Force estimates of prescribed joints with compared efforts, from required and measured torque."""
+    """Yield force estimates at prescribed joints with compared efforts: required minus measured torque."""
     episode, result, _ = run
     unbiased = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
     for samples, predicted in zip(unbiased, result.predicted_outputs, strict=True):
@@ -231,7 +231,7 @@ def _read_forces(
 
 
 def _spans(whole: ForceHistory, limits: Thresholds) -> Iterator[ForceHistory]:
-    """Overlapping parts (twice the longest pulse) of a long history; cost grows with the cube of their points."""
+    """Yield parts of a long history, which overlap by twice the longest pulse. Cost grows with the cube of a part."""
     overlap = math.ceil(2 * limits.max_event_duration / whole.time_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
     for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
@@ -246,7 +246,7 @@ def _driving_forces(
     smoothed: SmoothedUnknownsResult,
     torques: CompiledInverseDynamics,
 ) -> list[ForceHistory]:
-    """Force estimates of coordinates moved by unknown forces, if the smoother found some for a part of the time."""
+    """Return force estimates at coordinates where the smoother found forces, but only for a small part of the time."""
     sought = {trace.recording: _short(smoothed, i) for i, trace in enumerate(smoothed.smoothed_unknowns)}
     found: list[ForceHistory] = []
     if not any(sought.values()):
@@ -272,7 +272,7 @@ def _driving_forces(
 
 
 def _short(smoothed: SmoothedUnknownsResult, recording: int) -> list[str]:
-    """Unknown forces that are significant, but only for a small part of the time."""
+    """Return the names of unknown forces that are significant only for a small part of a recording's time."""
     trace, names = smoothed.smoothed_unknowns[recording], []
     for i, source in enumerate(trace.unknown_groups):
         sure = smoothed_unknown_significance_mask(trace, [i])
@@ -285,7 +285,7 @@ def _short(smoothed: SmoothedUnknownsResult, recording: int) -> list[str]:
 def _one_each(
     found: Sequence[tuple[ForceHistory, DetectedForcePulse]], problem: EstimationProblem
 ) -> list[ForceOrFaultEvent]:
-    """Force events; a push that moves the model is assigned to the coordinate that explains most of it."""
+    """Return force events. A force that moves the model counts once, at the coordinate with the smallest p-value."""
     prescribed = set(problem.system.prescribed)
     kept: list[ForceOrFaultEvent] = []
     for history, pulse in sorted(found, key=lambda entry: entry[1].p_value):
@@ -301,17 +301,17 @@ def _one_each(
 def _without_forces_of_motion(
     forces: Sequence[ForceOrFaultEvent], durations: Mapping[str, float], limits: Thresholds
 ) -> list[ForceOrFaultEvent]:
-    """Forces without those that come with the motion, if most forces recur in other recordings.
+    """Return the forces that do not belong to the motion. All are returned if at most half recur in other recordings.
 
-    A force comes with the motion if more recordings than by chance have the same force, or if one recording has more
-    than by chance of the same forces as its own recording. Numbers by chance are Poisson distributed.
+    A force belongs to the motion if more recordings than by chance have the same force, or if its recording and one of
+    these have more forces in common than by chance. Numbers by chance are Poisson distributed.
     """
     pairs = np.array([[_recurrence(one, other, durations) for other in forces] for one in forces])
     pairs = pairs.reshape(len(forces), len(forces), 2)
     names = list(dict.fromkeys(force.recording for force in forces))
     recording = np.array([names.index(force.recording) for force in forces], int)
     of = np.eye(len(names))[recording]
-    recurs, chance = pairs[..., 0] @ of > 0, pairs[..., 1] @ of  # by force and recording
+    recurs, chance = pairs[..., 0] @ of > 0, pairs[..., 1] @ of  # by force and other recording
     is_recurring = np.any(recurs, axis=1)
     if is_recurring.sum() <= _MAX_RECURRING_FRACTION * len(forces):
         return list(forces)
@@ -324,9 +324,9 @@ def _without_forces_of_motion(
 
 
 def _recurrence(one: ForceOrFaultEvent, other: ForceOrFaultEvent, durations: Mapping[str, float]) -> tuple[bool, float]:
-    """Whether another recording has the same force, and the probability of that if `other` came at a random time.
+    """Return whether `other` is the same force in another recording, and the probability of this at a random time.
 
-    The same force acts on the same coordinate at the same time, with the same impulse within `SIGNIFICANT_Z` stds.
+    The same force acts on the same coordinate at the same time, and impulses differ by at most `SIGNIFICANT_Z` stds.
     """
     shorter, longer = sorted(force.end_time - force.start_time for force in (one, other))
     apart, std = abs(one.impulse - other.impulse), math.hypot(one.impulse_std, other.impulse_std)
@@ -340,7 +340,7 @@ def _recurrence(one: ForceOrFaultEvent, other: ForceOrFaultEvent, durations: Map
 
 
 def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterator[ForceOrFaultEvent]:
-    """Samples that contradict their neighbours: sensors relative to their prediction, joints as recorded."""
+    """Yield samples that contradict their neighbours: residuals of sensors, and recorded values of joints."""
     episode, result, _ = run
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         sensor = samples.sensor
@@ -368,7 +368,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
 
 
 def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:
-    """Noise of one joint's raw channel, if it drives the model or is compared with it after smoothing."""
+    """Return the noise std of a joint's raw channel. None if the model neither takes it as input nor smooths it."""
     joints, options, system = episode.recording.joints, problem.options, problem.system
     assert joints is not None
     by_torque = joint in system.driven and joint not in system.servos
@@ -390,7 +390,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
 def _alone(
     t: Array, values: Array, noise: Array, recording: str, about: tuple[str, str, str]
 ) -> Iterator[ForceOrFaultEvent]:
-    """Runs of at most `_MAX_WRONG_SAMPLES` samples that deviate far more from their surroundings than all others."""
+    """Yield up to `_MAX_WRONG_SAMPLES` consecutive samples that deviate from a cubic far more than their neighbours."""
     count, many = len(values), _NEIGHBOUR_COUNT
     if count < 2 * many:
         return
@@ -405,7 +405,7 @@ def _alone(
         if end - begin >= _MAX_WRONG_SAMPLES:
             continue
         near = np.r_[max(begin - many, 0) : begin, end + 1 : min(end + 1 + many, count)]
-        # a stamp that is late by an interval moves a value by what changes from sample to sample
+        # a stamp that is late by one interval changes a value by its step from sample to sample
         steps = np.abs(np.diff(values))[[k for k in near[:-1] if k + 1 != begin and k < count - 1]]
         around = max(size[near].max(initial=0.0), steps.max(initial=0.0))
         if size[begin : end + 1].min() < _MIN_NEIGHBOUR_RATIO * around:
@@ -419,7 +419,7 @@ def _alone(
 
 
 def _beside_neighbours(t: Array, values: Array) -> Array:
-    """Value minus a cubic through four nearby samples, the smallest of three such differences, (M,)."""
+    """Return values minus a cubic through four nearby samples (M,): the smallest of three such differences."""
     found = np.zeros((len(_STENCIL_STEPS), len(values)))
     for one, step in zip(found, _STENCIL_STEPS, strict=True):
         middle = np.arange(2 * step, len(values) - 2 * step)
@@ -434,15 +434,14 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
     return smallest
 
 
-# -- the recordings without them --------------------------------------------------------------------------------------
+# -- recordings without the events ------------------------------------------------------------------------------------
 
 
 def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
-    """Remove the influence of found events from the data of a problem, so that they do not disturb a fit.
+    """Return the problem without the influence of found events on its data, so that they do not disturb a fit.
 
     Forces at joints driven by recorded torques are added to these torques; forces on an object and at servos are not
-    compensated. Wrong samples are excluded, and effort samples of prescribed joints during an event, and everything
-    after an overspeed.
+    compensated. Excluded are wrong samples, effort samples during an event, and effort samples after an overspeed.
     """
     system, cutoff = problem.system, problem.options.path_cutoff
 
@@ -464,7 +463,7 @@ def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -
 def _counting(
     episode: Episode, samples: SensorMeasurements, own: Sequence[ForceOrFaultEvent], end: float, cutoff: float
 ) -> SensorMeasurements:
-    """Samples without those affected by an event."""
+    """Return the samples without those that an event affects."""
     hidden, is_effort = np.zeros(samples.value.shape, bool), bool(samples.sensor.effort_joints)
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
@@ -475,7 +474,7 @@ def _counting(
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)
         for column, channel in enumerate(samples.channel_name_per_output):
             name = channel.rpartition(".")[2] if is_effort else samples.sensor.output_names[column]
-            # a wrong angle is smeared over what all joints need
+            # a wrong angle changes the required torques of all joints
             if event.channel == name or (is_effort and event.kind == "sample"):
                 hidden[:, column] |= inside[:, column]
     return mask_out_samples(samples, hidden) if np.any(hidden & samples.positive_weight_mask) else samples

@@ -1,4 +1,4 @@
-"""An estimation problem that contains all candidate effects in one compiled step."""
+"""Candidate effects of a diagnosis, and an estimation problem that contains all of them in one compiled step."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
-_BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
-_MIN_PREDICTED_DURATION = 1.0  # shortest beginning of a held-out recording that is worth predicting [s]
+_BLOCK_DURATION = 1.0  # duration of the blocks into which a recording is split if none is held out [s]
+_MIN_PREDICTED_DURATION = 1.0  # shortest part of a truncated held-out recording that is kept [s]
 KEPT_FRACTIONS_BEFORE_FAILURE = (0.9, 0.5, 0.0)
-"""Held-out recordings keep one of these fractions of the duration that a model follows before its rollout fails: before
-a failure it has already deviated. The next fraction is tried if the refitted model fails earlier."""
+"""Fractions of the duration until the simulation of a held-out recording fails, of which it keeps one. All are below 1,
+because the simulation deviates before it fails. The next fraction is tried if the refitted model fails earlier."""
 
 
 def make_candidate_effects(
     system: System, recordings: Sequence[Recording], choice: CandidateNamesOrAll
 ) -> list[EffectBase]:
-    """Create the candidate effects for a system, except effects that its nominal model already contains.
+    """Return the candidate effects that `choice` names, for a system and the signals in its recordings.
 
-    `choice` is "all", or a list of `kind@location` or `kind` (at all locations that a diagnosis tries). Raises
-    `ConfigError` if the list is empty, or if a kind does not exist, has no location here or is part of the nominal
-    model. Raises `ModelError` if a location does not exist.
+    `choice` is "all", or a list of `kind@location` or `kind` (at all locations that a diagnosis tries). "all" leaves
+    out effects of the system. Raises `ConfigError` if the list is empty, or a kind does not exist, has no location here
+    or is an effect of the system. Raises `ModelError` if a location does not exist.
     """
     where, sensors = "diagnosis.candidates", signal_kinds_for_effects(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
@@ -56,20 +56,20 @@ def make_candidate_effects(
     if choice == "all":
         return [_make_candidate(kind, place, system) for kind, place in possible]
     if isinstance(choice, str) or not choice:
-        what = f"candidates = '{choice}'" if choice else "there is no candidate to try"
+        what = f"'{choice}' is neither 'all' nor a list" if choice else "the list of candidates is empty"
         raise ConfigError(what, where=where, allowed="all, or a list of kinds", hint="leave the key out to try all")
     pairs: list[tuple[str, str]] = []
     for text in choice:
         kind, _, place = text.partition("@")
         cls = EFFECTS[kind]
         if text in present:
-            what, allowed = f"the effect {text} is already part of the model", "effects that the model does not have"
-            raise ConfigError(what, where=where, allowed=allowed, hint="leave it out")
+            what, allowed = f"the model already has the effect {text}", "effects that the model does not have"
+            raise ConfigError(what, where=where, allowed=allowed, hint="remove it from the list")
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
             missing = ", ".join(sorted(cls.required_sensors - sensors))
             what = f"the effect {kind} is not possible for this model" + (f" without {missing}" if missing else "")
-            allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), "leave it out"
+            allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), "remove it from the list"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)
         pairs += [pair for pair in found if pair not in pairs]
     return [_make_candidate(kind, place, system) for kind, place in pairs]
@@ -80,56 +80,56 @@ def _make_candidate(kind: str, place: str, system: System) -> EffectBase:
 
 
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Return the candidate effects that are not listed in `names` (as `kind` or `kind@location`).
+    """Return the candidates `effects` without those that `names` lists (as `kind` or `kind@location`).
 
-    Excluded candidates stay in the compiled step, at values without effect, so nothing is recompiled. Raises
-    `ConfigError` if a name is not a candidate, or if no candidate is left.
+    Excluded candidates stay in the compiled step at their neutral values, so that it is not compiled again. Raises
+    `ConfigError` if a name is not a candidate, or if every candidate is excluded.
     """
     where = "diagnosis.excluded_candidates"
     known = {name for effect in effects for name in (effect.kind, effect.label)}
     for name in names:
         if name not in known:
             allowed = ", ".join(dict.fromkeys(effect.kind for effect in effects))
-            what, hint = f"'{name}' is not a candidate", nearest_name_question(name, known) or "leave it out"
+            what, hint = f"'{name}' is not a candidate", nearest_name_question(name, known) or "remove it from the list"
             raise ConfigError(what, where=where, allowed=f"{allowed}, or kind@location", hint=hint)
     kept = [effect for effect in effects if not {effect.kind, effect.label} & set(names)]
     if not kept:
-        what, allowed = "every candidate is excluded", "at least one candidate that is not excluded"
-        raise ConfigError(what, where=where, allowed=allowed, hint="exclude fewer")
+        what, allowed = "all candidates are excluded", "at least one candidate that is not excluded"
+        raise ConfigError(what, where=where, allowed=allowed, hint="exclude fewer candidates")
     return kept
 
 
 def neutral_effect_parameter_values(effects: Sequence[EffectBase]) -> dict[str, float]:
-    """Return the parameter values at which the given effects change nothing."""
+    """Return the values of all parameters of `effects`, by name, at which the effects change nothing."""
     return {name: value for effect in effects for name, value in effect.neutral_values.items()}
 
 
 def join_effect_labels(effects: Sequence[EffectBase]) -> str:
-    """Join the labels `kind@location` of effects with "and", or return "the nominal model" if there are none."""
+    """Return the labels `kind@location` of effects, joined with "and"; "the nominal model" without effects."""
     return " and ".join(effect.label for effect in effects) or "the nominal model"
 
 
 @dataclass(frozen=True)
 class HeldOutTruncation:
-    """A held-out recording that is cut off where the nominal model stops following it, with its durations."""
+    """A held-out recording that is cut off because its simulation with the nominal model fails later on."""
 
     recording: str
-    kept_duration: float  # compared duration [s]; 0 if nothing is compared
-    full_duration: float  # [s]
+    kept_duration: float  # duration that is compared with predictions [s]; 0 if the recording is left out
+    full_duration: float  # duration of the whole recording [s]
 
 
 @dataclass(frozen=True)
 class AllCandidatesProblem:
-    """An estimation problem with all candidate effects, each of which can be freed without recompiling.
+    """An estimation problem with all candidate effects, whose parameters can be freed without compiling again.
 
     Sensors, statics and corrections are compiled once with all derivatives, and recordings are placed on the nodes
-    once. The tracking filter is computed at the nominal initial values and is therefore the same for every hypothesis.
+    once. The tracking filter is computed at the nominal initial values, so it is the same with any effects.
     """
 
     # system with all candidates at their neutral values, and free nominal parameters
     problem: EstimationProblem
     candidate_effects: tuple[EffectBase, ...]  # candidates to try: neutral in the nominal model and not excluded
-    is_split_in_blocks: bool  # whether a single recording is both estimated on and held out, in alternate blocks
+    is_split_in_blocks: bool  # whether alternate blocks of the estimation recordings are held out, without other ones
     # functions of the nominal system with some candidates, by their labels and the time step [s]
     functions_of_some: CasadiLockedCache[tuple[tuple[str, ...], float], ModelFunctions] | None = None
     held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
@@ -138,7 +138,7 @@ class AllCandidatesProblem:
     def from_problem(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> AllCandidatesProblem:
-        """Add candidate effects to a problem. Raises `DataError` if a recording is both estimated on and held out."""
+        """Return a problem with neutral candidates. Raises `DataError` if an estimation recording is held out too."""
         effects = tuple(effects)
         joint = compile_step_like(problem.step, problem.step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
@@ -146,7 +146,7 @@ class AllCandidatesProblem:
         for recording in held:
             if any(_same(recording, other) for other in estimate):
                 what, allowed = "a recording is both estimated on and held out", "held-out recordings of other motions"
-                hint = "leave held_out empty to split one recording in blocks"
+                hint = "remove it from recordings.held_out; without held-out ones, blocks of recordings are held out"
                 raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
@@ -168,7 +168,7 @@ class AllCandidatesProblem:
 
     @property
     def problem_with_all_samples(self) -> EstimationProblem:
-        """The composed problem with all samples, even if a single recording is divided in blocks."""
+        """The problem with all candidates and all samples: alternate blocks that are held out are estimated on, too."""
         if not self.is_split_in_blocks:
             return self.problem
 
@@ -185,7 +185,7 @@ class AllCandidatesProblem:
         return self.problem.free
 
     def candidates_with_prior_ranges_for(self, states: Sequence[Array]) -> tuple[EffectBase, ...]:
-        """Return the candidates with prior ranges for the largest joint angles of each segment in rolled-out states."""
+        """Return the candidates with prior ranges for the largest joint angles of each segment in `states` (N, nx)."""
         mechanism, largest = self.problem.system.mechanism, {}
         for segment in self.problem.system.segment_layouts:
             index = [mechanism.joint_index(joint) for link in segment.link_joints for joint in link]
@@ -193,7 +193,7 @@ class AllCandidatesProblem:
         return tuple(effect.with_prior_ranges_for_largest_angles(largest) for effect in self.candidate_effects)
 
     def with_whitening_linearized_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
-        """Return the problem whitened by sensor and torque noise, with filters linearised at `values`."""
+        """Return the problem whitened by sensor and input noise, with filters linearised at the parameters `values`."""
         if not self.problem.has_process_noise:
             return self
         # filters are linearised about the estimated torques, so these must be known first
@@ -203,7 +203,7 @@ class AllCandidatesProblem:
         return replace(self, problem=problem_with_held_out_kalman_whitening(made, x))
 
     def with_time_step(self, time_step: float, with_held_out: bool = True) -> AllCandidatesProblem:
-        """Return the problem with another time step [s] and whole recordings, whitened by sensor noise alone."""
+        """Return the problem with another time step [s] and untruncated recordings, whitened by sensor noise alone."""
         made = self.problem.with_time_step(time_step)
         if self.is_split_in_blocks or not with_held_out:
             return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made, held_out_spread=None)
@@ -213,10 +213,10 @@ class AllCandidatesProblem:
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], kept_fraction: float
     ) -> tuple[AllCandidatesProblem, tuple[HeldOutTruncation, ...]]:
-        """Cut off held-out recordings where the nominal model's simulation fails. Also returns these recordings.
+        """Return the problem with truncated held-out recordings where their simulation at `values` fails, and a list.
 
-        They keep `kept_fraction` of the duration that the model follows. If too little of every recording remains,
-        estimation recordings are split in blocks instead. Residuals are whitened by sensor noise alone.
+        A truncated recording keeps `kept_fraction` of the duration until the failure, and is left out if this is less
+        than 1 s. If none remains, blocks of the estimation recordings are held out. Whitening is by sensor noise alone.
         """
         problem, x = self.problem, self.problem.unknown_vector(values)
         kept, cuts = [], []
@@ -236,11 +236,7 @@ class AllCandidatesProblem:
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
     def restricted_to_effects(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
-        """Return a cheaper problem whose step contains only the given candidates.
-
-        A step of all candidates costs three times as much. The problem is unchanged if the filters contain states of
-        other candidates.
-        """
+        """Return the problem on a step of `effects` only (a third of the cost), unchanged if filters need others."""
         if self.functions_of_some is None:
             return self
         key = tuple(sorted(effect.label for effect in effects)), self.problem.step.time_step
@@ -255,17 +251,14 @@ class AllCandidatesProblem:
     def with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return the problem with free `effects`, and with filters linearised again at the torque offsets for `at`.
-
-        Filters of held-out recordings are unchanged: see `relinearize_held_out_filters`.
-        """
+        """Return the problem with free `effects` and filters of estimation recordings linearised for values `at`."""
         own = self.with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
     def relinearize_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return `own`, from `with_effects_and_relinearized_filters`, with its held-out filters linearised at `at`."""
+        """Return `own` (a problem with free `effects`) with filters of held-out recordings linearised for values `at`."""
         if not own.has_process_noise:
             return own
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))
@@ -278,9 +271,9 @@ def compose_candidates(
     held_out: Sequence[Recording],
     progress: Progress,
 ) -> AllCandidatesProblem:
-    """Return the problem with all candidates that are not left out. See `diagnose` for errors."""
+    """Return the problem with all `candidates` except `leave_out` as candidates to try. Errors are as in `diagnose`."""
     if problem.options.weighting != "whitened":
-        what = "a diagnosis needs residuals in units of their noise"
+        what = "a diagnosis needs residuals that are divided by their noise"
         hint = "set problem.weighting: whitened and the noise levels under `sensors`"
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
@@ -291,7 +284,7 @@ def compose_candidates(
 
 
 def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFunctions) -> EstimationProblem | None:
-    """The problem, its episodes and filters on another step; None where filters contain states that it lacks."""
+    """Return the problem on a step of fewer effects. None if its whitening filters have states that the step lacks."""
     whole, part, n = problem.system, functions.step.system, problem.system.n_coordinates
     joints = np.array([whole.mechanism.joint_index(name) for name in part.mechanism.joint_names], np.int64)
     hidden = [*whole.effect_internal_coordinate_symbols]
@@ -317,24 +310,24 @@ def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFuncti
 
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
-    """Unknowns at some values, and with neutral effects, for the linearisation of filters."""
+    """Return the unknowns for the parameters `at`, and for `at` with neutral effects, to linearise filters."""
     return own.unknown_vector(at), own.unknown_vector({**at, **neutral_effect_parameter_values(effects)})
 
 
 def _same(a: Recording, b: Recording) -> bool:
-    """Whether two recordings hold the same positions."""
+    """Return whether two recordings hold the same positions of joints and points."""
     first, second = ([group.position for group in (r.joints, *r.points) if group is not None] for r in (a, b))
     return len(first) == len(second) and all(map(partial(np.array_equal, equal_nan=True), first, second))
 
 
 def _in_blocks(problem: EstimationProblem) -> EstimationProblem:
-    """The problem with alternate blocks of its recordings held out."""
+    """Return the problem in which alternate blocks of its estimation recordings are held out."""
     others = [replace(_masked(e, 1), initial_state_shared_with=i) for i, e in enumerate(problem.episodes)]
     return problem.with_episodes([_masked(episode, 0) for episode in problem.episodes], others)
 
 
 def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> int:
-    """Number of steps of a held-out recording that can be rolled out, to within 1/64 of its length."""
+    """Return how many steps of a held-out recording can be simulated, to within 1/64 of its length."""
 
     def runs(steps: int) -> bool:
         [(_, result)] = problem.with_episodes(problem.episodes, [truncate_episode(episode, steps)]).predict_held_out(x)
@@ -350,7 +343,7 @@ def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> i
 
 
 def _masked(episode: Episode, parity: int) -> Episode:
-    """The episode with the measurements of alternate blocks only; its rollout is complete."""
+    """Return the episode with measurements of alternate blocks (`parity` 0 or 1) only; all of it is simulated."""
     samples = []
     for entry in episode.measurements:
         t = (entry.node + entry.fraction) * episode.grid.time_step

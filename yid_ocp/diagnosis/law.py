@@ -1,4 +1,4 @@
-"""Estimation of a torque law (a smooth function of known quantities) for a gap that no named effect explains."""
+"""Estimation of a torque law, a smooth function of known quantities, for a gap that no accepted effect explains."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ from yid_ocp.problem.options import MultivariateGaussianPrior
 
 _N_KNOTS = 12
 _MAX_PLACES = 3  # largest number of gap locations at which a law is estimated
-_MAX_REFITS = 3  # the torque over time included
+_MAX_REFITS = 3  # largest number of refitted families; includes the torque over time
 _ROUGHNESS_WEIGHTS = tuple(10.0**power for power in range(-3, 5))  # curvature weights; the evidence chooses among them
-_RIDGE_STD_RATIO = 3.0  # std of a value at a knot, apart from its curvature, over the torques there
-_MIN_KNOT_RANGE = 1e-3  # smallest range of knots if hardly any range is visited [unit of the quantity]
-_EVEN_STD_RATIO = 1 / 300  # std of a drive's even part, f(x) + f(-x), over the prior's width: drives are nearly odd
+_RIDGE_STD_RATIO = 3.0  # prior std of the torque at a knot (apart from curvature) over the std of torques there
+_MIN_KNOT_RANGE = 1e-3  # smallest range of knots, for a quantity that hardly changes [unit of the quantity]
+_EVEN_STD_RATIO = 1 / 300  # std of f(x) + f(-x) over the prior's width, for a drive: its law is nearly odd
 _MIN_VISITED_PART = 0.7  # fraction of the knots' range that a fitted law must visit to keep its knots
-_MIN_LEFTOVER_CLOSURE = 0.2  # fraction of the residual gap that a law must close in addition to effects
+_MIN_LEFTOVER_CLOSURE = 0.2  # fraction that a law must close of the gap that accepted effects leave
 
 
 @dataclass(frozen=True)
 class GapLaw:
-    """A torque law for a gap that no effect of the library explains, with the fraction of the gap that it closes."""
+    """A torque law for the gap, or for the part of it that accepted effects leave, with its closure."""
 
     location: str
     tables: tuple[TorqueLawTable, ...]  # one table per quantity
     visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
     closure: GapClosure  # closure of the held-out gap of the model without the law
-    runner_up: tuple[str, str, float] | None  # location, quantities and closure of the next best
-    model: RefittedModel
+    runner_up: tuple[str, str, float] | None  # location, quantities and closure of the second best law
+    model: RefittedModel  # the fitted model with the law
     has_accepted_effects: bool  # whether the model also has accepted effects
 
     @property
@@ -62,7 +62,7 @@ class GapLaw:
     def sentence(self) -> str:
         """A sentence about the law that states its location, quantity and size, and the closed fraction of the gap."""
         if self.depends_on == "time":
-            head = f"{self.location} carries a torque that depends on nothing the model knows better than on time"
+            head = f"{self.location} carries a torque that no quantity of the model predicts better than time does"
         else:
             words = " and its ".join("the time" if t.quantity == "time" else t.quantity for t in self.tables)
             head = f"{self.location} carries a torque that depends on its {words}"
@@ -100,7 +100,7 @@ class GapLaw:
 
 @dataclass(frozen=True)
 class _Family:
-    """A law as a function of some quantities at one location, with the results of a linearised fit."""
+    """A candidate law: a function of some quantities at one location, with the results of a linearised fit."""
 
     law: TorqueLaw  # restricted to the quantities
     log_evidence: float
@@ -111,10 +111,10 @@ class _Family:
 def find_gap_law(
     search: RefitContext, problem: EstimationProblem, last: RefittedModel, places: Sequence[str], events: EventSet
 ) -> GapLaw | None:
-    """Estimate a torque law for the remaining gap, or return None if no law is possible or closes enough of the gap.
+    """Estimate a torque law for the remaining gap. Returns None if no law is possible, or none closes enough of it.
 
-    `problem` is the problem of the nominal model, without candidates. `last` is the model with the accepted effects, or
-    the nominal model. `places` are the locations of the gap, the most likely first.
+    `problem` is that of the nominal model, without candidates. `last` is the fitted model with the accepted effects, or
+    the nominal one. `places` are the locations of the gap, the most likely first.
     """
     places = [p for p in dict.fromkeys(places) if allowed_torque_law_quantity_names(problem.system, p)][:_MAX_PLACES]
     if not places or search.record_skip_if_past_deadline("a law"):
@@ -164,7 +164,7 @@ def find_gap_law(
 class _RefittedLaw:
     law: TorqueLaw
     fit: RefittedModel
-    loss: HeldOutLoss  # without what the prior of the law adds
+    loss: HeldOutLoss  # of `fit`, without the chi2 of the law's prior
 
 
 def _refitted_families(
@@ -175,8 +175,8 @@ def _refitted_families(
     events: EventSet,
     only: Sequence[str] = (),
 ) -> tuple[RefittedModel | None, list[_RefittedLaw]]:
-    """The model without a law, refitted together with the laws in one step, and refits of the best families."""
-    # with the diagnosis' corrections and truncations
+    """Return a refit of the model without a law, and refits with each of the best laws, in one compiled step."""
+    # events are corrected and recordings truncated as in the diagnosis
     held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
@@ -197,7 +197,7 @@ def _refitted_families(
 
 
 def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw], slack: float) -> bool:
-    """Whether a refit's held-out chi2/n is close to the best (the first), with the fewest quantities of such refits."""
+    """Return whether a refit predicts about as well as the best (the first), with the fewest quantities of such."""
 
     def is_as_good(own: _RefittedLaw) -> bool:
         gained, error = held_out_improvement_and_error(own.loss, found[0].loss)
@@ -208,28 +208,28 @@ def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw],
 
 
 def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
-    """Whether a fitted law's knots reach far beyond the values that its model visits."""
+    """Return whether a fitted law's knots reach far beyond the values of the quantity in its model's motion."""
     low, high = _visited_range(found.fit, found.law.location, quantity)
     return high - low < _MIN_VISITED_PART * float(np.ptp((found.law.knots or {})[quantity]))
 
 
 def _neutral_law(model: RefittedModel, place: str, names: Sequence[str], system: System | None = None) -> TorqueLaw:
-    """A neutral law at a location, a sum over quantities, with knots over the visited range."""
+    """Return a law with zero torque at a location: a sum of functions of each quantity, with knots over its range."""
     tables, zeros = [], np.zeros(_N_KNOTS)
     for quantity in names:
         low, high = _visited_range(model, place, quantity)
         if quantity == "command":
             low, high = min(low, -high), max(high, -low)
         room = max(high - low, _MIN_KNOT_RANGE) / (_N_KNOTS - 3)
-        # half a gap of room, so that the ends are estimated and what lies beyond is flat
+        # knots reach half an interval beyond the range, so that its ends are estimated
         tables.append(TorqueLawTable(quantity, np.linspace(low - room / 2, high + room / 2, _N_KNOTS), zeros, zeros))
-    # of the torque of springs or through a joint [N m]
+    # std of the torque of springs or through the joint [N m]
     size = float(np.std(_visited(model, place, "load"))) or 1.0
     return torque_law_from_tables(place, system or model.problem.system, tables, _RIDGE_STD_RATIO * size)
 
 
 def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
-    """Values of a quantity in all estimation recordings, (samples,)."""
+    """Return the values (samples,) of a quantity in all estimation recordings."""
     problem, x, found = model.problem, model.unknowns, []
     for i, (episode, result) in enumerate(zip(problem.episodes, model.evaluation.episode_predictions, strict=True)):
         theta = problem.predictor.theta_with_episode_values(episode, problem.unpack_episode_unknowns(x, i)[0])
@@ -246,7 +246,7 @@ def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[flo
 
 
 def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[TorqueLaw]) -> list[_Family]:
-    """The families to refit, by the evidence of a fit linearised about the model without a law."""
+    """Return the laws to refit, ordered by the evidence of a fit that is linearised about the model without a law."""
     own = composed.with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
     evaluation = own.evaluate(own.unknown_vector(before.values), True, before.evaluation.equilibrium_guesses)
     if not evaluation.ok or evaluation.jacobian is None:
@@ -273,7 +273,7 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
 
 
 def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
-    """Evidence, values and prior of one law, at the curvature weight and noise level with the largest evidence."""
+    """Return evidence, values and prior of one law, at the curvature weight and noise level of largest evidence."""
     n, gram, pull = len(residual), slopes.T @ slopes, slopes.T @ residual
     total = float(residual @ residual)
     best: tuple[float, Array, Array] | None = None
@@ -291,7 +291,7 @@ def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
 
 
 def _prior_precision(law: TorqueLaw, roughness_weight: float) -> Array:
-    """Inverse prior covariance of the values at a law's knots, from their second differences and their size."""
+    """Return the inverse prior covariance of a law's values at its knots, for their curvature and their size."""
     blocks = []
     for quantity in law.quantities:
         count = len(law.knot_parameter_names(quantity))
@@ -308,7 +308,7 @@ def _prior_precision(law: TorqueLaw, roughness_weight: float) -> Array:
 def _refitted(
     composed: AllCandidatesProblem, before: RefittedModel, family: _Family, search: RefitContext
 ) -> RefittedModel | None:
-    """The model with a law, whose values at the knots have a prior."""
+    """Return a refit of the model with a law, whose values at the knots have a prior. None if it fails."""
     known = composed.problem.options.multivariate_prior
     names = (*known.parameter_names, *family.law.parameters.names)
     covariance = scipy.linalg.block_diag(known.covariance, np.linalg.inv(family.precision))

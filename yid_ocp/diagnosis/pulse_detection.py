@@ -5,10 +5,10 @@ background with the covariance
 
     cov f(s), f(t) = e(s) e(t) (delta(s, t) + exp(-|s - t|/a))/2 + s^2 exp(-|s - t|/b),   e^2 = (c m)^2 + w^2 + h^2/3,
 
-where m is the assumed model error for these torques and h the torque that friction can hold. c >= 1, w and s maximise
-the evidence, with and without a pulse, so that a dominant model error causes no events. Pulses are added one by one,
-largest rise of the evidence first. This is the search for shocks by auxiliary residuals (de Jong and Penzer 1998,
-doi:10.1080/01621459.1998.10473717), with pulses in place of impulses.
+where m is the assumed model error, h the torque that friction can hold, and a and b are correlation times. c >= 1, w
+and s are chosen for the largest evidence, with and without a pulse, so that a dominant model error causes no events.
+Pulses are added one by one, largest rise of the evidence first. This is the search for shocks by auxiliary residuals
+(de Jong and Penzer 1998, doi:10.1080/01621459.1998.10473717), with pulses in place of impulses.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _STANDSTILL_SPEED = 0.1  # speed below which friction can stick [rad/s or m/s]
 
 @dataclass(frozen=True)
 class _TorqueTermSizes:
-    """Magnitudes (M, n) of each inverse dynamics term of every coordinate at some nodes of a rollout."""
+    """Magnitudes (M, n) of torques in the inverse dynamics, at M nodes of a rollout and for all n coordinates."""
 
     # root sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal forces,
     # gravity, springs, friction, effects' forces and the applied or required torque [N m or N]
     rss_torque: Array
-    torque_rate: Array  # rate of the required torque [N m/s or N/s]
+    torque_rate: Array  # time derivative of the required torque [N m/s or N/s]
     static_friction_limit: Array  # limit of static friction, zero above `_STANDSTILL_SPEED` [N m or N]
 
 
@@ -58,7 +58,7 @@ class CompiledInverseDynamics:
         return _function(self._step.system, self._step.time_step)
 
     def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
-        """Compute the size of each inverse dynamics term at increasing nodes (M,). Accelerations are differences."""
+        """Return the magnitudes at increasing nodes (M,). Velocities and accelerations are finite differences."""
         system, time_step = self._step.system, self._step.time_step
         n = system.n_coordinates
         q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
@@ -77,7 +77,7 @@ class CompiledInverseDynamics:
 
 
 def _function(system: System, time_step: float) -> ca.Function:
-    """Function of (q, v, a, z, theta): sum of squares of all terms, required torque, torque that friction can hold."""
+    """Return the function (q, v, a, z, theta) -> (sum of squared terms, required torque, limit of static friction)."""
     n, names = system.n_coordinates, tuple(system.effect_internal_coordinate_symbols)
     q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
     kinematics = forward_kinematics(system.mechanism, q)
@@ -111,22 +111,22 @@ def _function(system: System, time_step: float) -> ca.Function:
 _SparseMatrix = Any  # scipy.sparse.csc_array or, of few profiles, ndarray; the former has no types
 
 _MODEL_ERROR_TIME, _SLOW_FORCE_TIME = 0.3, 2.0
-"""Correlation times a of the model error and b of the slow background [s]."""
+"""Correlation times a of the model error and b of the slow background [s] (see the module)."""
 _MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS = (1.0, 2.0, 4.0), (0.0, 0.5, 1.0), (0.25, 1.0)
-"""c, w in units of the robust spread of the history, s in units of its root mean square."""
-_MIN_PULSE_POINTS = 2.5  # points that the shortest pulse covers
+"""Values tried for c, for w / robust spread of the history, and for s / root mean square of the history."""
+_MIN_PULSE_POINTS = 2.5  # duration of the shortest pulse, in time points of the history
 _WINDOW_GROWTH = 1.25  # ratio of successive window lengths
-_FLAT_RAMP_FRACTION = 0.5  # rising and falling fraction of a flat-topped pulse
+_FLAT_RAMP_FRACTION = 0.5  # fraction of a flat-topped pulse's duration in which it rises or falls
 _MAX_PROFILES = 12  # largest number of pulses and similar profiles in one history
 MAX_EVENT_TIME_FRACTION = 1 / 3
-"""Part of the time above which forces in short windows are not events: model error dominates."""
-_MIN_PROMINENCE_RATIO = 1.5  # times the median size anywhere that a pulse must have: more than a sine's maximum has
+"""Fraction of the time above which short forces are not events, because model error dominates."""
+_MIN_PROMINENCE_RATIO = 1.5  # smallest ratio of a pulse's size to the median size at all times; above that of a sine
 _MAX_PULSE_RANGE_RATIO = 1.5  # largest ratio of a pulse to the range of the history around it
 
 
 @dataclass(frozen=True)
 class ForceHistory:
-    """An estimate of an unknown force f over time at one location, given by its log likelihood g'f - f'L f / 2."""
+    """An estimate of an unknown force f over time at one location, as its log likelihood g'f - f'L f / 2."""
 
     recording: str
     location: str
@@ -165,18 +165,18 @@ class ForceHistory:
 
 @dataclass(frozen=True)
 class DetectedForcePulse:
-    """A force pulse that rises and falls within a time window, with peak, shape and p-value."""
+    """A force pulse that begins and ends at zero, with time window, peak, shape and p-value."""
 
     start_time: float  # [s]
     end_time: float
     peak_value: float  # largest signed value, in the history's unit
-    is_flat_topped: bool  # whether it stays at its peak for half of the time; otherwise it is a squared sine
-    peak_std: float  # standard deviation of the peak, background included
-    p_value: float  # probability that chance raises the evidence this far in one window
+    is_flat_topped: bool  # whether the force is at its peak for half of the time; otherwise it is a squared sine
+    peak_std: float  # standard deviation of the peak, including the background
+    p_value: float  # probability that chance raises the evidence as much in one window
 
     @property
     def impulse_per_unit_peak(self) -> float:
-        """The time integral [s] of the pulse if its peak is one."""
+        """The time integral [s] of the pulse divided by its peak."""
         return (self.end_time - self.start_time) * (1 - _FLAT_RAMP_FRACTION / 2 if self.is_flat_topped else 0.5)
 
     @property
@@ -185,21 +185,21 @@ class DetectedForcePulse:
         return self.peak_value * self.impulse_per_unit_peak
 
     def filtered_force_at(self, t: Array, cutoff: float = math.inf) -> Array:
-        """Compute the force of the pulse at the times `t` after a low-pass filter at `cutoff` [Hz]."""
+        """Return the force of the pulse at the times `t` (M,), after a low-pass filter with the cutoff [Hz]."""
         window = _Windows(*map(np.atleast_1d, (self.start_time, self.end_time, self.is_flat_topped)))
         return self.peak_value * _Filter.of(cutoff)(window, t)[:, 0]
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Pulse shapes of peak one: starts, ends, and whether they are flat-topped, (k,) each."""
+    """Pulse shapes with peak one: starts [s], ends [s], and whether they are flat-topped, (k,) each."""
 
     begin: Array
     end: Array
     flat: BoolArray
 
     def at(self, t: Array) -> Array:
-        """Values (M, k) at times (M, 1), or values (k,) at one time for each pulse."""
+        """Return values (M, k) at times (M, 1), or (k,) at one time (k,) for each pulse."""
         part = np.clip((t - self.begin) / (self.end - self.begin), 0.0, 1.0)
         ramp = np.where(self.flat, _FLAT_RAMP_FRACTION / 2, 0.5)
         return np.asarray(np.sin(np.pi / 2 * np.minimum(np.minimum(part, 1 - part) / ramp, 1.0)) ** 2)
@@ -210,7 +210,7 @@ class _Windows:
 
 @dataclass(frozen=True)
 class _Filter:
-    """A zero-phase filter as weights at delays, (L,) each."""
+    """A zero-phase filter, given by L weights at delays [s]."""
 
     delay: Array
     weight: Array
@@ -227,11 +227,11 @@ class _Filter:
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:
-        """Filtered pulse shapes (M, k) at times (M,)."""
+        """Return filtered pulse shapes (M, k) at times (M,)."""
         return self._seen(windows, t[:, None])
 
     def of_many(self, windows: _Windows, t: Array) -> _SparseMatrix:
-        """The same, for windows that are short relative to the history."""
+        """Return filtered pulse shapes (M, k) as a sparse matrix, for windows that are short beside the history."""
         reach = float(self.delay[-1])
         first, last = (np.searchsorted(t, ends) for ends in (windows.begin - reach, windows.end + reach))
         count = last - first
@@ -245,7 +245,7 @@ class _Filter:
 
 @dataclass(frozen=True)
 class _Rest:
-    """The data minus a background of known covariance: Sigma^-1 (M, M), Sigma^-1 y (M,), log evidence."""
+    """Data y whose background has the covariance Sigma: Sigma^-1 (M, M), Sigma^-1 y (M,) and log evidence."""
 
     precision: Array
     scored: Array
@@ -269,7 +269,7 @@ class _Rest:
         return _Rest(history.information - half.T @ half, history.score - half.T @ told, evidence, none)
 
     def beside(self, taken: Array) -> _Rest:
-        """The same, with profiles (M, k) of free size added."""
+        """Return the data beside profiles `taken` (M, k), whose sizes are free."""
         if not taken.shape[1]:
             return self
         seen = self.precision @ taken
@@ -280,19 +280,19 @@ class _Rest:
         return _Rest(self.precision - lost @ lost.T, self.scored - lost @ told, evidence, lost)
 
     def information(self, profiles: _SparseMatrix) -> Array:
-        """u' Sigma^-1 u (k,) of profiles u (M, k)."""
+        """Return u' Sigma^-1 u (k,) for each of the profiles u (M, k)."""
         product = self.precision @ profiles
         if scipy.sparse.issparse(profiles):
             return np.asarray(profiles.multiply(product).sum(axis=0)).ravel()
         return np.asarray(np.sum(profiles * product, axis=0))
 
     def gains(self, profiles: _SparseMatrix, bare: Array | None = None) -> Array:
-        """Rise of the evidence (k,) with each profile (M, k) at its best size; `bare`: result of `information`."""
+        """Return the rise (k,) of the log evidence by each profile (M, k) of best size. `bare`: from `information`."""
         told, sure = self._sizes(profiles, bare)
         return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
 
     def sizes(self, profiles: Array) -> Array:
-        """Best size (k,) of each profile, zero without information in the data."""
+        """Return the best size (k,) of each profile (M, k); zero if the data have no information about it."""
         told, sure = self._sizes(profiles)
         return np.where(sure > 0, told / np.where(sure > 0, sure, 1.0), 0.0)
 
@@ -306,10 +306,10 @@ class _Rest:
 def detect_force_pulses(
     history: ForceHistory, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[list[DetectedForcePulse], float]:
-    """Find force pulses in a force estimate, strongest evidence first. Also returns the number of windows searched.
+    """Return the force pulses in a force estimate, largest evidence first, and the number of windows searched.
 
-    The p-value of a pulse refers to a single window, so it must be corrected for the number of windows. This number
-    counts disjoint windows, of lengths a factor of two apart.
+    The p-value of a pulse refers to a single window, so it must be corrected for the number of windows. Disjoint
+    windows are counted; lengths within a factor of two count as one.
     """
     windows, tries, profiles = _looked_at(history.t.tobytes(), history.filter_cutoff, limits.max_event_duration)
     if not len(windows.begin):
@@ -347,7 +347,7 @@ def detect_force_pulses(
 
 @lru_cache(maxsize=8)
 def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, float, _SparseMatrix]:
-    """Windows to search, the number of disjoint ones, and their profiles; the same for all joints of a recording."""
+    """Return windows to search, the number of disjoint ones, and profiles; cached for all joints of a recording."""
     t = np.frombuffer(times)
     spacing, first, last = float(np.median(np.diff(t))), float(t[0]), float(t[-1])
     lengths = [_MIN_PULSE_POINTS * spacing]
@@ -362,7 +362,7 @@ def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, f
 
 
 def _both_shapes(begin: Array, end: Array) -> _Windows:
-    """Windows with rounded and with flat-topped profiles."""
+    """Return the windows twice, with rounded and with flat-topped profiles."""
     return _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
 
 
@@ -376,7 +376,7 @@ def _rests(history: ForceHistory) -> list[_Rest]:
 
 
 def _refined(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
-    """A window with start, end and shape moved to the largest evidence."""
+    """Return the window with start, end and shape changed for the largest evidence."""
     spacing = history.time_spacing
     first, last, shortest = history.t[0] + spacing, history.t[-1] - spacing, _MIN_PULSE_POINTS * spacing
     gain = float(rest.gains(seen(window, history.t))[0])
@@ -395,7 +395,7 @@ def _refined(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter
 
 
 def _other(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
-    """A step or biphasic profile (M,) that explains as much as the pulse, which is then not accepted."""
+    """Return a step or biphasic profile (M,) that explains as much as the pulse, which is then no event; else None."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, gain = end - begin, float(rest.gains(seen(window, t))[0])
     steps = np.arange(begin - length / 2, end + length / 2, history.time_spacing)
@@ -412,10 +412,10 @@ def _other(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter) 
 def _stands_out(
     history: ForceHistory, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
 ) -> bool:
-    """Whether a pulse is short enough, larger than the rest of the history, and measured."""
+    """Return whether a pulse has an allowed length, fits the measured range, and exceeds the rest of the history."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, own = end - begin, seen(window, t)
-    # a length at either bound is cut off: friction jumps are shorter, model errors longer
+    # a length at a bound is no pulse's: jumps of friction are shorter, model errors longer
     if not 1.02 * _MIN_PULSE_POINTS * history.time_spacing < length < 0.98 * longest:
         return False
     size = abs(float(rest.sizes(own)[0]))
@@ -430,7 +430,7 @@ def _stands_out(
 def _sized(
     history: ForceHistory, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
 ) -> list[DetectedForcePulse]:
-    """The pulses with their sizes, estimated together on the background with the largest evidence."""
+    """Return the pulses with their sizes, which are estimated together on the background of largest evidence."""
     if not found:
         return []
     rest = max(rests, key=lambda one: one.beside(taken).evidence)
