@@ -258,7 +258,7 @@ class AllCandidatesProblem:
     def relinearize_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return `own` (a problem with free `effects`) with filters of held-out recordings linearised for values `at`."""
+        """Return `own` (a problem with free `effects`) with filters of held-out recordings linearised at `at`."""
         if not own.has_process_noise:
             return own
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))
