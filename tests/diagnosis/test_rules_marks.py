@@ -421,7 +421,7 @@ def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path,
         ({"code": "newer"}, "another ensemble"),
         ({"slice": "2/3"}, "another ensemble"),
         ({"slice": "1/2"}, "given twice"),
-        ({"labels_sha256": "0"}, "commitment"),
+        ({"labels_sha256": "0"}, "do not match the hashes"),
     ],
 )
 def test_slices_count_together_only_with_one_hash(tmp_path, changes, words):
