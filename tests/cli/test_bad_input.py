@@ -112,7 +112,7 @@ OTHER = np.array(["shoulder", "elbo"], dtype=h5py.string_dtype())
     [
         (lambda j: setitem(j["effort"], (5, 1), np.nan), ("'effort' of joint 'elbow' is not finite", "t = 0.05 s")),
         (lambda j: setitem(j["t"], 7, j["t"][5]), ("the clock does not advance", "index 6", "strictly increasing")),
-        (lambda j: setitem(j["position"].attrs, "unit", "deg"), ("the unit is 'deg'", "rad", "convert")),
+        (lambda j: setitem(j["position"].attrs, "unit", "deg"), ("the unit of the dataset is 'deg'", "rad", "convert")),
         (lambda j: setitem(j["position"], ..., np.rad2deg(j["position"][...]) + 90), ("degrees", "rad")),
         (lambda j: setitem(j.attrs, "names", OTHER), ("joint 'elbow' of the model is not recorded", "mean 'elbo'?")),
         (lambda j: delitem(j, "effort"), ("no sensor of the model has a measurement",)),

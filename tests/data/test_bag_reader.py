@@ -167,7 +167,7 @@ def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
 
 
 def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
-    refused(write_bag(tmp_path, "mcap", two_arms(effort=False)), "/left has no effort, but others")
+    refused(write_bag(tmp_path, "mcap", two_arms(effort=False)), "/left has no effort, but another source has it")
     (tmp_path / "twice").mkdir()
     one = joint_state(("a",), START, position=[1.0])
     path = write_bag(tmp_path / "twice", "mcap", [("/x", START, one), ("/y", START, one)])
@@ -315,7 +315,7 @@ def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
     assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
     current = "effort of 'a' is a current, but its torque constant is not given"
     refused(path, current, units={"effort": "A"}, torque_constants={"b": 1.0})
-    refused(path, "unit of the efforts is not that of a current", torque_constants={"*": 1.0})
+    refused(path, "unit of the efforts is not a unit of current", torque_constants={"*": 1.0})
 
 
 @pytest.mark.parametrize("stamps", [(0, 0), (START - SECOND // 2, 0)])
@@ -341,7 +341,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
         ("/b/tip", START, point(START + SECOND, (1, 1, 1), "camera")),
     ]
     path = write_bag(tmp_path, "bag", messages)
-    refused(path, "points of the same name")
+    refused(path, "points have the same name")
     recording = read_any(path, point_names={"/a/tip": "tip", "/b/tip": "seen_tip"})
     assert recording.joints is None
     assert [(g.name, g.frame, g.names) for g in recording.points] == [

@@ -45,7 +45,7 @@ def test_markers_of_a_file(tmp_path: Path) -> None:
     assert np.argwhere(np.isnan(points.position).all(axis=2)).tolist() == [[2, 1], [4, 0]]
     assert sorted(recording.notes) == [
         "*3 was left out (it has no label)",
-        "LKneeAngles was left out (computed by a model, no place)",
+        "LKneeAngles was left out (result of a body model)",
         "force was left out (an analog channel)",
         "gone was left out (never seen)",
     ]

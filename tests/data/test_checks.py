@@ -168,7 +168,7 @@ def test_noise_stated_far_above_what_is_there():
     (doubt,) = recording_quality_issues(recording, lambda _: SensorOptions())
     assert (doubt.cause, doubt.weight, doubt.group) == ("noise_overstated", "warning", "joints")
     assert re.fullmatch(r"sensors.joints.effort.std: {a: 0.0[56]\d*, b: 0.05, c: 0.0[56]\d*}", doubt.setting)
-    assert "1 is stated, and so for 2 of 3 channels" in doubt.what
+    assert "the stated std is 1 (also too large for others: 2 of 3 channels in all)" in doubt.what
     # one number for all joints holds for the noisiest
     noisy = column(EFFORT, 0, lambda x: x + 0.5 * np.random.default_rng(3).standard_normal(len(x)))
     assert causes(changed(made(), effort=noisy, effort_std=0.5)) == set()
@@ -246,7 +246,7 @@ def test_equal_counts_of_an_encoder_are_no_second_copy_but_a_copied_stretch_is()
     assert duplicate_data_issue(steady, alike) is None
     for whole in (one, steady):
         part = replace(whole.time_slice(5.0, 8.0), name="part")
-        assert "samples of part are those of run_1 to the last digit" in duplicate_data_issue(whole, part).what
+        assert "samples of part equal samples of run_1 to the last digit" in duplicate_data_issue(whole, part).what
 
 
 def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
@@ -264,7 +264,7 @@ def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_i
     assert [p.name for p in parts.recordings] == ["made_part1", "made_part2"]
     (doubt,) = parts.issues
     assert (doubt.cause, doubt.weight, doubt.begin, doubt.end) == ("gap", "warning", 2.99, 5.01)
-    assert "2 parts of it, 5.98 s, are used" in doubt.what
+    assert "2 parts of the data, 5.98 s, are used" in doubt.what
 
 
 def test_where_a_model_starts_from_rest_only_parts_that_do_are_kept():

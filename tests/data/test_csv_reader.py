@@ -117,7 +117,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
     "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:JOINT"),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
-    "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' holds 'fast'", ""),
+    "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' has the cell 'fast'", ""),
     "joint missing in a channel": (
         "t,q_a,q_b,effort_a\n0,1,1,1\n",
         {},
@@ -226,7 +226,7 @@ def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
     assert caught.value.where.endswith("line 3")
     recording = read_any(path, skip_bad_lines=True)
     assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
-    assert recording.notes == ("3 of 8 lines were bad and left out (line 3, 5, 6)",)
+    assert recording.notes == ("3 of 8 lines were left out: not rows of numbers (line 3, 5, 6)",)
     mostly = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,slow\n")
     with pytest.raises(DataError, match="2 of 3 lines are not rows of 2 numbers"):
         read_any(mostly, skip_bad_lines=True)
@@ -253,7 +253,7 @@ def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
     contents = preview_file(path)
     assert contents.reader_options["units"] == {"position": "deg", "points": "mm", "t": "ms"}
     assert contents.reader_options["skip_bad_lines"] is True
-    assert contents.notes[0] == "1 of 9 lines are no rows of numbers"
+    assert contents.notes[0] == "1 of 9 lines are not rows of numbers"
     joints = joints_of(read_any(path, **contents.reader_options))
     assert joints.t[1] == pytest.approx(0.01)
     assert joints.position[0, 0] == pytest.approx(math.pi / 2)
@@ -366,7 +366,7 @@ def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are
     )
     for broken in (without_rate, text.splitlines()[0] + "\n"):
         (tmp_path / name).write_text(broken)
-        with pytest.raises(DataError, match="the motion capture export is not as the program writes it"):
+        with pytest.raises(DataError, match="does not have the structure that the program writes"):
             read_any(tmp_path / name)
 
 

@@ -302,7 +302,7 @@ UNREADABLE: dict[str, tuple[Callable[[h5py.File, Path], object], str]] = {
     "external link": (lambda f, o: f.__setitem__("a/more", h5py.ExternalLink(o.name, "secret")), OTHER_FILE),
     "external values": (lambda f, o: f.create_dataset("a/more", (1,), "f8", external=[(str(o), 0, 8)]), OTHER_FILE),
     "virtual values": (virtual_values, OTHER_FILE),
-    "groups without end": (lambda f, o: f.__setitem__("a/self", f["a"]), "nested more than 10 deep"),
+    "groups without end": (lambda f, o: f.__setitem__("a/self", f["a"]), "nested more than 10 levels deep"),
     # numbers of one byte each; as float64 with copies they are 27 GB
     "a bomb": (lambda f, o: f.create_dataset("b", (120_000_000, 7), "i1", **PACKED), "declares 840 million numbers"),
     "not there": (lambda f, o: f.create_dataset("b", (10**9,), "f8", chunks=(1000,)), "declares 1000 million numbers"),

@@ -189,11 +189,11 @@ def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without
     assert np.all(joints.values_by_channel["effort"] == 3.0)
     for fields, what in (
         ({"position": "/arm.state.p"}, "no field 'state.p'"),
-        ({"position": "/arm.state.label"}, "holds no numbers"),
+        ({"position": "/arm.state.label"}, "is not numeric"),
         ({"position": "/hand.q"}, "no messages on the topic '/hand'"),
-        ({"position": "/arm"}, "has no name"),
-        ({"effort": "/arm.state.torque"}, "no field is the position"),
-        ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "not a channel of joints"),
+        ({"position": "/arm"}, "names no field"),
+        ({"effort": "/arm.state.torque"}, "the channel position has no field"),
+        ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "not a joint channel"),
     ):
         with pytest.raises(DataError, match=what):
             read_any(path, message_fields=fields)

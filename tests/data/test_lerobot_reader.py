@@ -133,7 +133,7 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
     [
         ({}, {"episode": 2}, "there is no episode 2"),
         ({}, {"episode": -1}, "there is no episode -1"),
-        ({"total_episodes": 9}, {"episode": 5}, "no table has this episode"),
+        ({"total_episodes": 9}, {"episode": 5}, "no file has this episode"),
         ({"codebase_version": "v1.6"}, {}, "has the version v1.6"),
         ({"fps": 0}, {}, "fps = 0 is not allowed"),
         ({"fps": "fast"}, {}, 'fps = "fast" is not allowed'),
@@ -197,7 +197,7 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
     table = parquet.read_table(path / FIRST).to_pydict()
     text = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * len(table[name])), ["x" * 1_000_000])
     parquet.write_table(pyarrow.table({**table, name: text}), path / FIRST, store_schema=False)
-    with pytest.raises(DataError, match=f"the column {name} holds string instead of numbers"):
+    with pytest.raises(DataError, match=f"the column {name} contains string instead of numbers"):
         read_lerobot_episode(path)
 
 

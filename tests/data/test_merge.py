@@ -43,7 +43,7 @@ def test_a_shared_clock_is_left_as_it_is_and_said() -> None:
     assert merged.joints is not None
     assert np.array_equal(merged.joints.t, T)
     assert np.array_equal(merged.points[0].t, FRAMES)
-    assert merged.notes == ("robot and camera are taken as on one clock: they have 18.99 s in common",)
+    assert merged.notes == ("robot and camera are assumed to have one clock: their times overlap by 18.99 s",)
 
 
 @pytest.mark.parametrize("late", [0.08, 1.5])

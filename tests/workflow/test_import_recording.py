@@ -75,14 +75,14 @@ def test_what_the_preview_proposes_imports_the_file(odd: Path, capsys: pytest.Ca
     # a recording of our own is shown, too
     assert main(["import", "plain.h5", "--preview"]) == 0
     told = capsys.readouterr().out
-    assert "note: a recording already" in told
+    assert "note: the file is already a recording" in told
     assert "to import it" not in told
 
 
 def test_left_out_lines_are_told(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (odd / "bad.csv").write_text("t,q_a\n0,0\n1,x\n2,0\n")
     assert main(["import", "bad.csv", "--out", "bad.h5", "--skip-bad-lines"]) == 0
-    assert "note: 1 of 3 lines were bad and left out (line 3)" in capsys.readouterr().out
+    assert "note: 1 of 3 lines were left out: not rows of numbers (line 3)" in capsys.readouterr().out
 
 
 GOOD = "t,q_a,tip_x,tip_y,tip_z\n0,0.1,1,1,1\n1,0.2,1,1,1\n"
@@ -100,7 +100,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "a joint that is not there": ("run.csv", GOOD, "--joints b", "no joint 'b'"),
     "text in place of a pair": ("run.csv", GOOD, "--points tip=", "'tip=' is not NAME=VALUE"),
     "text in place of a number": ("run.csv", GOOD, "--gear-ratios a=fast", "'fast' is not a number"),
-    "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "not that of a"),
+    "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "unit of current"),
     "an option of another format": ("run.csv", GOOD, "--joint-topic /j", "no option 'joint_topics'"),
     "a long delimiter": ("run.csv", GOOD, "--delimiter ::", "the delimiter is '::'"),
     "a section that is none": ("run.csv", GOOD, "--config wrong.yaml", "there is no key 'colums'"),

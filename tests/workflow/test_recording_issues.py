@@ -83,7 +83,7 @@ def test_strict_stops_a_run_in_doubt(cli, damaged, tmp_path, left_nothing, comma
     file = damaged(noisy)
     done = cli(command, file, "--strict", "--out", tmp_path / "run")
     assert done.code == 2
-    assert "error: more noise than stated: effort.shoulder has noise of" in done.err
+    assert "error: more noise than stated: the noise of effort.shoulder" in done.err
     assert "damaged/joints/effort.shoulder" in done.err
     left_nothing(file)
 

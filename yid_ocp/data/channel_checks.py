@@ -25,7 +25,7 @@ _MAX_SAMPLE_PERIOD = 0.02  # longest period at which arm motion counts as slow [
 
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
-    """Group, channel, times and values (N,) or (N, 3) of the measured channels of some quantities."""
+    """Yield group, channel, times [s] and values (N,) or (N, 3) of each measured channel of the `wanted` quantities."""
     joints = recording.joints
     if joints is not None:
         for quantity, values in joints.values_by_channel.items():
@@ -38,7 +38,7 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
 
 
 def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
-    """Find channels stuck at one value although they are noisy elsewhere or their velocity is not zero."""
+    """Find channels that repeat one value although they vary elsewhere or the recorded velocity is not zero."""
     joints = recording.joints
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) <= QUALITY_LIMITS.min_stuck_samples:
@@ -78,13 +78,13 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         if evidence >= 1:
             start, stop = float(t[begin]), float(t[end])
             what = f"{channel} repeats one value for {stop - start:.3g} s"
-            what += f", while its velocity turns it by {turned:.2g} rad" if turned > unseen else ""
+            what += f", while by its velocity it turns by {turned:.2g} rad" if turned > unseen else ""
             advice = "exclude this part or this channel, and check the sensor"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
 def _comes_to_rest(values: Array, begin: int, end: int) -> bool:
-    """Whether a channel approaches a value and leaves it slowly, like the rounded angle of a joint at rest."""
+    """Whether a channel slowly approaches and leaves the value that it repeats, like the angle of a joint at rest."""
     moves = np.abs(np.diff(values, axis=0))
     moves = moves[moves > 0]
     if values.ndim > 1 or not len(moves):
@@ -95,7 +95,7 @@ def _comes_to_rest(values: Array, begin: int, end: int) -> bool:
 
 
 def white_noise_std(t: Array, values: Array) -> float:
-    """Robust standard deviation of white noise; zero if times `t` are uneven or most values repeat."""
+    """Estimate the standard deviation of white noise. Zero for few samples, uneven times `t` or mostly equal values."""
     if len(t) < NOISE_ESTIMATE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
@@ -107,12 +107,12 @@ def white_noise_std(t: Array, values: Array) -> float:
 
 
 def seen_noise_std(t: Array, values: Array) -> float:
-    """Standard deviation of the noise that a channel's samples show: white or from quantization, the larger one."""
+    """Estimate the noise standard deviation of a channel: the larger one of white noise and quantization noise."""
     return max(white_noise_std(t, values), quantization_step(values) / math.sqrt(12))
 
 
 def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, channel: str) -> float:
-    """Standard deviation of a channel from settings or recording, or zero if neither states it."""
+    """Noise standard deviation of a channel as the settings or else the recording state it; zero if neither does."""
     joints = recording.joints
     quantity, _, name = channel.partition(".")
     if group == "joints" and joints is not None:
@@ -136,7 +136,7 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
 
 
 def excess_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
-    """Find channels whose quantization or noise exceeds the stated noise. Channels below 20 Hz are skipped."""
+    """Find channels whose quantization or noise far exceeds the stated noise. Rates below 20 Hz are not checked."""
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) < 100 or median_sample_period(t) > 0.05:
             continue
@@ -149,10 +149,10 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsLookup) -> I
         few = step > wide / 16 and wide > least
         setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
         if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
-            what = f"{channel} moves in steps of {step:.3g}, which is noise of {size:.2g}"
-            what += f"; {stated:.2g} is stated" if stated else ""
+            what = f"{channel} is quantised in steps of {step:.3g}, which give noise with the std {size:.2g}"
+            what += f"; the stated std is {stated:.2g}" if stated else ""
             ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
-            advice, line = "state the noise of the steps, or record with more digits", f"{setting}: {size:.2g}"
+            advice, line = "state the std of the steps, or record with more digits", f"{setting}: {size:.2g}"
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
@@ -160,19 +160,19 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsLookup) -> I
             # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            what = f"{channel} has noise of {seen:.2g} from sample to sample; {stated:.2g} is stated"
+            what = f"the noise of {channel} between samples has the std {seen:.2g}; the stated std is {stated:.2g}"
             ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
-            advice = "state the noise that is there"
+            advice = "state the std of the actual noise"
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
 def recording_overstated_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
     """Find channels whose noise is far below the noise that the recording states.
 
-    Channels of equal stated noise are judged together. Noise stated in the settings (`options`) is not checked, because
-    it may represent model error. The noise is estimated from all samples, every second sample, and so on up to a period
-    of `_MAX_SAMPLE_PERIOD`, because it need not be white; the largest estimate counts, but at least the quantisation
-    noise. Computed channels without noise, such as commands, are skipped.
+    Channels of a sensor with equal stated noise are judged together. Noise stated in the settings (`options`) is not
+    checked, because it may represent model error. Noise need not be white, so it is estimated from all samples, from
+    every second, every fourth and so on, up to a period of `_MAX_SAMPLE_PERIOD`. The largest estimate counts, but at
+    least the quantization noise. Computed channels without noise, such as commands, are skipped.
     """
     found: dict[str, list[tuple[str, float, float]]] = {}
     commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
@@ -202,17 +202,17 @@ def recording_overstated_noise_issues(recording: Recording, options: SensorOptio
         line = f"{{{', '.join(f'{name}: {size:.2g}' for name, size in own.items())}}}"
         if len(set(own.values())) == 1 or not sensor.startswith("joints."):  # a group of points takes one number
             line = f"{max(own.values()):.2g}"
-        what = f"{channel} has noise of {seen_of[channel]:.2g} or less; {stated:.2g} is stated"
-        what += f", and so for {len(low)} of {len(entries)} channels" if len(low) > 1 else ""
+        what = f"the noise of {channel} has the std {seen_of[channel]:.2g} or less; the stated std is {stated:.2g}"
+        what += f" (also too large for others: {len(low)} of {len(entries)} channels in all)" if len(low) > 1 else ""
         ratio = stated / most[channel]
-        advice = "state the actual noise: as stated every ± is too wide, and a small gap is not detected"
+        advice = "state the std of the actual noise: a larger one makes every ± too wide and hides small gaps"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
         yield Issue("noise_overstated", what, "warning", ratio, advice, "", group, channel, setting=setting)
 
 
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
-    """Find joints with saturated effort, which repeatedly equals its extreme value exactly."""
+    """Find joints with saturated effort: the effort repeatedly equals its largest or smallest value exactly."""
     if recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command":
         return  # commands end at the controller's own limit
     for group, channel, t, values in _channels(recording, "effort"):
@@ -227,18 +227,18 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             if alone and again and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
-                advice = "exclude the saturated samples, or record within the sensor's range; if it is what a "
-                advice += "controller commanded, set sensors.joints.effort.kind: command"
+                advice = "exclude the saturated samples, or record within the sensor's range; if the efforts are "
+                advice += "commands of a controller, set sensors.joints.effort.effort_sampling_kind: command"
                 yield Issue("saturated", what, "not_trusted", at.sum() / least, advice, "", group, channel, begin, end)
 
 
 def typical_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
-    """Typical distance [m] between the two points of each of `edges`: mean over frames, then median over recordings.
+    """Return the typical distance [m] between the two points of each pair in `edges`.
 
-    If `frames` is given, only the first `frames` frames of each recording count. Raises `DataError` without a
-    recording, or if an edge is never seen.
+    It is the mean over the first `frames` frames of a recording (None: all frames), then the median over the
+    recordings. Raises `DataError` if a point is not recorded, or if no frame shows both points of a pair.
     """
     result: dict[tuple[str, str], float] = {}
     for edge in edges:
@@ -249,7 +249,7 @@ def typical_point_pair_distances(
             if np.any(np.isfinite(length)):
                 seen.append(float(np.nanmean(length)))
         if not seen:
-            what = f"no frame shows both points of the edge {edge[0]} to {edge[1]}"
+            what = f"no frame shows both points of the edge {edge[0]} to {edge[1]}, so its length is unknown"
             where = ", ".join(f"recording '{r.name}'" for r in recordings)
             hint = "add a recording in which both points are visible"
             raise DataError(what, where=where, allowed="at least one frame with both points", hint=hint)
@@ -301,7 +301,7 @@ QUALITY_LIMITS = _QualityLimits()
 
 @dataclass(frozen=True)
 class Issue:
-    """One data quality issue of a recording: cause, severity, evidence and advice."""
+    """One suspected error of a recording, with its cause, severity, evidence and remedy."""
 
     cause: str  # key of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # sentence on the cause, with numbers
@@ -327,7 +327,7 @@ class Issue:
 
     @property
     def certainty_word(self) -> str:
-        """Certainty of the issue: `perhaps`, `likely` or `certain`."""
+        """Certainty of the issue by `limit_violation_ratio`: `perhaps`, `likely` (from 1.5) or `certain` (from 3)."""
         ratio = self.limit_violation_ratio
         return "perhaps" if ratio < 1.5 else "likely" if ratio < 3 else "certain"
 

@@ -49,8 +49,8 @@ class _RecordingParts(NamedTuple):
 def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
     """Split a recording at gaps of its joint samples or, without joints, of the samples of the `driving` points.
 
-    The first part is kept, and each later part that starts at standstill. If `anywhere` is True, parts that start in
-    motion are kept too, because the problem can estimate their initial state. Very short parts are dropped.
+    The first part is kept, and each later part at whose start the joints stand still. If `anywhere` is True, parts that
+    start in motion are kept too, because the problem can estimate their initial state. Very short parts are dropped.
     """
     t = _times(recording, driving)
     steps = np.diff(t)
@@ -67,14 +67,14 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
     left = sum(part.duration for part in kept)
     parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
     named = tuple(replace(one, name=f"{recording.name}{part}") for one, part in zip(kept, parts, strict=False))
-    said = f"{count_with_noun(len(kept), 'part')} of it, {left:.3g} s, {'is' if len(kept) == 1 else 'are'} used"
+    said = f"{count_with_noun(len(kept), 'part')} of the data, {left:.3g} s, {'is' if len(kept) == 1 else 'are'} used"
     if not anywhere and len(kept) < len(edges):
         said += "; a part counts only where it starts at rest"
     return _RecordingParts(named, tuple(_doubt(recording, t, int(gap), allowed, said) for gap in gaps))
 
 
 def _times(recording: Recording, driving: Sequence[str]) -> Array:
-    """Times at which all inputs of the model were measured."""
+    """Times of the model's inputs: of joint samples or, without joints, of frames that show all `driving` points."""
     if recording.joints is not None:
         return recording.joints.t
     for group in recording.points:
@@ -101,19 +101,19 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         fastest = float(np.max(speed))
         at_once = np.max(way) < _MAX_CLOCK_JUMP_PERIODS * median_sample_period(t) * fastest
         jumped = fastest * length > _MIN_JUMP_ROTATION and bool(at_once)
-    what = f"nothing was recorded of what drives the model for {length:.3g} s"
+    what = f"the data that drive the model have a gap of {length:.3g} s"
     if jumped:
         what = f"the clock jumps by {length - median_sample_period(t):.3g} s while the joints continue smoothly"
     cause, group = "clock_jump" if jumped else "gap", "joints" if joints is not None else ""
-    advice = "find the cause of the loss, or list the wanted part as a separate recording"
+    advice = "find out why samples are missing, or list the wanted part as a separate recording"
     what, begin, end = f"{what}; {said}", float(t[gap]), float(t[gap + 1])
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
 def recording_quality_issues(recording: Recording, options: SensorOptionsLookup) -> list[Issue]:
-    """Find data quality issues of one recording by all checks that need no model.
+    """Return the issues of one recording that all checks without a model find.
 
-    `options` returns the sensor options of a group, such as its stated noise.
+    `options` returns the sensor options for a settings key, such as `joints.effort`.
     """
     recording = recording.with_effort_sampling_kind(options("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
@@ -139,7 +139,7 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         what, advice = f"{group.name}/t has a sample every {step:.4g} s", "write times in seconds"
         for unit, size in _CLOCK_UNITS.items():
             if 2e-4 <= step * size <= 2 * slowest:
-                what += f": in {unit} it would be {1 / (step * size):.4g} Hz"
+                what += f"; if the times are {unit}, the rate is {1 / (step * size):.4g} Hz"
                 advice += f" (divide by {1 / size:.0e})"
                 break
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
@@ -163,7 +163,7 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
         if end < first or begin > last:
             far = min(abs(begin - last), abs(first - end))
             epoch = (abs(begin) > _MIN_UNIX_TIME) != (abs(first) > _MIN_UNIX_TIME)
-            since = "one of them counts from 1970: " if epoch else ""
+            since = "one of two clocks counts from 1970: " if epoch else ""
             spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
             ratio = LIMIT_VIOLATION_RATIO_CAP if epoch else 1 + far / max(last - first, 1e-9)
             what, advice = f"{since}joints were recorded {spans}", "write the times of all groups on one clock"
@@ -173,13 +173,13 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
         late, over = begin - first, end - last
         shift = min(late, over) if late > 0 else max(late, over)
         if late * over > 0 and abs(shift) > slack:
-            what = f"{group.name} begins {late:+.3g} s from the joints and ends {over:+.3g} s from them"
-            advice = "shift its times to the joints' clock"
+            what = f"begin and end of {group.name} minus those of the joints are {late:+.3g} s and {over:+.3g} s"
+            advice = f"shift the times of {group.name} to the joints' clock"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
 
 
 def _dropped(recording: Recording) -> Iterator[Issue]:
-    """Samples missing from an otherwise even clock of the model's inputs."""
+    """Find a joint recording with an even clock from which many samples are missing."""
     joints = recording.joints
     if joints is None or len(joints.t) < 20:
         return
@@ -192,14 +192,14 @@ def _dropped(recording: Recording) -> Iterator[Issue]:
     small = count[count < 50]  # longer ones are gaps
     missing = float(np.sum(small - 1) / np.sum(small))
     if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
-        what = f"{100 * missing:.2g} % of the samples of a clock of {1 / base:.4g} Hz are missing"
+        what = f"{100 * missing:.2g} % of the joint samples at a rate of {1 / base:.4g} Hz are missing"
         advice = "find the cause; torques are interpolated between the remaining samples"
         ratio = missing / QUALITY_LIMITS.max_missing_fraction
         yield Issue("dropped_samples", what, "warning", ratio, advice, "", "joints", "t")
 
 
 def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array]:
-    """Rates of change from values and from recorded rates, averaged over windows that suppress noise."""
+    """Mean rates of change in overlapping windows of about 0.2 s: from `values`, and from the recorded `rates`."""
     width = max(3, round(0.2 / max(median_sample_period(t), 1e-9)))
     starts = np.arange(0, max(len(t) - width, 1), max(1, width // 2))
     ends = np.minimum(starts + width, len(t) - 1)
@@ -231,12 +231,12 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     alike = bool(len(wrong) == len(known) and np.all(np.abs(ratio[known] / typical - 1) < 0.2))
     if alike and typical > 0 and len(known) >= min(2, len(names)):
         cause, channel = "time_scale", "t"
-        advice = f"multiply times by {typical:.3g}, or find what is wrong with velocities"
+        advice = f"multiply the times by {typical:.3g}, or correct the velocities"
         if abs(typical / math.degrees(1.0) - 1) < 0.1:
             cause, channel, advice = "degrees", "position", "convert angles to radians"
         elif abs(typical * math.degrees(1.0) - 1) < 0.1:
             cause, channel, advice = "degrees", "velocity", "convert velocities to radians per second"
-        what = f"all angles turn {typical:.3g} times as fast as the recorded velocities say"
+        what = f"all angles change {typical:.3g} times as fast as the recorded velocities state"
         ratio_beyond = max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio
         yield Issue(cause, what, "not_trusted", ratio_beyond, advice, "", "joints", channel)
         return
@@ -245,19 +245,19 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
         evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
         if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
             cause, evidence = "angle_sign", LIMIT_VIOLATION_RATIO_CAP
-        what = f"the angle of {names[j]} turns {ratio[j]:.3g} times as fast as its recorded velocity says"
+        what = f"the angle of {names[j]} changes {ratio[j]:.3g} times as fast as its recorded velocity states"
         advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}"
         yield Issue(cause, what, "not_trusted", evidence, advice, "", "joints", f"position.{names[j]}")
 
 
 def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Issue]:
-    """Pairs of joints whose angles change as the velocity of the other joint indicates."""
+    """Find pairs of exchanged joints: the angle of each joint changes like the recorded velocity of the other one."""
     off = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5]
     for i, j in combinations(off, 2):
         across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
         if min(across) > 0.9:
-            what = f"the angle of {names[i]} turns as the velocity of {names[j]} says, and the other way round"
-            evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two columns"
+            what = f"the angle of {names[i]} changes like the velocity of {names[j]}, and the reverse holds, too"
+            evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two joints' angles"
             yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", f"position.{names[i]}")
 
 
@@ -280,7 +280,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
 
 
 def _transitions(one: JointGroup | PointGroup, other: JointGroup | PointGroup) -> tuple[IntArray, IntArray]:
-    """Numbers for the changes between samples of two groups; equal numbers mean equal change after equal time."""
+    """Number the changes between the samples of two groups. Equal changes after equal times get equal numbers."""
     changes = []
     for group in (one, other):
         rows = np.nan_to_num(group.position.reshape(len(group.t), -1))
@@ -312,7 +312,7 @@ def _longest_shared_run(one: IntArray, other: IntArray) -> int:
 
 
 def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
-    """Logarithm of the expected number of shared runs of unrelated recordings, from repetitions within each."""
+    """Logarithm of the number of equal runs of `length` expected by chance, from the repetitions within each series."""
     again = again_twice = pairs = 0.0
     for values in (one, other):
         follow = np.unique(np.column_stack([values[:-1], values[1:]]), axis=0, return_counts=True)[1]
@@ -325,7 +325,7 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
 
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
-    """Return an issue of the recording `other` if it shares samples with the recording `one`, else None."""
+    """Return an issue of the recording `other` if many of its samples also occur in the recording `one`, else None."""
     others = {group.name: group for group in other.joint_and_point_groups}
     count = 0
     for group in one.joint_and_point_groups if one.joints is None else (one.joints,):
@@ -337,5 +337,5 @@ def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     few = min(len(group.t) for recording in (one, other) for group in recording.joint_and_point_groups[:1])
     if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None
-    what = f"{count} samples of {other.name} are those of {one.name} to the last digit"
+    what = f"{count} samples of {other.name} equal samples of {one.name} to the last digit"
     return Issue("same_data", what, "warning", LIMIT_VIOLATION_RATIO_CAP, "list every measurement once", other.name)

@@ -28,7 +28,7 @@ _CHANNEL_WORDS: Mapping[str, str] = {
     "velocity_command": "dq_cmd dq_des dq_d qd_d vel_cmd cmd_vel velocity_command target_qd desired_velocity",
     "torque_enable": "torque_enable",
 }
-"""Column names of loggers: Franka's, UR's, Isaac Sim's, LeRobot's, of ROS and of PlotJuggler."""
+"""Words for each joint channel in column names of Franka, UR, Isaac Sim, LeRobot, ROS and PlotJuggler."""
 _CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
 _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
@@ -49,7 +49,7 @@ _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_BY_WOR
 def column_meanings(
     header: Sequence[str], sensor_components: Sequence[str]
 ) -> tuple[list[ColumnMeaning], list[tuple[str, str]]]:
-    """Find the meaning of every column of `header` from its name (None if unclear), and quantities with their units.
+    """Return the meaning of each column of `header` (None if unclear), and the (quantity, unit) pairs that names state.
 
     `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
     """
@@ -124,7 +124,7 @@ _MocapTable = tuple[PointGroup, str, tuple[str, ...]]
 
 
 def select_mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
-    """Choose a reader of a motion capture export by the table's first row. Returns None for other tables."""
+    """Return the reader of a motion capture export, chosen by the table's first row. Returns None for other tables."""
     first = first_row[0].strip() if first_row else ""
     if first == "Format Version":
         return _read_motive
@@ -134,7 +134,7 @@ def select_mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str]
 
 
 def _read_motive(rows: _Rows, where: str) -> _MocapTable:
-    """Read positions of rigid bodies and markers. Rotations and fit errors are omitted."""
+    """Read positions of rigid bodies and markers from an export of Motive. Rotations and fit errors are omitted."""
     head: list[list[str]] = []
     body: list[list[str]] = []
     for _, cells in rows:
@@ -151,9 +151,9 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
             columns.setdefault(names[i], range(i, i + 3))
     table = _numbers(body, len(axes), where)
     unit = _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
-    notes = ["Motive's y axis is up unless the export said otherwise: `pose` or model.frames turn it to the robot's z"]
+    notes = ["Motive's y axis is up unless the export states otherwise: export with z up, as positions are not rotated"]
     if len({names[i] for i in range(2, min(len(names), len(axes)))} - {""}) > len(columns):
-        notes.append("what has no position was left out")
+        notes.append("rigid bodies and markers without a position were left out")
     return _made(table[:, 1], columns, table, unit, "OptiTrack", notes, where)
 
 
@@ -177,7 +177,7 @@ def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
 
 
 def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
-    """Read markers. Three zeros mean that a marker was not seen."""
+    """Read markers from an export of QTM (Qualisys). Three zeros mean that a marker was not seen."""
     said: dict[str, list[str]] = {}
     body: list[list[str]] = []
     head: list[str] = []
@@ -219,7 +219,7 @@ def _made(
 
 
 def _numbers(rows: Sequence[Sequence[str]], n_columns: int, where: str) -> Array:
-    """Numbers of rows, NaN for an empty or missing cell."""
+    """Table (rows, `n_columns`) of the numbers in the cells; NaN for an empty or missing cell."""
     table = np.full((len(rows), n_columns), math.nan)
     for i, row in enumerate(rows):
         for j, cell in enumerate(row[:n_columns]):
@@ -239,7 +239,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _broken(where: str, allowed: str) -> DataError:
-    what = "the motion capture export is not as the program writes it"
+    what = "the motion capture export does not have the structure that the program writes"
     return DataError(what, where=where, allowed=allowed, hint="export it again, with its header, and do not edit it")
 
 
@@ -255,7 +255,7 @@ OTHER_JOINT_MESSAGE_TYPES = (
 
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ESTIMATED_WRENCH_RECORDING_GROUP = "wrist_estimated"
-"""Group of a recording with the wrench that a driver estimates from joint torques, at the frame where it acts."""
+"""Recording group of the external wrench that a driver estimates from joint torques, in the frame that it states."""
 
 
 def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
@@ -286,7 +286,7 @@ def joint_values_from_message_fields(content: Any, paths: Mapping[str, str], whe
     found: dict[str, Any] = {}
     for channel, path in paths.items():
         if channel not in JOINT_CHANNEL_UNITS:
-            what = f"'{channel}' is not a channel of joints"
+            what = f"'{channel}' is not a joint channel"
             raise DataError(what, where=where, **unknown_name_error_arguments(channel, JOINT_CHANNEL_UNITS))
         value = content
         for part in path.split("."):
@@ -299,12 +299,12 @@ def joint_values_from_message_fields(content: Any, paths: Mapping[str, str], whe
             found[channel] = np.asarray(value, float).ravel()
         except (TypeError, ValueError) as error:
             allowed, hint = "an array of numbers, one for each joint", "choose another field with --field"
-            raise DataError(f"the field '{path}' holds no numbers", where=where, allowed=allowed, hint=hint) from error
+            raise DataError(f"the field '{path}' is not numeric", where=where, allowed=allowed, hint=hint) from error
     return _values([str(i + 1) for i in range(max((len(values) for values in found.values()), default=0))], found)
 
 
 def _franka_state(content: Any) -> SimpleNamespace:
-    """Joint values of the ROS 1 driver, whose messages do not name joints."""
+    """Joint values of a message of Franka's ROS 1 driver, which does not name the joints."""
     torque = content.tau_J if hasattr(content, "tau_J") else content.tau_j
     own = {"position": content.q, "velocity": content.dq, "effort": torque, "position_command": content.q_d}
     own["external_effort"] = content.tau_ext_hat_filtered
@@ -315,7 +315,7 @@ def _franka_state(content: Any) -> SimpleNamespace:
 
 
 def _franka_robot_state(content: Any) -> SimpleNamespace:
-    """Joint values of the ROS 2 driver."""
+    """Joint values of a message of Franka's ROS 2 driver."""
     measured, external = content.measured_joint_state, content.tau_ext_hat_filtered
     own = {"position": measured.position, "velocity": measured.velocity, "effort": measured.effort}
     own["external_effort"] = getattr(external, "effort", external)
@@ -329,7 +329,7 @@ def _franka_robot_state(content: Any) -> SimpleNamespace:
 
 
 def _dynamic_joint_state(content: Any) -> SimpleNamespace:
-    """Joint values of the ros2_control broadcaster: named interfaces of joints that have a position."""
+    """Values of the joints with a position in a message of ros2_control, and the channels that all of them have."""
     by_joint = {
         str(name): dict(zip(map(str, entry.interface_names), map(float, entry.values), strict=True))
         for name, entry in zip(content.joint_names, content.interface_values, strict=True)

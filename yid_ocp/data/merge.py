@@ -35,10 +35,10 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
 
     Recordings whose time ranges overlap are assumed to share one clock and are not shifted; a note reports a remaining
     lag between points and joints. Recordings without overlap are aligned by the motion: the lag is chosen for which the
-    joint angles explain the points best, and `clock_offset_std` says how well. Joints of several recordings are
-    interpolated to the fastest clock. Points and other sensors keep their clocks. `clock_offsets` [s] are added to the
-    times of the recordings that they name, which are then not aligned. Raises `DataError` if two recordings have a
-    joint in common, if clocks cannot be aligned, or if an offset names no recording. Notes report all of this.
+    joint angles explain the points best. The points get its uncertainty as `clock_offset_std`. Joints of several
+    recordings are interpolated to the fastest clock. Points and other sensors keep their clocks. `clock_offsets` [s]
+    are added to the times of the recordings that they name, which are then not aligned. The result's `notes` list these
+    changes. Raises `DataError` for a joint in two recordings, a failed alignment, or an offset that names no recording.
     """
     offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
     where = ", ".join(names)
@@ -51,7 +51,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     shifted, notes = list[Recording](), list[str]()
     for recording in recordings:
         if recording.name in offsets:
-            shift, said = offsets[recording.name], "as asked"
+            shift, said = offsets[recording.name], "as specified"
         else:
             shift, said = (0.0, "") if recording is lead else _shift(first, recording)
             if shift:
@@ -63,7 +63,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     begin = min(float(group.t[0]) for recording in shifted for group in recording.all_groups)
     if abs(begin) > _LARGEST_START:
         shifted = [_with_times_shifted(recording, -begin) for recording in shifted]
-        notes.append(f"times count from the first sample, at {begin:.9g} s")
+        notes.append(f"times count from the first sample, which was recorded at {begin:.9g} s")
     joints, more = _merged_joints([(r.name, r.joints) for r in shifted if r.joints is not None], where)
     merged = Recording(
         joints,
@@ -83,13 +83,13 @@ def _span(recording: Recording) -> tuple[float, float]:
 
 
 def _shift(first: Recording, other: Recording) -> tuple[float, str]:
-    """Seconds to add to the times of `other`, and the reason. Raises `DataError` if the shift is unknown."""
+    """Shift [s] to add to the times of `other`, and the reason. Raises `DataError` if the clocks cannot be aligned."""
     (begin, end), (start, stop) = _span(first), _span(other)
     overlap = min(end, stop) - max(begin, start)
     shared = overlap >= _MIN_SHARED_FRACTION * min(end - begin, stop - start)
     for recording in (first, other) if shared else ():
         _check_time_unit(recording, max(begin, start), min(end, stop))
-    said = f"{first.name} and {other.name} are taken as on one clock: they have {overlap:.4g} s in common"
+    said = f"{first.name} and {other.name} are assumed to have one clock: their times overlap by {overlap:.4g} s"
     seen, joints = _seen_path(other), first.joints
     best = at_zero = None
     if seen is not None and joints is not None and len(joints.t) >= _MIN_SAMPLES:
@@ -104,13 +104,13 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
             return 0.0, said
         if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
             late = f"{abs(best.lag):.2g} s {'later' if best.lag > 0 else 'earlier'}"
-            said += f"; its points follow the angles best {late} ({best.explained:.1%} of the motion): the sensor is "
-            said += f"late, the object swings behind, or clocks differ (--clock-offset {other.name}={-best.lag:.2g})"
+            said += f"; the points match the angles best {late} ({best.explained:.1%} of the motion): the sensor is "
+            said += f"late, the object lags behind, or clocks differ (--clock-offset {other.name}={-best.lag:.2g})"
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:
-        spans = f"{first.name} has {begin:.10g} to {end:.10g} s, {other.name} {start:.10g} to {stop:.10g} s"
+        spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"
         what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
-        hint = f"--clock-offset {other.name}=SECONDS adds to its times; {begin - start:.10g} lets both begin at once"
+        hint = f"--clock-offset {other.name}=SECONDS shifts its times ({begin - start:.10g}: both begin together)"
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
     why = "the recording times do not overlap; with this offset the points follow the joint angles best "
     why += f"({best.explained:.1%} of the motion), to ± {_ALIGNED_CLOCK_STD:g} s, which a fit of the model corrects"
@@ -118,20 +118,20 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
 
 
 def _check_time_unit(recording: Recording, begin: float, end: float) -> None:
-    """Raise `DataError` if nearly none of many samples is in the common time, as of a file in milliseconds."""
+    """Raise `DataError` if hardly any of many samples lies in the common time, as for a file in milliseconds."""
     total = max(len(group.t) for group in recording.all_groups)
     inside = max(np.count_nonzero((group.t >= begin) & (group.t <= end)) for group in recording.all_groups)
     if total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples:
         name = recording.name
-        what = f"{inside} of {total} samples of {name} are in the {end - begin:.4g} s that it shares with the others"
-        hint = "import a file of another unit on its own, as with --units t=ms, and list its .h5 in place of the file"
+        what = f"only {inside} of {total} samples of {name} lie in the {end - begin:.4g} s that all files cover"
+        hint = "import a file with another unit alone, for example with --units t=ms, and list its .h5 in its place"
         raise DataError(what, where=name, allowed="files of one run with one unit of time", hint=hint)
 
 
 def _motion_lag(
     joints: JointGroup, t: Array, path: Array, period: float, around: float, reach: float = _LAG_SEARCH
 ) -> _MotionLag | None:
-    """Lag within `reach` [s] of `around` at which a linear function of the angles fits positions best, if any."""
+    """Lag within `reach` of `around` [s] at which angles explain positions best (linearly); None for few samples."""
     moving = joints.position[:, np.ptp(joints.position, axis=0) > _MIN_TURN]
     lags = around + period * np.arange(-round(reach / period), round(reach / period) + 1)
     inside = (t - lags[-1] > joints.t[0]) & (t - lags[0] < joints.t[-1])
@@ -149,7 +149,7 @@ def _motion_lag(
 
 
 def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
-    """Times and coordinates (M, columns) of the points seen most of the time, at times when all of them are seen."""
+    """Times (M,) and coordinates (M, columns) of the often seen points, from frames that show all of these points."""
     for group in recording.points:
         whole = group.position.reshape(len(group.t), -1)
         whole = whole[:, np.isfinite(whole).mean(axis=0) > _MIN_SEEN_FRACTION]
@@ -160,7 +160,7 @@ def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
 
 
 def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) -> float:
-    """Delay of one speed relative to another on an even clock [s]; each has values and the time of the first sample."""
+    """Delay [s] of the speed `b` relative to the speed `a`. Each has samples every `period`, and their first time."""
     from scipy import signal  # slow to import
 
     (x, x_start), (y, y_start) = a, b
@@ -180,7 +180,7 @@ def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) ->
 
 
 def _speed(t: Array, values: Array, period: float) -> tuple[Array, float]:
-    """Speed of all columns together on an even clock, smoothed over 50 ms, and its first time."""
+    """Norm of the columns' rates every `period` [s], from values averaged over 50 ms, and the first sample's time."""
     even = np.arange(t[0], t[-1], period)
     path = np.stack([np.interp(even, t, column) for column in values.T], axis=1)
     width = max(1, round(0.05 / period))
@@ -200,14 +200,14 @@ def _with_times_shifted(recording: Recording, shift: float) -> Recording:
 def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup | None, tuple[str, ...]]:
     if not groups:
         return None, ()
-    hint = "import one CSV on its own without these columns (--columns NAME=skip), and list its .h5 in its place"
+    hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
     merged, notes = joints_on_fastest_clock(groups, where, hint)
     rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
     return merged, notes if len(groups) == 1 else (f"joints: {rates}", *notes)
 
 
 def _with_unique_names(recordings: Sequence[Recording], groups: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
-    """Groups of all recordings. Groups of equal names are suffixed with the recording's name."""
+    """Groups of all recordings. If several groups have one name, the name of the recording is added to each."""
     pairs = [(group, recording) for recording, own in zip(recordings, groups, strict=True) for group in own]
     names = [group.name for group, _ in pairs]
     return tuple(g if names.count(g.name) == 1 else replace(g, name=f"{g.name}_{r.name}") for g, r in pairs)

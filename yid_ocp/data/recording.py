@@ -32,13 +32,13 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 
 _STD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 JOINT_NOISE_AND_SERVO_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
-"""Constants of a joint group that may be given, nonnegative, one for all joints or one for each."""
+"""Names of the optional constants of a joint group. A constant is one number for all joints, or one for each joint."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
 _CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # what terminals obey and HDF5 cannot store
 
 _LARGEST = {"1": 1.0, "rad": 50.0, "rad/s": 1e6, "N m": 1e9}
-"""Limits that no joint exceeds: eight turns (angles in degrees nearly always exceed them), or beyond any machine."""
+"""Largest accepted values by unit: eight turns, which angles in degrees nearly always exceed, or beyond any machine."""
 _LARGEST_SPREAD = 1e9  # its square is finite
 _LARGEST_DISTANCE = 50.0  # beyond any motion capture volume [m]; objects in millimetres exceed it
 _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its end is seldom exactly the number asked for
@@ -57,9 +57,9 @@ class JointGroup(ReprMixin):
     position, velocity, effort : ndarray, shape (N, nj)
         Measured values [rad], [rad/s], [N m].
     position_command, velocity_command : ndarray, shape (N, nj), or None
-        Commands of the controller [rad], [rad/s].
+        Positions and velocities that the controller was commanded to reach [rad], [rad/s].
     external_effort : ndarray, shape (N, nj), or None
-        Effort minus the prediction of the robot's own model [N m].
+        Measured effort minus the effort that the robot's own model predicts [N m].
     position_std, velocity_std, effort_std, effort_bias_std : float or ndarray, shape (nj,), or None
         Standard deviations of white noise, and of a constant error of a joint's effort [rad], [rad/s], [N m].
     torque_enable : ndarray, shape (N, nj), or None
@@ -67,7 +67,7 @@ class JointGroup(ReprMixin):
     position_resolution, proportional_gain : float or ndarray, shape (nj,), or None
         Step of the encoder [rad]; proportional gain set in a servo's firmware, in the firmware's unit.
     effort_kind : {'sample', 'mean', 'command'} or None
-        Meaning of `effort[k]`: value at t_k, mean from t_k to t_{k+1}, or value held from t_k to t_{k+1}.
+        Meaning of `effort[k]`: torque at t_k, mean torque from t_k to t_{k+1}, or command held from t_k to t_{k+1}.
     clock : {'recorded', 'nominal'}
         Whether `t` was measured or is a sample index times a nominal period.
     """
@@ -106,7 +106,7 @@ class JointGroup(ReprMixin):
 
     @property
     def effort_sampling_kind_or_default(self) -> EffortSamplingKind:
-        """Whether effort samples are values or means (`effort_kind`). The default is `sample`, as drivers publish."""
+        """Meaning of the effort samples: `effort_kind`. If it is None: `sample`, as drivers publish them."""
         return self.effort_kind or "sample"
 
     def _summary(self) -> ReprTexts:
@@ -140,7 +140,7 @@ class PointGroup(ReprMixin):
     clock : {'recorded', 'nominal'}
         As in `JointGroup`.
     clock_offset_std : float or None
-        Standard deviation of a constant offset of `t` from the joints' clock [s], if that was only estimated.
+        Standard deviation of the unknown constant offset of `t` from the joints' clock [s]; None if not stated.
     """
 
     name: str
@@ -179,7 +179,7 @@ class SensorChannelGroup(ReprMixin):
     Attributes
     ----------
     name : str
-        Declared group such as `motors`, optionally with `_` and a word chosen by the user.
+        Group of a kind of sensor, such as `motors`, optionally with `_` and a word chosen by the user.
     names : tuple of str, length k
         Names of the columns, such as joints.
     t : ndarray, shape (M,)
@@ -187,7 +187,7 @@ class SensorChannelGroup(ReprMixin):
     values_by_quantity : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
         Values in the channel's unit.
     noise_and_bias_stds_by_attribute : mapping of str to float or ndarray, shape (k,)
-        Standard deviations by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), in the channel's unit.
+        Standard deviations of white noise (`QUANTITY_std`) and of a constant error (`QUANTITY_bias_std`), in its unit.
     clock : {'recorded', 'nominal'}
         As in `JointGroup`.
     """
@@ -333,33 +333,33 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     ------
     DataError
         There is no group, or a group is empty. Names are repeated or do not match the arrays. A clock is not finite and
-        strictly increasing. A joint channel is not finite, or a point is infinite or partly seen. A standard deviation
-        is negative. The kind of effort is unknown. A pose is not a rigid transform. Joint positions exceed 50 rad or
-        points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any machine.
-        `marker_reference_pose` does not match the first group of points.
+        strictly increasing. A joint value is not finite. A point has infinite coordinates, or one or two coordinates.
+        A standard deviation is negative. The kind of effort is unknown. A pose is not a rigid transform. Positions of
+        joints exceed 50 rad or points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any
+        machine. `marker_reference_pose` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
-    allowed, hint = "joints, points, points_<name>", "add joints or points"
+    allowed, hint = "a group of joints, points or another sensor", "add joints or points"
     raise_data_error_unless(recording.all_groups, "the recording has no group", origin, allowed, hint)
     texts = (("description", recording.description), ("source", recording.source))
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        raise_data_error_unless(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
+        raise_data_error_unless(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "a finite number")
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
     names = [group.name for group in recording.points]
     for group in recording.points:
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
-        what, hint = f"a group of points is called '{group.name}'", f"rename it, such as points_{group.name}"
+        what, hint = f"a group of points is called '{group.name}'", f"rename it, for example to points_{group.name}"
         raise_data_error_unless(legal, what, origin, "points, points_<name>", hint)
         what = f"two groups of points are called '{group.name}'"
-        raise_data_error_unless(names.count(group.name) == 1, what, origin, "every name once", "rename one")
+        raise_data_error_unless(names.count(group.name) == 1, what, origin, "every name once", "rename one group")
         _validate_points(group, f"{origin}: {group.name}")
     names = [channels.name for channels in recording.channel_groups]
     for channels in recording.channel_groups:
-        what = f"two groups are called '{channels.name}'"
-        raise_data_error_unless(names.count(channels.name) == 1, what, origin, "every name once", "rename one")
+        what = f"two groups of sensor channels are called '{channels.name}'"
+        raise_data_error_unless(names.count(channels.name) == 1, what, origin, "every name once", "rename one group")
         _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
@@ -383,7 +383,7 @@ def read_only_copy(value: ArrayLike, where: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        what, hint = "this is not an array of real numbers", "write numbers, in rows of equal length"
+        what, hint = "the value is not an array of real numbers", "write numbers, in rows of equal length"
         raise DataError(what, where=where, allowed="an array of real numbers", hint=hint) from error
     array.setflags(write=False)
     return array
@@ -425,7 +425,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         raise_data_error_unless(size.max() <= _LARGEST[unit], what, place, f"at most {_LARGEST[unit]:g} {unit}", hint)
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
-    raise_data_error_unless(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
+    raise_data_error_unless(ok, "a value is neither 0 nor 1", f"{where}/torque_enable", "0 (motor off) or 1 (motor on)")
     for name in JOINT_NOISE_AND_SERVO_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
@@ -473,19 +473,19 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     declared = {channel.quantity: channel for channel in channel_kinds_of_sensor_group(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
-    allowed, hint = ", ".join(declared), "add a dataset of this name, or leave the group out"
-    allowed = allowed or "a group that a sensor declares"
-    raise_data_error_unless(own, "the group has no values", where, allowed, hint)
+    allowed, hint = ", ".join(declared), "add one of the allowed datasets, or leave the group out"
+    allowed = allowed or "a group of a kind of sensor that the package knows"
+    raise_data_error_unless(own, "the group has no dataset of measured values", where, allowed, hint)
     for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:
-            what = f"no sensor declares a {noun} '{name}' here"
+            what = f"groups of this kind of sensor have no {noun} '{name}'"
             raise_data_error_unless(name in known, what, where, **unknown_name_error_arguments(name, known))
     for quantity, values in own.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
         is_finite = bool(np.isfinite(values).all())
-        raise_data_error_unless(is_finite, "a value is not finite", f"{where}/{quantity}", "finite numbers")
+        raise_data_error_unless(is_finite, "a measured value is not finite", f"{where}/{quantity}", "finite numbers")
     for name, std in stds.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
@@ -498,7 +498,7 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
-    allowed, hint = "`straight` beside a group of points", "add the group of points, or leave `straight` out"
+    allowed, hint = "`straight` together with a group of points", "add the group of points, or leave `straight` out"
     raise_data_error_unless(groups, "the recording has `straight`, but no group of points", where, allowed, hint)
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
     finite, allowed = np.isfinite(straight).all(), "finite coordinates of every point"
@@ -507,7 +507,7 @@ def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str
     # a file lists its groups by name, so other orders are not stored
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    raise_data_error_unless(first is groups[0], what, where, "groups of points sorted by name", "sort them by name")
+    raise_data_error_unless(first is groups[0], what, where, "point groups sorted by name", "sort the groups by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
@@ -518,7 +518,7 @@ def _check_pose(pose: Array, where: str) -> None:
     orthonormal = np.allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-6)
     raise_data_error_unless(last_is_unit, f"the last row of the pose is {pose[3].tolist()}", where, allowed)
     raise_data_error_unless(orthonormal, "the axes of the pose are not orthonormal", where, allowed)
-    raise_data_error_unless(np.linalg.det(rotation) > 0, "the pose is a reflection", where, allowed)
+    raise_data_error_unless(np.linalg.det(rotation) > 0, "the pose contains a reflection", where, allowed)
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, where: str) -> None:
@@ -528,7 +528,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
     raise_data_error_unless(group.t.size > 0, "the group has no samples", where, allowed, hint)
     for name, count in Counter(group.names).items():
         usable = isinstance(name, str) and name and not _CONTROL_CHARACTER.search(name)
-        what, allowed = f"the name {name!r} cannot be used", "text without control characters, not empty"
+        what, allowed = f"the name {name!r} cannot be used", "a text that is not empty and has no control characters"
         raise_data_error_unless(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
         raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
@@ -537,7 +537,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
     what = f"the time at index {next(iter(bad), 0)} is {group.t[next(iter(bad), 0)]}"
-    raise_data_error_unless(bad.size == 0, what, f"{where}/t", "finite numbers [s]", "remove it from every channel")
+    raise_data_error_unless(bad.size == 0, what, f"{where}/t", "finite times [s]", "remove the sample in every channel")
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])

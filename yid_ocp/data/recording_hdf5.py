@@ -1,7 +1,7 @@
 """Read and write recordings as HDF5 files (format `yid-recording/1`), with safe access to any HDF5 file.
 
-The HDF5 library follows links into other files, and ends the process if the disk is full or a file is damaged in
-certain ways. Such errors cannot be caught. Files are therefore written atomically and first read by another process.
+The HDF5 library follows links into other files. It ends the process if the disk is full or a file is damaged in certain
+ways, and this cannot be caught. A file is therefore built in memory before it is written, and first read by a fork.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "clock_offset_
 
 
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
-    """Read and check a `yid-recording/1` file. With `allow_nan_effort`, efforts may contain NaN.
+    """Read a recording from an HDF5 file (`yid-recording/1`) and check it. Efforts may be NaN with `allow_nan_effort`.
 
     Raises `DataError` if the file is missing, not HDF5, damaged or of another format, if a group, dataset, attribute or
     unit is unknown or missing, or if `validated_recording` refuses the recording.
@@ -66,9 +66,9 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Check a recording and write a `yid-recording/1` file atomically. Efforts may contain NaN.
+    """Check a recording, and write it atomically to an HDF5 file (`yid-recording/1`). Efforts may contain NaN.
 
-    Raises `OutputError` if writing fails (an older file is then kept), and `DataError` as in `validated_recording`.
+    Raises `DataError` as in `validated_recording`, and `OutputError` if writing fails; an older file is then kept.
     """
     validated_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:
@@ -110,7 +110,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     }
     form, where = texts["format"], f"{origin}, attribute format"
     what = f"the format of the file is '{form}'" if form else "the file has no format"
-    hint = "update yid_ocp if a newer version wrote the file; else import the original data with this version"
+    hint = "update yid_ocp if a newer version wrote the file; otherwise import the original data again"
     raise_data_error_unless(form == _RECORDING_FORMAT, what, where, _RECORDING_FORMAT, hint)
     joints, points, straight, channels, gain = None, [], None, [], {}
     if _GAIN in file.attrs:  # of all joints alike
@@ -121,7 +121,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         where, declared = f"{origin}: {name}", channel_kinds_of_sensor_group(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_question(name, ("joints", "points", *further, _STRAIGHT))
-        what, hint = f"the format has no group '{name}'", hint or "rename or delete the group"
+        what, hint = f"{_RECORDING_FORMAT} files have no group '{name}'", hint or "rename or delete the group"
         raise_data_error_unless(legal, what, origin, allowed, hint)
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
@@ -144,11 +144,11 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             points.append(PointGroup(name, sensor_name=own.pop("sensor"), camera_pose=own.pop("pose", None), **own))
     where, allowed = f"{origin}, attribute truth", '{"name": number, ...}'
     truth = _json(texts["truth"] or "{}", where, allowed)
-    raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object", where, allowed)
+    raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object of numbers", where, allowed)
     where, allowed = f"{origin}, attribute notes", '["sentence", ...]'
     notes = _json(texts["notes"] or "[]", where, allowed)
     good = isinstance(notes, list) and all(isinstance(note, str) for note in notes)
-    raise_data_error_unless(good, "the JSON is not a list of text", where, allowed)
+    raise_data_error_unless(good, "the JSON text is not a list of sentences", where, allowed)
     said = texts["description"], texts["source"], path.stem, digest, truth, straight, tuple(notes)
     return Recording(joints, tuple(points), *said, tuple(channels))
 
@@ -166,13 +166,13 @@ def _read_group(
         ("attribute", set(map(str, group.attrs)), attributes, set(required)),
     ):
         for name in sorted(found - set(known)):
-            what, hint = f"the format has no {noun} '{name}' here", f"rename or delete the {noun}"
+            what, hint = f"groups of this kind have no {noun} '{name}'", f"rename or delete the {noun}"
             raise DataError(what, where=where, **unknown_name_error_arguments(name, known, hint))
         for name in sorted(wanted - found):
             what, hint = f"the {noun} '{name}' is missing", f"add the {noun}, or leave the group out"
             raise DataError(what, where=where, allowed=", ".join(known), hint=hint)
     what, is_twice = "`std` is both a dataset and an attribute", "std" in group and "std" in group.attrs
-    raise_data_error_unless(not is_twice, what, where, "one of the two", "delete one of them")
+    raise_data_error_unless(not is_twice, what, where, "a dataset or an attribute", "delete one of them")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
     for name, value in group.attrs.items():
         place = f"{where}, attribute {name}"
@@ -187,10 +187,10 @@ def _read_group(
 
 def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
     good = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    raise_data_error_unless(good, "this is not a dataset of real numbers", where, "floating point or integer numbers")
+    raise_data_error_unless(good, "the entry is not a dataset of real numbers", where, "a dataset of real numbers")
     found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
-    hint = f"convert the values to {unit}, and change the attribute: recordings are never converted silently"
-    raise_data_error_unless(found == unit, f"the unit is '{found}'", where, unit, hint)
+    hint = f"convert the values to {unit}, and write this unit: values of a recording are never converted on reading"
+    raise_data_error_unless(found == unit, f"the unit of the dataset is '{found}'", where, unit, hint)
     return np.asarray(dataset[()], dtype=np.float64)
 
 
@@ -204,7 +204,7 @@ def _text(value: object, where: str) -> str:
             return value.decode("utf-8")
         except UnicodeDecodeError as error:
             hint = "write the attribute again as UTF-8"
-            raise DataError("the text is not UTF-8", where=where, allowed="text in UTF-8", hint=hint) from error
+            raise DataError("the attribute is not UTF-8 text", where=where, allowed="UTF-8 text", hint=hint) from error
     raise_data_error_unless(isinstance(value, str), f"the value {value} is not text", where, "text")
     return str(value)
 
@@ -257,19 +257,19 @@ def check_readable_in_child_process(path: Path, complaint: Callable[[Path], str]
     elif not answer:
         number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         how = signal.Signals(number).name if number else "an exit"
-        what = f"the {noun} file is damaged (it ends the {noun} library with {how})"
+        what = f"the {noun} file is damaged (reading it ends the {noun} library with {how})"
     else:
         what = answer[1:]
     if what:
         most = f"{files.MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
-        allowed = f"an undamaged {noun} file of at most {most}, without links"
-        hint = "copy it again from its source; if the copy fails as well, export or import the original data again"
+        allowed = f"an undamaged {noun} file of at most {most}, without links to other files"
+        hint = "copy the file again from its source; if this does not help, export or import the original data again"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
 
 
 @contextlib.contextmanager
 def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """Create an HDF5 file in memory and write it if the block succeeds (context manager; errors of `atomic_write`)."""
+    """Create an HDF5 file in memory, and write it to `path` if the `with` block succeeds. Errors: `atomic_write`."""
     with files.atomic_write(Path(path)) as temporary:
         with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
             yield file
@@ -295,7 +295,7 @@ def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.Fi
 
 
 def _damage(error: Exception) -> str:
-    """What is wrong with a file by an error of h5py, with the sizes of a truncated file."""
+    """Description of a file's damage from an error of h5py, with the actual and expected sizes if it is truncated."""
     sizes = re.search(r"eof = (\d+), .*stored_eof = (\d+)", str(error))
     return "the HDF5 file is truncated or damaged" + (f": it has {sizes[1]} of {sizes[2]} bytes" if sizes else "")
 
@@ -319,7 +319,7 @@ def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
 
 
 def _foreign(group: h5py.Group, depth: int = 0) -> str:
-    """Description of an entry that links to another file, or empty."""
+    """Description of an entry that refers to another file, is a broken link or is nested too deeply. Empty if none."""
     for name in group:
         link = group.get(name, getlink=True)
         item = None if isinstance(link, h5py.ExternalLink) else group.get(name)
@@ -328,14 +328,14 @@ def _foreign(group: h5py.Group, depth: int = 0) -> str:
         if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
             return f"the values of '{name}' in the HDF5 file are stored in another file"
         if isinstance(item, h5py.Group):
-            endless = f"groups in the HDF5 file are nested more than {_MAX_GROUP_DEPTH} deep"
+            endless = f"groups in the HDF5 file are nested more than {_MAX_GROUP_DEPTH} levels deep"
             if found := _foreign(item, depth + 1) if depth < _MAX_GROUP_DEPTH else endless:
                 return found
     return ""
 
 
 def _excess(file: h5py.File) -> str:
-    """Description of an excess of declared numbers (independent of compression), or empty."""
+    """Description of a file that declares too many numbers, counted without compression. Empty for other files."""
     numbers = 0.0
 
     def count(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -345,4 +345,4 @@ def _excess(file: h5py.File) -> str:
 
     file.visititems(count)
     what = f"the HDF5 file declares {numbers / 1e6:.0f} million numbers"
-    return f"{what}, more than {files.MAX_INPUT_NUMBERS / 1e6:.0f} million" * (numbers > files.MAX_INPUT_NUMBERS)
+    return f"{what}; the limit is {files.MAX_INPUT_NUMBERS / 1e6:.0f} million" * (numbers > files.MAX_INPUT_NUMBERS)

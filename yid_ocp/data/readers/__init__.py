@@ -65,11 +65,11 @@ def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         TopicOrColumnSummary(g.name, "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names))
         for g in recording.all_groups
     )
-    return FilePreview(tuple(sources), {}, ("a recording already", *recording.notes))
+    return FilePreview(tuple(sources), {}, ("the file is already a recording", *recording.notes))
 
 
 def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
-    """The `progress` argument for readers that take it."""
+    """The argument `progress` for a reader that has this parameter, else no argument."""
     return {"progress": progress} if "progress" in inspect.signature(reader).parameters else {}
 
 

@@ -113,16 +113,16 @@ class OpenBag:
             raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known))
 
     def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
-        """Return the `DataError` for a bag without usable topics, with a list of its topics."""
-        held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
-        where, hint = f"{self.path}, with {held}", "choose a field by --field, or another bag"
+        """Return the `DataError` for a bag without usable topics. Its text lists the topics of the bag."""
+        held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "none"
+        where, hint = f"{self.path}, topics: {held}", "choose a field by --field, or another bag"
         return DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def time_since_first_message_function(
     messages: Sequence[BagMessage], origins: Sequence[BagMessage] | None = None
 ) -> Callable[[BagMessage], float]:
-    """Return a function for a message's time [s] since the first of `origins` (default: of `messages`)."""
+    """Return a function that computes a message's time [s] since the first one of `origins` (default: `messages`)."""
     # if one message has no stamp, the two clocks are not comparable, and no stamp is used
     stamped = all(message.stamp > 0 for message in (*messages, *(origins or ())))
     origin = min((message.stamp if stamped else message.logged for message in origins or messages), default=0)
@@ -148,11 +148,11 @@ class BagOptions(base.JointPointAndUnitOptions):
     """Options of `read_bag`: topics, joints and points, with their names in the recording, and units.
 
     Messages that lack one of the `joints` are skipped. `joints` is required if the messages of a topic differ in their
-    joints. `point_names` has topics as keys, or `TOPIC:CHILD` for a frame of `/tf`. By default, all topics of
-    points, poses and transforms except `/tf`, each under the last descriptive part of its name.
+    joints. The keys of `point_names` are topics, or `TOPIC:CHILD` for a frame of `/tf`. By default, all topics of
+    points, poses and transforms except `/tf` are read. The last descriptive part of a topic is then the point's name.
     """
 
-    joint_topics: Sequence[str] | None = None  # topics of the joint states; all that there are when absent
+    joint_topics: Sequence[str] | None = None  # topics of joint states; None: all
     # topic of joint states whose positions are commands: `position_command`, held until the next command
     command_topic: str | None = None
     # path of an array by joint channel, `/topic.field.field`, in messages of any type; joints are then named 1, 2, ...
@@ -178,10 +178,10 @@ def read_bag(
     type. Stamped points, poses and transforms of `geometry_msgs` and frames of `/tf` become points, one group per
     reference frame. Each topic of `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
 
-    Times are header stamps (recording times if a message has no stamp), relative to the first message. A message that
-    repeats time and values of another counts once. A joint channel that is empty or all NaN is omitted. `notes` lists
-    unused topics. Raises `DataError` if `rosbags` is not installed,
-    if the bag cannot be read, has no usable topic or is ambiguous, or if `validated_recording` refuses the result.
+    Times are header stamps, relative to the first message. If any message has no stamp, all times are recording times.
+    A message that repeats time and values of the previous one counts once. A joint channel that is empty or all NaN is
+    omitted. `notes` lists unused topics. Raises `DataError` if `rosbags` is not installed, if the bag cannot be read,
+    has no usable topic or is ambiguous, or if `validated_recording` refuses the result.
     """
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
@@ -200,7 +200,7 @@ def read_bag(
     seconds = time_since_first_message_function(used_messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     if unstamped := sum(message.stamp <= 0 for message in used_messages):
-        more = (*more, f"{unstamped} of {len(used_messages)} messages have no stamp: all times are those of recording")
+        more = (*more, f"{unstamped} of {len(used_messages)} messages have no stamp: all times are times of recording")
     points = []
     for frame, entries in seen.items():
         position = _positions(_with_axes(entries, distance), seconds, str(path))
@@ -209,12 +209,12 @@ def read_bag(
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     channels = tuple(_mounted_sensors(bag, groups, seconds))
     if channels and channels[-1].name == ESTIMATED_WRENCH_RECORDING_GROUP:
-        said = "the driver's estimate from joint torques, less the loads that it knows"
-        more = (*more, f"{ESTIMATED_WRENCH_RECORDING_GROUP} is {said}: use it in place of efforts, not beside them")
+        said = "the driver's estimate from joint torques, without the loads that it knows"
+        more = (*more, f"{ESTIMATED_WRENCH_RECORDING_GROUP} is {said}: use it in place of efforts, not with them")
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and distance is None:
-        more = (*more, f"pose_axis_point_distance keeps orientations of {', '.join(sorted(turned))}, left out here")
+        more = (*more, f"orientations of {', '.join(sorted(turned))} were left out: no pose_axis_point_distance is set")
     left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
@@ -235,7 +235,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     shared = {topic for topics in owners.values() if len(topics) > 1 for topic in topics}
     if shared:
         options["joint_topics"] = [states[0], *(topic for topic in states[1:] if topic not in shared)]
-        notes.append(f"{', '.join(sorted(shared))} have joints in common: choose one of them")
+        notes.append(f"{', '.join(sorted(shared))} have joints in common: choose one of these topics")
     elif len(states) > 1:
         options["joint_topics"] = states
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
@@ -253,7 +253,7 @@ for _kind in (".bag", ".mcap", ".db3", "folder"):
 def _contents(
     path: Path, trees: Sequence[str] | None, progress: Progress, fields: Mapping[str, str] | None = None
 ) -> _Contents:
-    """Decode the usable messages of a bag. Of transform trees only the frames `trees` are decoded (None: all)."""
+    """Decode the usable messages of a bag. `trees` lists the frames of transform trees to decode (None: all)."""
     bag, states, places, mounted = OpenBag(path), list[BagMessage](), list[BagMessage](), list[BagMessage]()
     own_topic, paths = _topic_and_paths(bag, fields or {})
     refused: DataError | None = None
@@ -291,17 +291,17 @@ def _contents(
 
 
 def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """Topic of fields `/topic.field.field`, empty without fields, and the path by channel."""
+    """Split fields `/topic.field.field` into their common topic (empty without fields) and a field path by channel."""
     split = {channel: text.partition(".") for channel, text in fields.items()}
     topics = sorted({topic for topic, _, _ in split.values()})
-    where, allowed = str(bag.path), "CHANNEL=/TOPIC.FIELD, of one topic, position among them"
+    where, allowed = str(bag.path), "entries CHANNEL=/TOPIC.FIELD of one topic, one of them for position"
     for channel, (topic, _, path) in split.items():
         bag.check_topic_is_one_of(topic, [known.name for known in bag.topics], "messages")
         if not path:
             hint = f"write --field {channel}={topic}.FIELD"
-            raise DataError(f"the field of '{channel}' has no name", where=where, allowed=allowed, hint=hint)
+            raise DataError(f"the entry of '{channel}' names no field", where=where, allowed=allowed, hint=hint)
     if len(topics) > 1 or (fields and "position" not in fields):
-        what = f"the fields are of {len(topics)} topics" if len(topics) > 1 else "no field is the position"
+        what = f"the fields belong to {len(topics)} topics" if len(topics) > 1 else "the channel position has no field"
         hint = "choose fields of one topic" if len(topics) > 1 else "add --field position=/TOPIC.FIELD"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return next(iter(topics), ""), {channel: path for channel, (_, _, path) in split.items()}
@@ -359,7 +359,7 @@ def _numbers(content: Any, names: str) -> tuple[float, ...]:
 def _mounted_sensors(
     bag: _Contents, groups: Sequence[_States], seconds: Callable[[BagMessage], float]
 ) -> Iterator[SensorChannelGroup]:
-    """A group for each topic of wrenches or inertial readings, and for the wrench that a driver estimates."""
+    """Yield a group for each topic of wrenches or inertial readings, and for a wrench that a driver estimates."""
     for kind, group in _MOUNTED.items():
         topics = _names_of(bag, kind)
         for topic, name in topics.items():
@@ -412,7 +412,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
         names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
         kept = [message for message in messages if names and set(names) <= set(message.content.name)]
         if len(kept) < len(messages) and names:
-            notes.append(f"{len(messages) - len(kept)} of {len(messages)} messages of {topic} lack a joint")
+            notes.append(f"{len(messages) - len(kept)} of {len(messages)} messages of {topic} lack a joint: skipped")
         if kept:
             renamed = names if wanted is None else tuple(wanted[name] for name in names)
             found.append(_States(topic, names, renamed, kept))
@@ -421,7 +421,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
         names = tuple(name for entry in found for name in entry.names)
         kept = [message for message in messages if set(names) <= set(message.content.name)]
         if not kept or not names:
-            allowed, hint = f"commands of {', '.join(names) or 'the joints'}", "choose another --command-topic"
+            allowed, hint = f"messages with {', '.join(names) or 'the joints'}", "choose another --command-topic"
             raise DataError(f"no message of '{command}' has all joints", where=where, allowed=allowed, hint=hint)
         found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), kept, True))
     return found, tuple(notes)
@@ -477,7 +477,7 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
                 raise DataError(what, where=where, allowed="one value for each joint, or none", hint=hint)
         if rows and len(rows) < len(states):
             what = f"{len(states) - len(rows)} of {len(states)} messages lack '{channel}'"
-            allowed = "all messages, or none"
+            allowed = "a channel in all messages, or in none"
             raise DataError(what, where=where, allowed=allowed, hint="choose another topic with --joint-topic")
         if rows and not np.isnan(rows).all():
             channels[channel] = np.array(rows)
@@ -493,7 +493,7 @@ _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 
 def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
-    """Topics of some types (default: points), with the last descriptive part of each name."""
+    """Names by topic, for topics of the types `kinds` (default: points): the last descriptive part of the topic."""
     names = dict[str, str]()
     for topic in bag.file.topic_names_of_types(*(kinds or _PLACES)):
         parts = [part for part in topic.split("/") if part]
@@ -502,7 +502,7 @@ def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
 
 
 def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) -> _MessagesByFrame:
-    """Points with their names, by frame of reference."""
+    """Names and messages of the points by reference frame. `points`: None for all except frames of transform trees."""
     present = sorted({message.source for message in bag.places})
     names = _names_of(bag) if points is None else dict(points)
     known = [*present, *(f"{tree}:FRAME" for tree in bag.file.topic_names_of_types(*_TREES))]
@@ -519,7 +519,7 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
 
 
 def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None) -> Iterator[tuple[str, BagMessage]]:
-    """The points and, if a distance is given, three more points on the axes of each pose."""
+    """Yield the points and, if `distance` [m] is given, three more points at this distance on the axes of each pose."""
     from scipy.spatial.transform import Rotation
 
     for name, message in entries:
@@ -538,7 +538,7 @@ def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None
 def _positions(
     entries: Iterable[tuple[str, BagMessage]], seconds: Callable[[BagMessage], float], where: str
 ) -> tuple[tuple[str, ...], Array, Array]:
-    """Names, times and positions (N, np, 3) of some points, NaN if a point was not seen."""
+    """Names, times [s] and positions (N, np, 3) [m] of the points; NaN if a point has no message at a time."""
     seen: dict[tuple[float, str], tuple[float, ...]] = {}
     for point, message in entries:
         time, place = seconds(message), message.content.point
@@ -560,9 +560,9 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
-    becomes, note = "", "not a type that is understood; joint values: --field position=TOPIC.FIELD"
+    becomes, note = "", "type is not supported; for joint values: --field position=TOPIC.FIELD"
     if topic.kind in OTHER_JOINT_MESSAGE_TYPES and topic.name not in _default_joint_topics(bag.file):
-        note = f"joints, left out beside joint states: --joint-topic {topic.name}"
+        note = f"joints, left out because the bag has joint states: --joint-topic {topic.name}"
     elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
         becomes, note = f"joints {', '.join(joints)}", ""
@@ -579,7 +579,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
 
 
 def _for_guess(bag: _Contents) -> Recording:
-    """Angles and points of a bag as recorded, regardless of their joints, to guess their units."""
+    """Recording with the angles and points of a bag in their own units, from which the units are guessed."""
     widest = [float(np.nanmax(np.abs(m.content.position), initial=0.0)) for m in bag.states]
     joints = JointGroup(("any",), np.arange(float(len(widest))) * 1e-3, np.array(widest)[:, None]) if widest else None
     own = np.array([m.content.point for m in bag.places if ":" not in m.source], float).reshape(-1, 1, 3)

@@ -20,7 +20,7 @@ from yid_ocp.registry import Registry
 
 @dataclass(frozen=True)
 class TopicOrColumnSummary:
-    """One topic, column or marker of a file to import: sample count, rate and imported name."""
+    """One topic, column or marker of a file to import, with its sample count, rate and name after the import."""
 
     # name in the file, and type
     name: str
@@ -91,7 +91,7 @@ def _spaceless(unit: str) -> str:
 
 
 def si_factors(units: Mapping[str, str], where: str) -> dict[str, float]:
-    """Factor to SI units of every quantity; for a current, to ampere."""
+    """Return the factor from the file's unit to the SI unit for every quantity; to ampere for a motor current."""
     factors = dict.fromkeys(_QUANTITIES, 1.0)
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
@@ -106,17 +106,17 @@ def si_factors(units: Mapping[str, str], where: str) -> dict[str, float]:
 
 
 def parse_old_to_new_names(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
-    """Parse new names from entries `name` or `recorded=name`. Raises `DataError` for an empty or repeated name."""
+    """Return new names by recorded name, from entries `name` or `recorded=name`. `DataError` if empty or repeated."""
     found: dict[str, str] = {}
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))
         name = name if equals else recorded
         if not recorded or not name:
             allowed, hint = f"NAME, or RECORDED=NAME of a {noun}", "add the name, or leave the entry out"
-            raise DataError(f"the entry '{entry}' has no name of a {noun}", where=where, allowed=allowed, hint=hint)
+            raise DataError(f"the entry '{entry}' lacks the name of a {noun}", where=where, allowed=allowed, hint=hint)
         if recorded in found or name in found.values():
             what, allowed = f"the {noun} '{name}' is chosen twice", f"every {noun} once"
-            raise DataError(what, where=where, allowed=allowed, hint="leave one of the two entries out")
+            raise DataError(what, where=where, allowed=allowed, hint="remove one of the two entries")
         found[recorded] = name
     return found
 
@@ -125,8 +125,8 @@ def parse_old_to_new_names(entries: Iterable[str], noun: str, where: str) -> dic
 class JointPointAndUnitOptions:
     """Options that readers share: selection and names of joints and points, and the file's units."""
 
-    joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
-    point_names: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
+    joints: Sequence[str] | None = None  # entries `name` or `recorded=name`, in this order; None: all joints
+    point_names: Mapping[str, str] | None = None  # new names by recorded name; None: all points
     units: Mapping[str, str] | None = None  # unit of `t`, a joint channel or `points`, if not SI
     # if `effort` is a motor current, by joint or pattern: torque per current [N m/A], and motor turns per joint turn
     # (default 1)
@@ -182,13 +182,13 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
     names = list(chosen.values())
     shared = [source for source, name in chosen.items() if names.count(name) > 1]
     if shared:
-        what = f"points of the same name: {', '.join(f'{source} as {chosen[source]}' for source in shared)}"
+        what = f"points have the same name: {', '.join(f'{source} as {chosen[source]}' for source in shared)}"
         hint = ",".join(f"{source}=NAME{i + 1}" for i, source in enumerate(shared[:4])) + ",..." * (len(shared) > 4)
-        raise DataError(what, where=where, allowed="a name of its own for each", hint=f"name them: --points {hint}")
+        raise DataError(what, where=where, allowed="one name for each point", hint=f"rename them: --points {hint}")
 
 
 def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, where: str) -> Array:
-    """N m per recorded unit of every joint, shape (nj,)."""
+    """Factors from recorded efforts to joint torques, [N m] per recorded unit, shape (nj,)."""
     constants, gear_ratios = options.torque_constants or {}, options.gear_ratios or {}
     for word, given in (("torque_constants", constants), ("gear_ratios", gear_ratios)):
         for pattern, value in given.items():
@@ -200,7 +200,7 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed=allowed)
     if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
         if constants or gear_ratios:
-            what = "torque constants or gear ratios are given, but the unit of the efforts is not that of a current"
+            what = "torque constants or gear ratios are given, but the unit of the efforts is not a unit of current"
             allowed = "torque constants and gear ratios with --units effort=A or effort=mA"
             raise DataError(what, where=where, allowed=allowed, hint="add --units effort=A, or leave them out")
         return np.ones(len(names))
@@ -217,7 +217,7 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
 
 
 def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Guess the units of values that cannot be in SI units. Returns the units, and the reasons as sentences."""
+    """Guess the units of values that cannot be in SI units. Returns units by quantity, and the reasons as sentences."""
     units: dict[str, str] = {}
     notes = []
     joints = recording.joints
@@ -273,13 +273,13 @@ def joints_on_fastest_clock(
     if moved:
         notes.append(f"joint states of {', '.join(moved)} were interpolated to the times of {name}")
     if len(t) < len(clock.t):
-        notes.append(f"{len(clock.t) - len(t)} of {len(clock.t)} samples of {name} have none of another topic near")
+        notes.append(f"{len(clock.t) - len(t)} of {len(clock.t)} samples of {name} were omitted in gaps of others")
     names = tuple(joint for _, group in groups for joint in group.names)
     return replace(clock, names=names, t=t, **channels), tuple(notes)
 
 
 def _can_interpolate(known: Array, t: Array) -> BoolArray:
-    """Whether each time is a sample or lies between two samples close enough to interpolate."""
+    """Mask of the times `t` that are in `known` or lie between two times of `known` that are near enough together."""
     after = np.searchsorted(known, t)
     before = np.searchsorted(known, t, side="right") - 1
     inside = (after < len(known)) & (before >= 0)
@@ -293,10 +293,10 @@ def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str, hint: 
     for source, joint in ((source, joint) for source, group in groups for joint in group.names):
         if owner.setdefault(joint, source) != source:
             what = f"the joint '{joint}' is in {owner[joint]} and in {source}"
-            raise DataError(what, where=where, allowed="every joint in one of them only", hint=hint)
+            raise DataError(what, where=where, allowed="every joint in one source only", hint=hint)
     every = {channel for _, group in groups for channel in group.values_by_channel}
     for source, group in groups:
         lacking = sorted(every - set(group.values_by_channel))
         if lacking:
-            what, allowed = f"{source} has no {lacking[0]}, but others have it", "the same channels in all of them"
+            what, allowed = f"{source} has no {lacking[0]}, but another source has it", "equal channels in all sources"
             raise DataError(what, where=where, allowed=allowed, hint=hint)

@@ -20,7 +20,7 @@ from yid_ocp.errors import DataError, import_optional
 from yid_ocp.files import file_sha256
 
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
-"""Lists in `points` that are not positions but results of a body model."""
+"""Lists in the parameter group POINT whose labels are results of a body model instead of positions."""
 _UNITS = ("m", "cm", "mm")
 
 
@@ -48,8 +48,8 @@ def read_c3d(
 
     C3D has no time stamps: the times are frame index / rate from zero, a `nominal` clock. The file states rate and
     unit; `units` overrides the unit. A marker that was not seen in a frame (residual -1, NaN, or exactly the origin) is
-    NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `points` maps the markers to keep
-    to their names; by default all labelled markers that were ever seen are kept. `notes` lists omitted content:
+    NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `point_names` maps the markers to
+    keep to new names; by default all labelled markers that were ever seen are kept. `notes` lists omitted content:
     unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels. Raises
     `DataError` if `ezc3d` is not installed, if the file cannot be read or has no markers, or if `validated_recording`
     refuses the result.
@@ -77,7 +77,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
         seen = np.isfinite(found.position[:, i]).all(axis=1)
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
         sources.append(base.TopicOrColumnSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
-    notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
+    notes = [f"the file states the unit {found.unit}"] if found.unit else ["the file states no unit: set --units mm?"]
     return base.FilePreview((*sources, *found.others), {"point_names": {n: n for n in found.names}}, tuple(notes))
 
 
@@ -97,9 +97,9 @@ def _markers(path: Path) -> _Markers:
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise _unreadable(path) from error
     if not rate > 0 or not len(position) or not labels:
-        what = "the C3D file has no markers" if not labels else "the C3D file has no frames, or no rate"
+        what = "the C3D file has no labelled markers" if not labels else "the C3D file has no frames or no frame rate"
         hint = "export it again with the trajectories of the markers"
-        raise DataError(what, where=str(path), allowed="labelled 3-D points and their rate", hint=hint)
+        raise DataError(what, where=str(path), allowed="labelled 3-D points and their frame rate", hint=hint)
     if unit and unit not in _UNITS:
         what, hint = f"the unit of the markers is '{unit}'", "export it again in one of these units"
         raise DataError(what, where=str(path), allowed=", ".join(_UNITS), hint=hint)
@@ -109,13 +109,13 @@ def _markers(path: Path) -> _Markers:
     why = {}
     for i, label in enumerate(labels):
         unlabelled = not label or label.startswith("*")
-        reason = "computed by a model, no place" if label in computed else "it has no label" if unlabelled else ""
+        reason = "result of a body model" if label in computed else "it has no label" if unlabelled else ""
         if reason or unseen[:, i].all():
             why[i] = reason or "never seen"
     kept = [i for i in range(len(labels)) if i not in why]
     if not kept:
         what = "no labelled marker of the C3D file was ever seen"
-        raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
+        raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label markers, and export again")
     others = []
     for i, reason in why.items():
         name, count = labels[i] or f"marker {i + 1}", int(np.sum(~unseen[:, i]))
@@ -126,7 +126,7 @@ def _markers(path: Path) -> _Markers:
 
 
 def _complaint(path: Path) -> str:
-    """Error of the library for a file; the library may also end the process."""
+    """Description of the error that ezc3d raises for a file; empty if it reads the file. ezc3d may also crash."""
     import ezc3d
 
     try:
@@ -138,7 +138,7 @@ def _complaint(path: Path) -> str:
 
 def _unreadable(path: Path) -> DataError:
     why = "it is damaged, cut off or of another format" if path.stat().st_size else "it is empty"
-    allowed, hint = "a C3D file as Vicon, Qualisys or OptiTrack export it", "copy it again, or export it again"
+    allowed, hint = "a C3D file that Vicon, Qualisys or OptiTrack exported", "copy the file again, or export it again"
     return DataError(f"the C3D file cannot be read: {why}", where=str(path), allowed=allowed, hint=hint)
 
 
@@ -149,7 +149,7 @@ def _listed(group: Mapping[str, Any], key: str) -> list[str]:
 
 
 def _short(labels: list[str]) -> tuple[str, ...]:
-    """Labels without their subjects if they stay unique."""
+    """Labels without the prefix `Subject:` where the rest is unique."""
     last = [label.rpartition(":")[2] for label in labels]
     counts = Counter(last)
     return tuple(short if short and counts[short] == 1 else label for label, short in zip(labels, last, strict=True))

@@ -45,15 +45,15 @@ _LISTED = 5  # numbers of bad lines in a note
 class CsvOptions(base.JointPointAndUnitOptions):
     """Options of `read_csv`: meaning of columns, columns to keep, delimiter, header and clock.
 
-    `column_meanings` gives that of columns that `read_csv` does not recognise by name: `t`, `channel:joint`,
-    `axis:point`, or `skip`. A `*` in a column name matches any text and is replaced by this text in the meaning:
-    `*_pos` with `position:*`.
+    `column_meanings` maps names of columns that `read_csv` does not recognise to meanings: `t`, `channel:joint`,
+    `axis:point`, or `skip`. A `*` in a name matches any text, and this text replaces the `*` in the meaning. Example:
+    `*_pos` with the meaning `position:*`.
     """
 
     column_meanings: Mapping[str, str] | None = None
-    has_header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
+    has_header: bool = True  # whether the first row has names; if not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # omit lines that are not rows of numbers, and count them in `notes`
-    delimiter: str = ""  # one character between cells; found in the first line where empty
+    delimiter: str = ""  # one character between cells; empty: found in the first line
     recorded_or_nominal_times: RecordedOrNominalClock = "recorded"  # whether the times were measured
     point_sensor_name: str = "unknown"  # sensor of the points
     point_frame: str = "world"  # reference frame of the points
@@ -84,7 +84,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     if (capture := _mocap_table(path)) is not None:
         if options.column_meanings:
             what = "this is a motion capture export, whose header names its columns"
-            allowed, hint = "exports without --columns", "leave --columns out; choose markers: --points MARKER=POINT"
+            allowed, hint = "no --columns", "leave --columns out, and choose markers with --points MARKER=POINT"
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         seen, unit, remarks = capture
         sensor = seen.sensor_name if options.point_sensor_name == "unknown" else options.point_sensor_name
@@ -110,7 +110,7 @@ def _delimiter(path: Path) -> str:
 
 
 def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
-    """Joints, points and other sensors of the table in its own units."""
+    """Recording with the joints, points and other sensors of the table, in the units of the table."""
     t = table[:, meanings.index(("t", ""))]
     found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNEL_UNITS]
     joint_names = tuple(dict.fromkeys(joint for _, joint in found))
@@ -123,7 +123,7 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     is_alone = bool(joint_names) + bool(point_names) + len(mounted) < 2
 
     def measured(values: Sequence[Array]) -> IntArray:
-        """Rows in which not all cells are empty; all of them where nothing else is in the table."""
+        """Indices of the rows in which not all `values` are NaN; of all rows if the table has no other group."""
         flat = np.hstack([entry.reshape(len(table), -1) for entry in values])
         return np.arange(len(t)) if is_alone else np.flatnonzero(~np.isnan(flat).all(axis=1))
 
@@ -146,7 +146,7 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
 def _mounted_sensors(
     meanings: Sequence[tuple[str, str]], table: Array, where: str
 ) -> dict[str, tuple[tuple[str, ...], dict[str, Array]]]:
-    """Names of sensors on links, and values (M, k, components) by quantity, by group."""
+    """For each recording group: the names of its sensors on links, and their values (M, k, components) by quantity."""
     found: dict[str, tuple[tuple[str, ...], dict[str, Array]]] = {}
     for channel in _MOUNTED:
         parts = [f"{channel.quantity}_{axis}" for axis in channel.components]
@@ -210,10 +210,10 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     sources = []
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
-        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out: its name says nothing"
+        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out: meaning unknown"
         rate = mean_sample_rate(t) if ok else math.nan
         sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
-    notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
+    notes = [f"{bad} of {n_lines} lines are not rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
         units, why = base.guess_non_si_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
@@ -259,7 +259,7 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _table_rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    """`_rows` with the units of a second row, if it has nothing else, in the names of the first row."""
+    """Rows of the table. If the second row has nothing but units, they are added to the names in the first row."""
     rows = _rows(path, delimiter)
     head, second = next(rows, None), next(rows, None)
     if head and second and len(head[1]) == len(second[1]):
@@ -283,7 +283,7 @@ def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
 def _read_table(
     path: Path, options: CsvOptions
 ) -> tuple[list[tuple[str, str]], dict[str, str], Array, tuple[str, ...]]:
-    """The columns with a meaning: meanings, units of the header, table (rows, columns), and notes on bad lines."""
+    """Meanings of the columns that have one, units in the header, values (rows, columns), and notes on bad lines."""
     lines = _table_rows(path, options.delimiter or _delimiter(path))
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
@@ -313,7 +313,7 @@ def _read_table(
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        notes = (f"{len(bad)} of {n_lines} lines were bad and left out (line {listed})",)
+        notes = (f"{len(bad)} of {n_lines} lines were left out: not rows of numbers (line {listed})",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
@@ -329,7 +329,7 @@ def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> Non
         raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=_ALLOWED, hint=hint)
     name, count = Counter(header).most_common(1)[0]
     if options.has_header and count > 1:
-        allowed, hint = "a name of its own for every column", "rename one of them, or read the table with --no-header"
+        allowed, hint = "different names for all columns", "rename one of them, or read the table with --no-header"
         raise DataError(f"two columns are called '{name}'", where=f"{path}, line 1", allowed=allowed, hint=hint)
 
 
@@ -346,7 +346,7 @@ def _number(cell: str) -> float:
 
 def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
     if len(cells) != len(header):
-        what, allowed = f"the row has {len(cells)} cells", f"{len(header)} cells, as the header"
+        what, allowed = f"the row has {len(cells)} cells", f"{len(header)} cells, as in the header"
         raise DataError(what, where=where, allowed=allowed, hint=f"correct the row{_OR_SKIP}")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
@@ -354,14 +354,14 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             try:
                 numbers.append(float(cell) if cell.strip() else math.nan)
             except ValueError as error:
-                allowed = "a number with a decimal point, or nothing where there was no measurement"
-                what, hint = f"column '{name}' holds '{cell}'", f"leave the cell empty{_OR_SKIP}"
+                allowed = "a number with a decimal point, or an empty cell if there was no measurement"
+                what, hint = f"column '{name}' has the cell '{cell}'", f"correct or empty the cell{_OR_SKIP}"
                 raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return numbers
 
 
 def column_pattern(key: str) -> re.Pattern[str]:
-    """Pattern of the columns that a key of `column_meanings` selects."""
+    """Return the pattern of the column names that a key of `column_meanings` selects."""
     return re.compile(re.escape(key).replace(r"\*", "(.*)"))
 
 
@@ -426,7 +426,7 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
     for meaning in wanted:
         if meaning not in places:
             what, skip = f"there is no column for {meaning[0]} of '{meaning[1]}'", base.SKIP_COLUMN_KEYWORD
-            allowed = "every channel for all joints, position always; x, y and z of every point and every sensor"
+            allowed = "every channel for all joints (position is required); x, y and z of every point and sensor"
             hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
             names = [name for _, name in meanings]  # a misspelt one has a single column
             lone = [name for name in names if names.count(name) == 1 and name != meaning[1]]

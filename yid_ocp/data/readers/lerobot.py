@@ -1,4 +1,4 @@
-"""Reader of state and action of one episode of a LeRobot dataset (version 2.0, 2.1 or 3.0), as joints."""
+"""Reader of joint measurements and commands from one episode of a LeRobot dataset (version 2.0, 2.1 or 3.0)."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
             raise DataError(what, where=str(file), allowed=allowed, hint=hint) from error
         if len(found["frame_index"]):
             return found, file
-    raise DataError("no table has this episode", where=where, allowed=allowed, hint="download the whole dataset")
+    raise DataError("no file has this episode", where=where, allowed=allowed, hint="download the whole dataset")
 
 
 def _files(dataset: _Dataset, episode: int) -> list[Path]:
@@ -226,7 +226,7 @@ def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
         while hasattr(kind, "value_field"):
             kind = kind.value_type
         if not (types.is_integer(kind) or types.is_floating(kind)):
-            what = f"the column {name} holds {kind} instead of numbers"
+            what = f"the column {name} contains {kind} instead of numbers"
             hint = "convert the dataset again, or record it again"
             raise DataError(what, where=where, allowed="numbers, or lists of numbers", hint=hint)
 
@@ -236,7 +236,7 @@ def _times(dataset: _Dataset, table: Mapping[str, Array]) -> Array:
 
 
 def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str, ...], dict[str, Any], dict[str, str]]:
-    """Joints, their channels, and omitted features with the reason."""
+    """Names of the joints, arrays (frames, joints) by channel, and the reason for every omitted feature."""
     state = table[_STATE]
     entries = [_entry(name) for name in _names(dataset, _STATE, state.shape[1])]
     joints = tuple(dict.fromkeys(joint for joint, channel in entries if channel == "position"))
@@ -244,7 +244,7 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
     for channel in dict.fromkeys(channel for _, channel in entries):
         at = [entries.index((joint, channel)) for joint in joints if (joint, channel) in entries]
         if len(at) < len(joints):
-            what = f"{_STATE} has the {channel} of {len(at)} of {len(joints)} joints"
+            what = f"{_STATE} has the {channel} of only {len(at)} of {len(joints)} joints"
             allowed, hint = "every channel for all joints", f"record the {channel} of all joints, or of none"
             raise DataError(what, where=f"{dataset.folder}: {_STATE}", allowed=allowed, hint=hint)
         channels[channel] = state[:, at]
@@ -261,7 +261,7 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
         if set(joints) <= set(named):
             channels.setdefault(target, values[:, [named.index(joint) for joint in joints]])
         else:
-            left[name] = f"its {len(named)} entries are not those of {_STATE}"
+            left[name] = f"its {len(named)} entries do not include all joints of {_STATE}"
     return joints, channels, left
 
 
@@ -273,7 +273,7 @@ def _matrix(column: Any, name: str, folder: Path) -> Array:
         n_lengths = max(n_lengths, len(compute.unique(compute.list_value_length(column))))
         column = column.flatten()
     if n_lengths > 1 or len(column) < rows:
-        what, allowed = f"the lists of column '{name}' differ in length", "as many numbers in every frame"
+        what, allowed = f"the lists of column '{name}' differ in length", "lists of equal length in all frames"
         hint = "find the frames with other lengths and remove them, or convert the dataset again"
         raise DataError(what, where=str(folder), allowed=allowed, hint=hint)
     return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
