@@ -71,7 +71,7 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
     assert made.camera_point_group_times_and_std(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
-    with pytest.raises(DataError, match="the noise level of group 'points_camera' is neither recorded nor given"):
+    with pytest.raises(DataError, match="group 'points_camera' is neither recorded nor in the settings"):
         unknown.existing_point_observation_schedules(episode)
 
 

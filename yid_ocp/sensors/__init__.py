@@ -1,4 +1,4 @@
-"""Measurement models of the sensors, which compute readings at the nodes of a trajectory. A new kind is one file."""
+"""Models of the sensors, which predict readings at the nodes of a trajectory. A new kind of sensor is one file here."""
 
 from importlib import import_module
 from pkgutil import iter_modules

@@ -85,7 +85,7 @@ class RecordedChannelSpec:
     dataset `std`.
     """
 
-    group: str  # recording group; several are allowed, `GROUP` and `GROUP_NAME`, each with its own clock
+    group: str  # recording group; a recording may have several, `GROUP` and `GROUP_NAME`, each with its own clock
     quantity: str  # dataset of the group, with one column for every name of the group
     unit: str
     components: tuple[str, ...] = ()  # names of the components of each value; none for a number
@@ -103,11 +103,11 @@ class RecordedChannelSpec:
 
 
 CHANNEL_KINDS: Registry[RecordedChannelSpec] = Registry("recorded channel")
-"""Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
+"""Kinds of recorded channels. Those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
 def channel_kinds_of_sensor_group(group: str) -> tuple[RecordedChannelSpec, ...]:
-    """Return the channel kinds that are registered for a recorded group's name. Empty for joints and points."""
+    """Return the channel kinds that a recorded group of this name may contain. Empty for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
 
@@ -165,7 +165,7 @@ class RecordedExtraSensor(_RecordedGroup, Protocol):
 
 
 class _RecordingData(Protocol):
-    """Interface of a recording for sensors; implemented by `data.recording.Recording`."""
+    """The interface of a recording that sensors use. `data.recording.Recording` implements it."""
 
     @property
     def name(self) -> str: ...
@@ -178,8 +178,8 @@ class _RecordingData(Protocol):
 
 
 def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> DataError:
-    """Make the error for a channel whose standard deviation is neither recorded nor in the settings."""
-    what, hint = f"the noise level of {noun} is neither recorded nor given", f"set sensors.{key}.std"
+    """Return the error for a channel whose noise standard deviation is neither recorded nor in the settings."""
+    what, hint = f"the noise level of {noun} is neither recorded nor in the settings", f"set sensors.{key}.std"
     return DataError(what, where=where, allowed=f"a standard deviation above 0 [{unit}]", hint=hint)
 
 
@@ -196,7 +196,7 @@ def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[
 def expand_to_joint_values(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
-    """Return a value for each joint in `names`, from one value, an array over recorded joints or a mapping by joint."""
+    """Return a value for each joint in `names`, from one value, an array over the `recorded` joints or a mapping."""
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
@@ -342,11 +342,11 @@ class SensorData:
     t: Array  # shape (M,) [s]
     value: Array  # outputs in the sensor's unit, NaN if missing, (M, k)
     std: Array  # standard deviations of their noise, shape (M, k)
-    predictable_nodes: tuple[int, int] | None = None  # the first and the last one; all when absent
+    predictable_nodes: tuple[int, int] | None = None  # first and last node that can be predicted; None: all nodes
     bias_std: Array | None = None  # std of every output's constant error in the recording, shape (k,)
     noise_correlation: Array | None = None  # correlation of the outputs' noise in a sample, (M, k, k)
     change_by_clock: Array | None = None  # change of the outputs by one std of the recording's clock offset, (M, k)
 
 
 SENSOR_READERS: Registry[Callable[[SensorDataInputs], list[SensorData]]] = Registry("kind of sensor")
-"""Functions that take all measurements of one kind of sensor from a recording, by kind."""
+"""Functions that return all measurements of one kind of sensor in a recording, by kind."""

@@ -84,7 +84,7 @@ class PrescribedJointEffortSensor(JointSensor):
 
 
 def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
-    """Check whether the arm itself measured a point group, usually by its encoders and forward kinematics."""
+    """Check whether the arm measured a point group, usually by its encoders and forward kinematics."""
     return "arm" in (group.sensor_name, group.name.rpartition("_")[2])
 
 
@@ -100,7 +100,7 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
     if arm:
         both = f"the encoders and the points '{arm[0]}' on the arm are both used"
         what = f"{both}, but the points follow from the encoders"
-        allowed, hint = "one of the two", f"set sensors.{arm[0]}.use: false, or leave the encoders out"
+        allowed, hint = "encoders or points", f"set sensors.{arm[0]}.use: false, or leave the encoders out"
         raise ConfigError(what, where="sensors.joints.position.use", allowed=allowed, hint=hint)
     where = around.recording.name
     later = (joints.t > around.node_times[0] + 1e-9) & (joints.t <= around.node_times[-1] + 1e-9)
@@ -240,10 +240,10 @@ def joint_torque_bias_std(joints: RecordedJointsInterface, names: Sequence[str],
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """Noise (k,) of channels (N, k) from high-order differences; any change as fast as the sampling counts as noise."""
+    """Noise std (k,) of channels (N, k) by high-order differences. Changes as fast as the sampling count as noise."""
     order = NOISE_ESTIMATE_DIFFERENCE_ORDER
     if len(values) <= order:
-        what, allowed = f"{len(values)} samples are too few to estimate the noise of {group}", f"more than {order}"
+        what, allowed = f"{len(values)} samples are too few to estimate the noise of {group}", f"{order + 1} or more"
         raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
     mean_square = np.mean(np.diff(values, order, axis=0) ** 2, axis=0)
     return np.asarray(np.sqrt(mean_square / scipy.special.comb(2 * order, order)))
@@ -252,7 +252,7 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
 def _may_stick(inputs: SensorDataInputs, names: tuple[str, ...], times: Array) -> BoolArray:
     """Mask (K, k) of joints whose dry friction is unknown at `times` (K,), because they stop within the filter's reach.
 
-    A joint that stands still is held by any torque up to its friction, so that its effort says little about the model.
+    Dry friction can hold a joint at rest against any torque up to its size, so the effort says little about the model.
     """
     joints = inputs.recording.joints
     assert joints is not None
@@ -275,7 +275,7 @@ def _smoothed_effort_noise(
     """Noise std (M, k) and correlation (M, k, k) of filtered efforts at `times` (M,).
 
     An error of the acceleration of one joint, from encoder noise, changes the torques of all inertially coupled joints.
-    With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. It is None if encoder noise is unknown.
+    With the mass matrix M the covariance is diag(s^2) + M diag(a^2) M. The correlation is None without encoder noise.
     """
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None

@@ -59,7 +59,7 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraSensor) ->
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
     if constants is None:
-        what, allowed = "the torque constants of the motors are not given", "torque at the joint per current [N m/A]"
+        what, allowed = "the motors' torque constants are not stated", "torque at the joint per current [N m/A]"
         hint = f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}}"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     if std is None:
@@ -69,7 +69,7 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraSensor) ->
         for given, setting in ((constants, "constants"), (std, "std"), (bias, "bias_std"))
     ]
     if not np.all(by_joint[0] != 0):
-        where, allowed = f"sensors.{key}.constants", "a number that is not zero [N m/A]"
+        where, allowed = f"sensors.{key}.constants", "numbers that are not zero [N m/A]"
         raise DataError("a torque constant is zero", where=where, allowed=allowed)
     sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
     values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]

@@ -25,7 +25,7 @@ _Kind = TypeVar("_Kind", bound="MountedSensor")
 
 @dataclass(frozen=True)
 class MountedSensor(base.Sensor):
-    """The base class of sensors mounted on frames. Each sensor has three components along its frame's axes."""
+    """The base class of sensors that are mounted on frames. A reading has three components, along the frame's axes."""
 
     has_paper_weight = False
     point_names = ()
@@ -47,7 +47,7 @@ class MountedSensor(base.Sensor):
 
 
 def register_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
-    """Register the reader of a kind of mounted sensor. It makes one `SensorData` for each recorded group."""
+    """Register a reader for a class of mounted sensors. The reader makes one `SensorData` for each recorded group."""
     base.SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
     return kind
 
@@ -106,9 +106,9 @@ def _measured(
 def _with_encoder_noise(
     around: base.SensorDataInputs, sensor: MountedSensor, own: Array, times: Array
 ) -> tuple[Array, Array | None]:
-    """Noise std (M, k) and correlation (M, k, k) of smoothed readings that are predicted from noisy encoders.
+    """Noise std (M, k) and correlation (M, k, k) of filtered readings minus predictions from noisy encoders.
 
-    The responses to errors of angles, velocities and accelerations are linearised at standstill.
+    The derivatives by angles, velocities and accelerations are those at standstill. No correlation: no encoder noise.
     """
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     names = () if joints is None else tuple(name for name in around.system.prescribed if name in joints.names)
@@ -142,7 +142,7 @@ _XYZ = ("x", "y", "z")
 
 @register_mounted_sensor
 class _Gyroscope(MountedSensor):
-    """Angular velocity of a frame relative to the world."""
+    """Angular velocity of a frame relative to the world, along the frame's axes."""
 
     channel = base.CHANNEL_KINDS.register("imu.angular_velocity")(
         base.RecordedChannelSpec("imu", "angular_velocity", "rad/s", _XYZ)
@@ -155,7 +155,7 @@ class _Gyroscope(MountedSensor):
 
 @register_mounted_sensor
 class _Accelerometer(MountedSensor):
-    """Acceleration of a frame's origin minus gravity: 9.81 m/s^2 upwards at rest."""
+    """Acceleration of a frame's origin minus gravity, along the frame's axes. At rest it is 9.81 m/s^2 upwards."""
 
     channel = base.CHANNEL_KINDS.register("imu.specific_force")(
         base.RecordedChannelSpec("imu", "specific_force", "m/s^2", _XYZ)

@@ -1,4 +1,4 @@
-"""Sensors of point positions, such as cameras, motion capture, and the arm that holds the point."""
+"""Sensors of point positions, such as cameras, motion capture, and an arm that measures the point that it holds."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ def _points(
     for point in wanted:
         # points listed by name are used
         if point not in known and (choice.used_points is not None or point in choice.frame_by_recorded_name):
-            what = f"point '{point}' marks the frame '{frames[point]}', which the model does not have"
+            what = f"the point '{point}' belongs to the frame '{frames[point]}', which the model does not have"
             said = unknown_name_error_arguments(frames[point], mechanism.frames)
             raise DataError(what, where=f"sensors.{group.name}", **said)
     if not known:
-        what = f"no point of the group is a frame of the model: {', '.join(wanted)}"
+        what = f"no point of the group has the name of a frame of the model: {', '.join(wanted)}"
         hint = f"set sensors.{group.name}.frame_by_recorded_name: {{POINT: FRAME}}, or sensors.{group.name}.use: false"
         listed = unknown_name_error_arguments("", around.system.point_frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
@@ -74,7 +74,7 @@ def _points(
     inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
     if isinstance(choice.std, Mapping):
-        what, hint = "the group of points has several standard deviations", "give one number for all points"
+        what, hint = "the setting has several standard deviations for one point group", "set one number for all points"
         raise ConfigError(what, where=f"sensors.{group.name}.std", allowed="one number above 0 [m]", hint=hint)
     if choice.std is not None:
         std = np.full(value.shape, float(choice.std))
@@ -90,7 +90,7 @@ def _points(
 def _clock_offset_std(
     around: base.SensorDataInputs, sensor: PointSensor, group: base.RecordedPointGroup, choice: base.SensorOptions
 ) -> float:
-    """Standard deviation of the clock's offset [s]: stated, recorded, or half a sample unless an effect delays it."""
+    """Standard deviation [s] of the clock's offset: stated, recorded, else half a sample or (clock not free) zero."""
     stated = group.clock_offset_std if choice.clock_offset_std is None else choice.clock_offset_std
     if stated is not None:
         return stated
@@ -103,7 +103,7 @@ def _clock_offset_std(
 
 
 def _rates(t: Array, values: Array) -> Array:
-    """Rates of change (M, k) of outputs, by central differences of the measurements; zero if not measured."""
+    """Rates of change (M, k) [1/s] of outputs, by central differences of the measurements. Zero if not measured."""
     rates = np.zeros(values.shape)
     for column, rate in zip(values.T, rates.T, strict=True):
         if np.count_nonzero(seen := np.isfinite(column)) > 1:

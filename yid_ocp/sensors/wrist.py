@@ -26,7 +26,7 @@ _N_LOCKED_JOINTS = 6
 
 @register_mounted_sensor
 class _WristForceSensor(MountedSensor):
-    """Force on the sensor."""
+    """Force that the part beyond the sensor exerts on it, along the sensor frame's axes."""
 
     channel = CHANNEL_KINDS.register("wrist.force")(RecordedChannelSpec("wrist", "force", "N", _XYZ, _SIGN))
 
@@ -36,7 +36,7 @@ class _WristForceSensor(MountedSensor):
 
 @register_mounted_sensor
 class _WristTorqueSensor(MountedSensor):
-    """Torque on the sensor about its frame's origin."""
+    """Torque that the part beyond the sensor exerts on it about the origin of its frame, along the frame's axes."""
 
     channel = CHANNEL_KINDS.register("wrist.torque")(RecordedChannelSpec("wrist", "torque", "N m", _XYZ, _SIGN))
 
@@ -45,7 +45,7 @@ class _WristTorqueSensor(MountedSensor):
 
 
 def _wrench_on_sensor(state: NodeStateSymbols, frame: str) -> ca.SX:
-    """Force and torque (6, 1), along the frame's axes, that the part beyond a frame exerts on a sensor there."""
+    """Force and torque (6, 1), along the frame's axes, that the part beyond a frame exerts on the sensor in it."""
     system, first = _cut_at_frame(state.system, frame)
     locked, n = slice(first, first + _N_LOCKED_JOINTS), system.n_coordinates
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
@@ -73,7 +73,7 @@ def _wrench_on_sensor(state: NodeStateSymbols, frame: str) -> ca.SX:
 
 
 def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
-    """The system with the part beyond a frame on six locked joints, and the index of the first of these joints."""
+    """Copy of a system in which six locked joints carry the part beyond a frame, and the index of the first of them."""
     tree = system.mechanism
     frame = tree.frame(name)
     before, first = frame.joint_index, frame.joint_index + 1
