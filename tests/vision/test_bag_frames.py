@@ -149,9 +149,9 @@ def test_messages_of_one_time_are_told_apart(tmp_path):
         (lambda bag: bag.cloud(0, CLOUDS[0]), {"unit": "cm"}, "the unit is 'cm'"),
         (lambda bag: bag.joints(0), {}, "no clouds and no depth images"),
         (lambda bag: [bag.cloud(0, CLOUDS[0], topic=name) for name in ("/a", "/b")], {}, "2 topics of clouds"),
-        (lambda bag: bag.image(0, DEPTH, "16UC1"), {}, "intrinsics of the camera are not known"),
+        (lambda bag: bag.image(0, DEPTH, "16UC1"), {}, "intrinsics of the camera are unknown"),
         (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(NO_LENS)], {}, "is not calibrated"),
-        (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(model="odd")], {}, "the distortion model is 'odd'"),
+        (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(model="odd")], {}, "model 'odd' is unknown"),
     ],
 )
 def test_what_a_bag_lacks_is_said(tmp_path, fill, options, message):
@@ -173,7 +173,7 @@ def test_a_cloud_without_places_and_a_cut_off_one_are_bad_frames(tmp_path):
 
 def test_damaged_bags_and_other_files_are_refused(tmp_path):
     damaged = (("a.bag", b"#ROSBAG V2.0\nnonsense", "bag"), ("b.mcap", b"x" * 40, "bag"), ("c.db3", b"", "bag"))
-    for name, text, message in (*damaged, ("d.txt", b"", "not a sequence of frames")):
+    for name, text, message in (*damaged, ("d.txt", b"", "not a frame sequence")):
         (tmp_path / name).write_bytes(text)
         with pytest.raises(DataError, match=message):
             read_frames(tmp_path / name, pose=POSE)

@@ -98,7 +98,7 @@ def test_without_a_good_frame_the_reasons_and_pictures_are_left(carried_out, con
     assert "no frame could be used" in done.err
     assert str(done.folder) in done.err
     assert "no frame could" in done.result["refused"]
-    assert all("no point lies where the object can reach" in frame["reason"] for frame in done.result["frames"])
+    assert all("no point lies in the region" in frame["reason"] for frame in done.result["frames"])
     assert len(list((done.folder / "pictures").glob("*_cloud.png"))) == 1
     assert not (done.folder / "recording.h5").exists()
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]

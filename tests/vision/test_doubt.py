@@ -68,7 +68,7 @@ def test_a_wrong_length_further_up_moves_everything_and_is_found(track):
     assert "T1.length is estimated: " in found.dimensions.messages[0]
     with pytest.raises(DataError, match=r"no point is known|no frame could be used") as caught:
         track(longer, frames=3, filters=COARSE)
-    assert caught.value.what.startswith("the object seems to be other than the model says (T1.length")
+    assert caught.value.what.startswith("the object's dimensions contradict the model (T1.length")
     assert "T1.length seems to be wrong" in caught.value.hint
 
 
@@ -105,7 +105,7 @@ def test_what_sizes_do_to_points():
     covariance = np.diag([0.01**2, 0.02**2])
     change = np.array([0.05, 0.05])  # five and two and a half standard deviations
 
-    told = "the object seems to be other than the model says (a.length 1000 mm where 1051 mm fits)"
+    told = "the object's dimensions contradict the model (a.length: 1000 mm in the model, 1051 mm by the fit)"
     for used, std in (((False, False), [0.05, 0, 0]), ((True, False), [0.01, 0, 0]), ((True, True), [0.01, 0.02, 0])):
         check = TubeDimensionEstimates(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5)
         assert check.point_std_due_to_dimensions(moves)[0] == pytest.approx(std)

@@ -84,7 +84,7 @@ def test_formats_of_clouds(open3d, folder, ending, coloured):
         ("a.npz", lambda file: np.savez(file, dots=CLOUD), "no array `points`"),
         ("a.npz", lambda file: np.savez(file, points=CLOUD[:, :2]), "no array `points`"),
         ("a.npz", lambda file: np.savez(file, points=np.array([{}])), "damaged"),
-        ("a.npz", lambda file: np.savez(file, points=CLOUD, colours=COLOURS[:2]), "does not have one colour per point"),
+        ("a.npz", lambda file: np.savez(file, points=CLOUD, colours=COLOURS[:2]), "is not one RGB colour per point"),
         ("a.npz", lambda file: file.write_bytes(b"PK nonsense"), "damaged"),
         ("a.xyz", lambda file: file.write_text("1 2\n3 4\n"), "has 2 columns"),
         ("a.xyz", lambda file: file.write_text("1 2 here\n"), "cannot be read"),
@@ -247,8 +247,8 @@ WRONG = {
     "none": (ply_head("ascii", 0), "has no vertices"),
     "cut": (SOUND["little"][:-5], "declares 7 points"),
     "cut by one byte": (SOUND["little"][:-1], "declares 7 points"),
-    "cut text": (ply_head("ascii") + TEXT[:90], "a vertex is not|vertices are missing|declares"),
-    "words": (ply_head("ascii") + TEXT.replace(b"0.5", b"0.5 one", 1), "a vertex is not"),
+    "cut text": (ply_head("ascii") + TEXT[:90], "a vertex differs|vertices are missing|declares"),
+    "words": (ply_head("ascii") + TEXT.replace(b"0.5", b"0.5 one", 1), "a vertex differs"),
 }
 
 
@@ -319,7 +319,7 @@ def test_pixels_that_a_lens_does_not_have_are_no_points():
 @pytest.mark.parametrize(
     ("model", "coefficients", "message"),
     [
-        ("inverse_brown", (0.1, 0, 0, 0, 0), "the distortion model is 'inverse_brown'"),
+        ("inverse_brown", (0.1, 0, 0, 0, 0), "the distortion model 'inverse_brown' is unknown"),
         ("plumb_bob", (0.1, 0.2), "has the coefficients"),
         ("equidistant", (np.nan, 0, 0, 0), "has the coefficients"),
     ],

@@ -146,7 +146,7 @@ BAD = {
     "the cloud has no finite points": lambda points: points[:0],
     "the cloud has no finite points:": lambda points: np.full_like(points, np.nan),
     "not in metres": lambda points: 1000 * points,
-    "no point lies where the object can reach": lambda points: points + np.array([30.0, 0.0, 0.0]),
+    "no point lies in the region that the object can reach": lambda points: points + np.array([30.0, 0.0, 0.0]),
     "too few points of the object": lambda points: points[:60],
     "an end is not where its gripper is": lambda points: points * [1.0, 1.0, 1.05],
     "the cloud is empty or cannot be read": lambda points: unreadable(),
@@ -175,7 +175,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     duplicate, missing, late = (reports[3 + len(bad) + k] for k in range(3))
     assert "a duplicate" in duplicate
     assert "not a number" in missing
-    assert late == "there are no joint angles at its time"
+    assert late == "no joint angles were recorded at its time"
     assert sum(found.frame_drop_reason_counts.values()) == len(bad) + 3
 
 
@@ -192,7 +192,7 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, messa
         track_object(SceneDescription(system), small.recording, sequence, options)
     assert message in caught.value.what
     assert caught.value.what.endswith(f"({len(small.clouds)} of {len(small.clouds)})")  # all for one reason
-    assert "other than the model says" not in caught.value.what
+    assert "dimensions contradict the model" not in caught.value.what
     assert caught.value.hint
 
 

@@ -1,4 +1,4 @@
-"""Measurement of an object's points in the clouds of a depth camera, and simulation of such clouds.
+"""Measurement of an object's points from the point clouds of a depth camera, and simulation of such clouds.
 
 Letters in shapes: N points of a cloud, K links or skeleton nodes, np points of the model, M frames, s tubes.
 """

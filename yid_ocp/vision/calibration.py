@@ -1,8 +1,8 @@
 """Calibration of a camera's pose, depth and clock from the visible arm, and detection of late frame stamps.
 
 The remaining uncertainty is an error common to all frames; it is part of the standard deviation of every point. A frame
-whose own clock offset differs from the common offset was stamped late. Offset and latency cannot be separated: both are
-stamp minus joint time.
+whose own clock offset differs from the common offset was stamped late (or early). Clock offset and latency of the
+camera cannot be separated: both are stamp minus joint time.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class CameraClockOptions:
 
 
 class _StampDelay(NamedTuple):
-    """Delay of one frame's time stamp beyond the common clock offset."""
+    """Delay of one frame's time stamp beyond the common clock offset [s], its std [s] and its misfit [m^2]."""
 
     delay: float
     std: float
@@ -111,7 +111,7 @@ def stamp_delay_beyond_clock_offset(
 
 
 def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: float) -> _StampDelay:
-    """The delay near a start, by Gauss-Newton with successively shorter reach."""
+    """The delay near the delay `start` [s], by Gauss-Newton steps that match points within a decreasing distance."""
     x = np.array([start, 0.0, 0.0, 0.0])
     hessian, sigma = np.zeros((4, 4)), _OFF_ARM_DISTANCE
     for share in _REACH_FACTORS:
@@ -137,7 +137,7 @@ def _mean_square(error: Array, count: int) -> float:
 
 
 def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], float]:
-    """Frames with consistent delays, so that late stamps do not bias the others, and their usual misfit [m^2]."""
+    """Indices of the frames with consistent delays, from which the calibration is made, and the median misfit [m^2]."""
     known = {i: entry for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)}
     if not known:
         return [], 0.0
@@ -162,7 +162,7 @@ _CONTRADICTION_STDS = 3.0  # standard deviations
 
 @dataclass(frozen=True)
 class ArmBasedCameraCalibrationOptions:
-    """The priors of the camera calibration, and settings for the use of the visible arm."""
+    """The settings of the camera calibration by the visible arm: which parts are estimated, frames, and priors."""
 
     fix_pose: Annotated[
         bool,
@@ -189,8 +189,8 @@ class ArmBasedCameraCalibrationOptions:
 class CameraCalibration:
     """The result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
 
-    camera_state: CameraState  # used pose, depth and clock
-    prior_state: CameraState
+    camera_state: CameraState  # pose, depth and clock that the tracking uses
+    prior_state: CameraState  # specified pose, depth and clock
     usual_square_distance: float | None  # misfit of single frames [m^2]; None if no clock was compared
     # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero if nothing was estimated
     state_covariance: Array
@@ -222,9 +222,9 @@ class CameraCalibration:
 
 
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
-    """Make a calibration from the given pose and clock offset, without estimation. `reason` says why."""
+    """Return a calibration with the specified pose and clock offset. `reason` says why nothing was estimated."""
     offset = options.initial_stamp_minus_joint_time
-    text = f"clock offset {1e3 * offset:.0f} ms as given" + (f": {reason}" if reason else "")
+    text = f"clock offset {1e3 * offset:.0f} ms as specified" + (f": {reason}" if reason else "")
     state = CameraState(pose, clock_offset=offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
@@ -253,7 +253,7 @@ def calibrate_camera(
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_without_estimation(pose, clock, str(reason))
         known = "track.options.calibration.fix_pose: true and track.options.clock_offset.search_half_width: 0"
-        hint = f"{reason.hint}; with pose and clock known, set {known}"
+        hint = f"{reason.hint}; if pose and clock are known, set {known}"
         what, allowed = f"the camera cannot be calibrated by the arm: {reason}", "frames that show the moving arm"
         raise DataError(what, where=source, allowed=allowed, hint=hint) from None
 
@@ -289,7 +289,7 @@ class _Calibrator:
     def run(self, frames: Sequence[StampedCloud]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
         if len(glimpses) < _MIN_FRAMES:
-            needed = f"it is in view in {len(glimpses)} frames, {_MIN_FRAMES} are needed"
+            needed = f"the arm is in view in {len(glimpses)} frames, {_MIN_FRAMES} are needed"
             raise _UntoldError(needed, "turn the camera so that it sees the arm, or record for longer")
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
@@ -301,7 +301,7 @@ class _Calibrator:
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
-                raise _UntoldError("its frames do not agree on one time", "check the time stamps")
+                raise _UntoldError("no clock offset fits enough frames", "check the time stamps of the frames")
         presence = seen_occluded_and_seen_through_surface_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= _MIN_ARM_COVERAGE * free:
@@ -311,9 +311,9 @@ class _Calibrator:
         covariance = cost(state).state_covariance(self.precision)
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < _MAX_CLOCK_OFFSET_STD:
-            told = f"it moves too little to determine the clock offset: its std is {1e3 * std:.0f} ms"
+            told = f"the arm moves too little to determine the clock offset, whose std is {1e3 * std:.0f} ms"
             known = "set track.options.clock_offset.initial_stamp_minus_joint_time, and search_half_width: 0"
-            raise _UntoldError(told, f"record a livelier motion, or {known}")
+            raise _UntoldError(told, f"record a faster motion, or {known}")
         used_state = state
         if self.options.fix_pose:
             used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
@@ -323,7 +323,7 @@ class _Calibrator:
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
     def _about_the_arm(self, glimpse: StampedCloud) -> StampedCloud | None:
-        """The points around the arm, as seen by the specified camera; None if the arm is out of view."""
+        """The frame's points around the arm, according to the specified state; None if the arm is out of view."""
         own = self.told.world_to_measured_points(self.arm.visible_surface_points_and_parts(self.told, glimpse.stamp)[0])
         points = glimpse.points[glimpse.points[:, 2] > 0]
         if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):
@@ -334,14 +334,14 @@ class _Calibrator:
         return StampedCloud(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
     def _start(self, glimpses: Sequence[StampedCloud]) -> CameraState:
-        """The state at which most of the arm's surface coincides with measured points."""
+        """The initial state of the estimation, at which most of the arm's surface coincides with measured points."""
         few = []
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
             few.append(StampedCloud(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)))
         tried = candidate_calibration_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
         if not tried:
-            raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
+            raise _UntoldError("the arm is hardly in view", "turn the camera so that it sees more of the arm")
         best, most = tried[0], -1.0
         for trial in tried:
             for reach in _STAGE_REACHES:
@@ -356,7 +356,7 @@ class _Calibrator:
     def _rounds(
         self, state: CameraState, frames: list[StampedCloud], reach: float, along: bool, cap: int, rounds: int
     ) -> tuple[CameraState, Callable[[CameraState], RobustCostDerivatives], list[StampedCloud]]:
-        """The state after some steps on a limited number of points per frame, the cost of states, and these points."""
+        """The state after `rounds` steps with up to `cap` points per frame, the cost function and the chosen points."""
         chosen = []
         for glimpse in frames:
             points = state.measured_to_world_points(glimpse.points)
@@ -368,7 +368,7 @@ class _Calibrator:
                 chosen.append(StampedCloud(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _MIN_FRAMES:
             hint = "check the specified pose and the unit of the clouds"
-            raise _UntoldError("what the camera sees does not lie on it", hint)
+            raise _UntoldError("the points of the clouds do not lie on the arm", hint)
 
         def cost(state: CameraState) -> RobustCostDerivatives:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
@@ -387,9 +387,9 @@ class _Calibrator:
         stds = np.sqrt(np.diag(covariance))
         known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms (stamp minus joint time)"
         searched = self.clock.search_half_width > 0
-        words = [f"clock offset {1e3 * state.clock_offset:.1f} ms {known if searched else 'as given'}"]
+        words = [f"clock offset {1e3 * state.clock_offset:.1f} ms {known if searched else 'as specified'}"]
         if abs(state.clock_drift) > 2 * (drift := stds[CLOCK_DRIFT_INDEX]):
-            words.append(f"its drift {1e3 * state.clock_drift:.2f} ms in a second ± {1e3 * drift:.2f}")
+            words.append(f"clock drift {1e3 * state.clock_drift:.2f} ± {1e3 * drift:.2f} ms per second")
         points = self.arm.visible_surface_points_and_parts(state, stamp)[0].mean(axis=0, keepdims=True)
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
         change = state.difference_from(self.told)
@@ -398,11 +398,11 @@ class _Calibrator:
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTION_STDS**2 * 3:
-                off = f"it is seen {1e3 * away:.0f} mm from where the joints have it"
-                words.append(f"the arm contradicts the pose that is kept: {off}, which the standard deviations count")
+                off = f"it sees the arm {1e3 * away:.0f} mm from its place by the joint angles"
+                words.append(f"the arm contradicts the fixed pose of the camera: {off} (included in each point's std)")
         elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
-            off = f"the camera at its given pose sees the arm {1e3 * away:.0f} mm from its measured place: turned by"
-            moved = f"{math.degrees(turn):.1f} degrees, shifted by {1e3 * shift:.0f} mm"
-            words.append(f"{off} {moved}, depth scaled by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}")
+            off = f"the camera at its specified pose sees the arm {1e3 * away:.0f} mm from its place by the joints:"
+            moved = f"pose wrong by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm"
+            words.append(f"{off} {moved}, depth measured {math.exp(-change[DEPTH_SCALE_INDEX]):.3f} times as large")
         return "; ".join(words)

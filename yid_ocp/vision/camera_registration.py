@@ -67,10 +67,10 @@ class CameraState:
 
     pose: Array  # (4, 4), camera in the world, R and t
     depth_scale: float = 1.0  # factor g on a measured depth
-    depth_offset: float = 0.0  # added to that, o [m]
+    depth_offset: float = 0.0  # offset o added to the scaled depth [m]
     clock_offset: float = 0.0  # stamp minus joint time at the stamp `clock_reference_stamp`, tau0 [s]
-    clock_drift: float = 0.0  # growth of that per second, beta
-    clock_reference_stamp: float = 0.0  # s0 [s]
+    clock_drift: float = 0.0  # growth of the clock offset per second, beta
+    clock_reference_stamp: float = 0.0  # stamp s0 at which the clock offset is tau0 [s]
 
     def measured_to_world_points(self, points: Array) -> Array:
         """Transform measured points (N, 3) [m] from the camera's frame to the world."""
@@ -91,7 +91,7 @@ class CameraState:
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
     def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
-        """Compute the Jacobian (N, 3, 8) of world points with respect to the camera's pose and depth."""
+        """Compute the Jacobian (N, 3, 8) of world points (N, 3) with respect to the camera's pose and depth."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
@@ -114,7 +114,7 @@ class CameraState:
         return CameraState(pose, *depth, *clocks)
 
     def difference_from(self, other: CameraState) -> Array:
-        """Compute the difference (10,) of this state from another one, this minus other."""
+        """Return this state minus another one, (10,): the increment that leads from the other state to this one."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
         clock = self.clock_offset - other.clock_offset, self.clock_drift - other.clock_drift
@@ -134,7 +134,7 @@ class StampedCloud:
 
 
 class _CalibrationEquations(NamedTuple):
-    """Linearised calibration equations of one frame's points near the arm."""
+    """Linearised calibration equations of one frame's points near the arm, one row for each point."""
 
     jacobian: Array
     residuals: Array
@@ -147,7 +147,7 @@ class ArmSurface:
 
     robot_surfaces: ArticulatedSurfaces
     configuration_at: Callable[[float], Array]  # function of the joints' time
-    # from a configuration to where the grippers hold the object, shape (G, 3) [m], and how near points may be its [m]
+    # grasp positions (G, 3) [m] at a configuration; points within the radius [m] of one may belong to the object
     grasp_positions_at: Callable[[Array], Array]
     grasp_exclusion_radius: float
 
@@ -159,7 +159,7 @@ class ArmSurface:
         return self.robot_surfaces.part_poses_at_configuration(self.configuration_at(t))
 
     def visible_surface_points_and_parts(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
-        """Return world points on moving surfaces that an unobstructed camera sees, and each point's surface part."""
+        """Return world points (N, 3) on moving surfaces that an unobstructed camera sees, and their surface parts."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_incidence_and_part(_START_INTRINSICS, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _MIN_INCIDENCE_COSINE) & (part >= 0) & self._moving[part]
@@ -167,7 +167,7 @@ class ArmSurface:
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
     def near_moving_surface_off_grasps_mask(self, points: Array, t: float, within: float) -> BoolArray:
-        """Check for each world point whether it is near a moving surface and not near a grasp."""
+        """Check for each world point (N, 3) whether it is `within` [m] of a moving surface and not near a grasp."""
         q = self.configuration_at(t)
         result = self.robot_surfaces.within_surface_distance_mask(points, q, within, moving_only=True)
         for held in self.grasp_positions_at(q):
@@ -177,7 +177,7 @@ class ArmSurface:
     def match_points_to_surface(
         self, points: Array, origin: Array, t: float, reach: float, along: bool
     ) -> _SurfaceMatches:
-        """Match world points to the arm's surface, along camera rays (`along`) or to the nearest surface point."""
+        """Match world points (N, 3) to the arm's surface within `reach`, along camera rays (`along`) or the nearest."""
         q = self.configuration_at(t)
         if along:
             ahead = points - origin
@@ -202,7 +202,7 @@ class ArmSurface:
     def linearized_surface_distances(
         self, state: CameraState, frame: StampedCloud, reach: float, along: bool
     ) -> _CalibrationEquations:
-        """Linearise distances [m] of points within `reach` from the arm in the camera state. `along`: camera rays."""
+        """Linearise the distances [m] of a frame's points from the arm by the camera state. `along`: camera rays."""
         points, t = state.measured_to_world_points(frame.points), float(state.stamps_to_joint_clock(frame.stamp))
         met = self.match_points_to_surface(points, state.pose[:3, 3], t, reach, along)
         slope = np.empty((len(met.point_indices), CAMERA_STATE_SIZE))
@@ -238,7 +238,7 @@ class RobustCostDerivatives:
     score_covariance: Array
 
     def corrected_hessian_gradient_and_factor(self, precision: Array) -> tuple[Array, Array, float]:
-        """Return Hessian and gradient, each times a weight, and the weight. `precision`: inverse prior covariance."""
+        """Return weighted Hessian and gradient, and this weight of the data. `precision`: inverse prior covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
         excess = np.linalg.solve(whole, self.score_covariance * np.outer(scale, scale))
@@ -253,7 +253,7 @@ class RobustCostDerivatives:
 
 
 def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostDerivatives:
-    """Compute the gradient and Hessian of the robust cost over the points of all frames, scaled by the median error."""
+    """Return the derivatives of the robust cost of all frames' points. The median error sets the scale of the cost."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     sigma = max(MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
     square = (residuals / min(_ROBUST_SCALE_STDS * sigma, reach)) ** 2
@@ -275,7 +275,7 @@ def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: fl
 
 
 def _at_least(least: Array, matrix: Array) -> Array:
-    """A symmetric matrix that is in no direction smaller than another, positive definite one."""
+    """The symmetric `matrix`, enlarged where it is smaller in some direction than the positive definite one `least`."""
     base = least + 1e-12 * np.diag(np.diag(least)) + 1e-300 * np.eye(len(least))
     values, vectors = eigh(matrix, base)
     back = vectors.T @ base  # the inverse of the vectors, which are orthonormal in the base
@@ -287,8 +287,8 @@ def candidate_calibration_states(
 ) -> list[CameraState]:
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
-    Returns at most `count` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets are within `search` [s]
-    of the offset of the specified state `specified`.
+    Returns at most `count` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets differ from that of the
+    specified state by at most `search` [s].
     """
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
@@ -317,7 +317,7 @@ def candidate_calibration_states(
 def _add_costs(
     total: Array, arm: ArmSurface, told: CameraState, glimpse: StampedCloud, delays: Array, cells: IntArray
 ) -> None:
-    """Add the costs of the arm's points, `delays` [s] earlier and shifted by cells, to `total` (delays, cells)."""
+    """Add a frame's costs to `total` (delays, cells), with the arm `delays` [s] earlier and shifted by the cells."""
     from scipy.ndimage import distance_transform_edt  # slow to import; only needed to search for the camera's pose
 
     points, part = arm.visible_surface_points_and_parts(told, glimpse.stamp)
@@ -359,18 +359,18 @@ def _add_costs(
 
 @dataclass(frozen=True)
 class SurfaceObservationFractions:
-    """The fractions of the arm's surface in view that a cloud contains, occludes or sees through."""
+    """The fractions of the arm's visible surface on which, before which or behind which points were measured."""
 
-    there: float  # a cloud has it
-    covered: float  # something is before it
-    through: float  # the camera saw through it
-    samples: int
+    there: float  # fraction with measured points on it
+    covered: float  # fraction with measured points before it
+    through: float  # fraction with measured points behind it
+    samples: int  # number of surface points that were compared
 
 
 def seen_occluded_and_seen_through_surface_fractions(
     arm: ArmSurface, frames: Sequence[StampedCloud], state: CameraState, within: float
 ) -> SurfaceObservationFractions:
-    """Return which fractions of the arm's visible surface clouds contain (within `within` [m]), hide or see through."""
+    """Return the fractions of the arm's visible surface with points on it (`within` [m]), before it or behind it."""
     counts = np.zeros(4)
     for glimpse in frames:
         points, _ = arm.visible_surface_points_and_parts(state, glimpse.stamp)

@@ -2,10 +2,10 @@
 
     q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
 
-p_i is a point of the cloud (f = 1), or a node of its skeleton, the mean of a tube's visible half (f = pi/4). c_i is the
-nearest point of the model's line segments, r_i the radius of its tube, rho the Geman-McClure loss. g is the distance of
-held frames from the grippers. b are bends times the square root of their stiffness. Twists about a tube's axis do not
-move its centre line and stay at zero.
+p_i is a point of the cloud (f = 1), or a node of its skeleton, the mean of a tube's visible half (f = pi/4). w_i is its
+weight, c_i the nearest point of the model's line segments, r_i the radius of its tube, rho the Geman-McClure loss. g is
+the distance of held frames from the grippers, s_g its standard deviation. b are bends times the square root of their
+relative stiffness. Twists about a tube's axis do not move its centre line and stay at zero.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class ShapeFitOptions:
         check_option_bounds(self, "fit options")
         if not self.node_loss_scales and not self.surface_loss_scales:
             what, where = "node_loss_scales and surface_loss_scales are both empty", "track.options.shape_fit"
-            raise ConfigError(what, where=where, allowed="one scale or more [m]", hint="add a scale to one of them")
+            raise ConfigError(what, where=where, allowed="one scale or more [m]", hint="add a scale to one setting")
 
 
 class ShapeFitter:
@@ -165,8 +165,8 @@ class ShapeFitter:
         no points.
         """
         if not len(cloud.points) or not len(cloud.skeleton_nodes):
-            what, allowed = "the cloud has no points or no skeleton nodes", "one point and one node or more"
-            raise DataError(what, where="sight", allowed=allowed, hint="check the filters, or give another cloud")
+            what, allowed = "the cloud has no points or no skeleton nodes", "a cloud with points and skeleton nodes"
+            raise DataError(what, where="argument cloud", allowed=allowed, hint="check the filters of the cloud")
         free = list(self.free_joints)
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
@@ -193,7 +193,7 @@ class ShapeFitter:
         return trial
 
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
-        """A configuration with some tubes undeformed."""
+        """The configuration `q`, but with the tubes named `tubes` undeformed."""
         free = list(self.free_joints)
         again = np.array([owner in tubes for owner in self._free_joint_segments])
         return self._with_free(q, np.where(again, self.rest_configuration[free], q[free]))
@@ -204,7 +204,7 @@ class ShapeFitter:
     def _rivals(
         self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud
     ) -> list[Array]:
-        """Other shapes that fit the cloud equally well, if a foreign object touches a tube."""
+        """Configurations of other shapes that may fit the cloud, one for each tube that a foreign object touches."""
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
         tubes = self.tube_links_at_configuration(best.q)
@@ -221,7 +221,7 @@ class ShapeFitter:
         return found
 
     def _failed(self, evidence: ShapeFitQualityAndPointClasses) -> set[str]:
-        """Tubes of which too large a part is visibly empty."""
+        """Names of the tubes that have points on too small a part of their visible length."""
         own = {name: self._lengths * self._links_of({name}) for name in self.link_segments}
         empty, covered = evidence.visibly_empty_fraction, evidence.covered_fraction_of_visible_links
         return {name for name, mine in own.items() if mine @ empty > 0 and covered(mine) < _MIN_TUBE_COVERAGE}
@@ -229,7 +229,7 @@ class ShapeFitter:
     def _without(
         self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud, links: BoolArray
     ) -> _Left:
-        """All nodes and points except those on some links."""
+        """Masks of the nodes and points that are not on the links of the mask `links`."""
         tubes, nodes = self.tube_links_at_configuration(best.q), sight.skeleton_nodes
         link = tube_link_projections(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (evidence.is_own | evidence.is_contested)
@@ -239,7 +239,7 @@ class ShapeFitter:
     def _attempt(
         self, sight: ProcessedFrameCloud, starts: Sequence[Array], left: _Left
     ) -> tuple[_Minimum, ShapeFitQualityAndPointClasses]:
-        """The best shape through some of the nodes and points, refined with the points that belong to it."""
+        """The best shape by the nodes and points of the masks `left`, refined with the points that belong to it."""
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
         tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
@@ -261,7 +261,7 @@ class ShapeFitter:
     def _tasks(
         self, sight: ProcessedFrameCloud, at_nodes: BoolArray, at_points: BoolArray
     ) -> tuple[list[_Task], list[_Task]]:
-        """The passes on the nodes and those on the points."""
+        """The passes on the chosen nodes, and the passes on the chosen points."""
         options, camera = self.options, sight.camera_position
         factor = 1.0 / (_CORRELATED_POINTS * options.surface_noise_std**2)
         weight = np.minimum(sight.point_weights, _MAX_POINT_WEIGHT)[at_points]
@@ -274,7 +274,7 @@ class ShapeFitter:
         return nodes_first, points_then
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
-        """Minimum after several passes, each starting at the result of the previous one."""
+        """The minimum after several passes, each of which starts at the result of the previous one."""
         end, most = start, _MAX_ITERATIONS
         for task in tasks:
 
@@ -295,7 +295,7 @@ class ShapeFitter:
         rivals: Sequence[Array],
         sight: ProcessedFrameCloud,
     ) -> FrameShapeFit:
-        """The shape with its standard deviations and fit quality."""
+        """The fitted shape of a frame, with the standard deviations of its points and the quality of its fit."""
         q, on_shape = best.q, evidence.is_own | evidence.is_contested
         points, jacobian = self._seen(q)
         places = points.reshape(-1, 3)
@@ -338,7 +338,7 @@ class ShapeFitter:
         )
 
     def _quadratic(self, q: Array, task: _Task) -> LocalQuadraticModel:
-        """Cost, gradient and Gauss-Newton Hessian with respect to the free bends."""
+        """Cost of a pass at `q`, with gradient and Gauss-Newton Hessian by the free joints."""
         out, by_q = self._corners(q)
         corners = out.reshape(-1, 2, 3)
         seen = task.points, task.camera, task.share
@@ -380,7 +380,7 @@ class ShapeFitter:
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
     ) -> FrameTubeDimensionCost:
-        """Cost of lengths and radii by the points of a frame at its fitted shape."""
+        """Cost of tube lengths and radii in a frame, from the points of the pass `task` at the fitted shape `q`."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
         corners, jacobian = self._links_at(q), self._corners(q)[1]
@@ -427,7 +427,7 @@ class ShapeFitter:
         return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
     def gripper_positions_at_configuration(self, q: ArrayLike) -> Array:
-        """Return the gripper positions (grasps, 3) [m] at a configuration."""
+        """Return the positions (grasps, 3) [m] of the grippers' frames at a configuration."""
         return self._holders(np.asarray(q, float))[0].reshape(-1, 3)
 
     def point_frame_positions(self, q: ArrayLike) -> Array:
@@ -436,7 +436,7 @@ class ShapeFitter:
 
 
 class _Minimum(NamedTuple):
-    """Minimum of the passes: configuration, Hessian by the free bends, and cost."""
+    """Minimum of the passes: configuration, Hessian by the free joints, and cost."""
 
     q: Array
     hessian: Array
@@ -444,7 +444,7 @@ class _Minimum(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """One pass: points, their weights, their location on the tubes, loss scale, camera, observed ends."""
+    """One pass: points or nodes, their weights, distance from the axis in radii, loss scale, camera, observed ends."""
 
     points: Array
     weight: Array
@@ -457,9 +457,9 @@ class _Task(NamedTuple):
 def _symbolic_functions(system: System, options: ShapeFitOptions, free_joints: Sequence[int]) -> dict[str, ca.Function]:
     """Functions of the configuration and of all parameters, by name.
 
-    `corners` of the links, `seen` points of the system and errors of `held` frames in standard deviations have
-    derivatives by the free joints as a second output. `gap` of the grasps, `holders` and places `taken` by them.
-    `grown`: derivatives of the first three by the logarithm of each tube's length.
+    `corners` (ends of the links), `seen` (points of the system) and `held` (errors of held frames, in standard
+    deviations) have derivatives by the free joints as a second output. `grown` has the derivatives of these three by
+    the logarithm of each tube's length. `gap`: errors of the grasps [m]; `holders`, `taken`: positions of their frames.
     """
     symbols, tree, (q, kinematics) = system.parameters.symbols, system.mechanism, system.symbols_and_kinematics
     corners = []

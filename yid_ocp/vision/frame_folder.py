@@ -1,4 +1,4 @@
-"""Functions that read and write folders of clouds or depth images with time stamps and a camera (`yid-frames/1`).
+"""Functions that read and write folders of clouds or depth images with time stamps and camera data (`yid-frames/1`).
 
 PLY files (Turk 1994, The PLY polygon file format) are read in Python: a damaged file must not end the process.
 """
@@ -34,11 +34,11 @@ _MAX_FRAME_BYTES = 1 << 28  # largest size of one cloud or image
 
 
 _Cloud = tuple[Array, frames.PointColourArray | None]
-"""Points in the file's unit, and their red, green and blue where it has them, both (N, 3)."""
+"""Points (N, 3) in the file's unit, and their red, green and blue (N, 3) or None."""
 
 
 def _read_cloud(path: Path, coloured: bool = False) -> _Cloud:
-    """A cloud; colours of PLY files only if requested."""
+    """The cloud in a file. The colours of a PLY file are read only if `coloured`."""
     files.check_input_file(path, _MAX_FRAME_BYTES)
     if path.suffix.lower() == ".ply":
         return _read_ply(path, coloured)
@@ -64,7 +64,7 @@ def _read_npz(path: Path) -> _Cloud:
         what, hint = f"the file has no array `{_POINTS_ARRAY}` of points", "write the points as this array"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
-        what, hint = f"the array `{_COLOURS_ARRAY}` does not have one colour per point", "correct it, or leave it out"
+        what, hint = f"the array `{_COLOURS_ARRAY}` is not one RGB colour per point", "correct it, or leave it out"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     return points.astype(np.float64), colours
 
@@ -122,11 +122,11 @@ _NUMPY_TYPES = {
 _AXIS_PROPERTIES, _COLOUR_PROPERTIES = ("x", "y", "z"), ("red", "green", "blue")
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _Element = tuple[str, int, list[tuple[str, str]]]
-"""A table of a PLY file: its name, its number of rows, its columns with NumPy's names of their types, "" for lists."""
+"""A table of a PLY file: name, number of rows, and columns by name and NumPy's name of their type ("" for a list)."""
 
 
 def _read_ply(path: Path, coloured: bool) -> _Cloud:
-    """Positions and colours of the vertices; other properties and later elements are ignored."""
+    """Positions and colours of a PLY file's vertices. Other properties and later elements are ignored."""
     head, end, body = path.read_bytes().partition(b"end_header")
     line, _, body = body.partition(b"\n")
     if not end or len(head) > _MAX_HEADER_BYTES or line.strip() or not head.startswith(b"ply"):
@@ -136,7 +136,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
         if name == "vertex":
             return _vertices(path, count, columns, order, body, coloured)
         if any(not kind for _, kind in columns):  # their length is unknown
-            raise _damaged(path, f"lists of '{name}' stand before the vertices")
+            raise _damaged(path, f"lists ('{name}') before the vertices are not supported")
         if order:
             body = body[count * sum(np.dtype(kind).itemsize for _, kind in columns) :]
         else:
@@ -145,12 +145,12 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
 
 
 def _damaged(path: Path, why: str) -> DataError:
-    allowed, hint = f"a whole {path.suffix} file of points with x, y and z", "copy the file again, or export it again"
+    allowed, hint = f"a complete {path.suffix} file with x, y, z of points", "copy the file again, or export it again"
     return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), allowed=allowed, hint=hint)
 
 
 def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
-    """Byte order (empty for ASCII), and the elements in file order."""
+    """Byte order (empty for ASCII) and elements, in file order, that the header `text` of a PLY file declares."""
     order: str | None = None
     found: list[_Element] = []
     for line in text.splitlines()[1:]:
@@ -177,7 +177,7 @@ def _vertices(
 ) -> _Cloud:
     names, kinds = zip(*columns, strict=True) if columns else ((), ())
     if len(set(names)) < len(names) or not set(_AXIS_PROPERTIES) <= set(names) or "" in kinds:
-        raise _damaged(path, "its vertices have no x, y and z, or lists")
+        raise _damaged(path, "its vertices lack x, y or z, contain lists, or name a property twice")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if count * size > len(body) + (not order):  # the last line of a text may end without a newline
         raise _damaged(path, f"it declares {count:.3g} points in {len(body)} bytes")
@@ -192,7 +192,7 @@ def _vertices(
             lines = [line.split() for line in body.split(b"\n", count)[:count]]
             values = np.array([[float(row[names.index(name)]) for name in wanted] for row in lines])
         except (ValueError, IndexError) as error:
-            raise _damaged(path, f"a vertex is not what its head says ({error})") from error
+            raise _damaged(path, f"a vertex differs from the header ({error})") from error
     if len(values) < count:
         raise _damaged(path, "vertices are missing")
     return values[:, :3], values[:, 3:].astype(np.uint8) if len(wanted) > 3 else None
@@ -218,7 +218,7 @@ def read_frame_folder(
     path = Path(folder)
     if not path.is_dir():
         allowed = f"a folder with {STAMP_FILE} and clouds or depth images"
-        raise DataError("there is no such folder", where=str(path), allowed=allowed, hint="check the path")
+        raise DataError("the folder of frames does not exist", where=str(path), allowed=allowed, hint="check the path")
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
     camera = frames.validated_camera_pose(head.get("pose") if pose is None else pose, where)
@@ -247,7 +247,7 @@ def read_frame_folder(
 
 
 def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike[str]) -> None:
-    """Write a frame sequence as binary PLY clouds for `read_frame_folder`. Raises `OutputError`."""
+    """Write a frame sequence as a folder that `read_frame_folder` reads (PLY clouds). `OutputError` if this fails."""
     path, o3d = files.make_folder(folder), frames.import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):
@@ -299,7 +299,7 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: frames.CameraIn
             what, hint = f"'{name}' is neither a cloud nor a depth image", "remove the row, or convert the file"
             raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known), hint=hint)
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
-            what, hint = "the intrinsics of the camera are missing, which depth images need", "add `intrinsics`"
+            what, hint = "the intrinsics of the camera are missing; depth images need them", "add the key `intrinsics`"
             allowed = "intrinsics with width, height, fx, fy, cx, cy [pixels]"
             raise DataError(what, where=str(folder / _CAMERA_FILE), allowed=allowed, hint=hint)
 
@@ -311,7 +311,7 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        what, hint = "the intrinsics lack keys, or have unknown ones", "correct the keys"
+        what, hint = "the intrinsics lack keys or have unknown keys", "write exactly the allowed keys"
         raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
@@ -330,7 +330,7 @@ def _number(value: object, name: str, where: str) -> float:
 def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
     allowed = "CSV with the columns file, t [s]"
     if not path.exists():
-        what, hint = "the file of time stamps does not exist", "write it, with one row per frame"
+        what, hint = "the file of time stamps does not exist", "write the file, with one row per frame"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     try:
         rows = list(csv.DictReader(files.read_input_text(path).splitlines()))
@@ -349,5 +349,5 @@ def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
             times.append(float(row["t"]))
         except (TypeError, ValueError) as error:
             where, hint = f"{path}, line {number}", "correct the time, or remove the row"
-            raise DataError(f"the time is {row['t']!r}", where=where, allowed="a number [s]", hint=hint) from error
+            raise DataError(f"the stamp is {row['t']!r}", where=where, allowed="a number [s]", hint=hint) from error
     return tuple(str(row["file"]) for row in rows), np.array(times)

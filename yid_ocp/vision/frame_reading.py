@@ -33,7 +33,7 @@ _PER_METRE = "/option/Depth_Units/value"  # topic of RealSense's files with the 
 
 
 def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str | None) -> FrameSequence:
-    """Open the frames in a bag."""
+    """Return the frames in a bag as a sequence, which decodes each frame on demand."""
     camera = validated_camera_pose(pose, str(path))
     bag, scale = OpenBag(path), metres_per_named_unit(unit, str(path))
     name = _topic(bag, topic)
@@ -84,7 +84,7 @@ def _decoded(bag: OpenBag, message: BagMessage) -> Any:
             if number == before:
                 return bag.reader.deserialize(data, connection.msgtype)
     what, allowed = "the bag has changed since it was opened", "a bag that is not being written"
-    raise DataError(what, where=str(bag.path), allowed=allowed, hint="run the command again once it is complete")
+    raise DataError(what, where=str(bag.path), allowed=allowed, hint="run the command again when the bag is complete")
 
 
 def _first(bag: OpenBag, topic: str) -> Any:
@@ -95,12 +95,12 @@ def _first(bag: OpenBag, topic: str) -> Any:
 
 
 def _empty_topic(bag: OpenBag, topic: str) -> DataError:
-    what, allowed = f"there is no message on the topic '{topic}'", "a topic with one message or more"
+    what, allowed = f"the topic '{topic}' has no messages", "a topic with one message or more"
     return DataError(what, where=str(bag.path), allowed=allowed, hint="choose another topic with track.frame_topic")
 
 
 def _depth_unit(bag: OpenBag, topic: str) -> float:
-    """Factor on the usual unit of depth images, from the file of a RealSense camera; 1 if not stated."""
+    """Unit of the depth images, in units of 1 mm, as a RealSense camera's file states it; 1 if not stated."""
     for name in (entry.name for entry in bag.topics):
         if name.endswith(_PER_METRE) and name.split("/")[:3] == topic.split("/")[:3]:
             return float(_first(bag, name).data) / _DEPTH_ENCODINGS["mono16"][1]
@@ -131,12 +131,12 @@ def _is_depth(bag: OpenBag, topic: str) -> bool:
 
 
 def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
-    """Intrinsics from the camera messages whose topic is most similar to an image's topic."""
+    """Camera intrinsics from the `CameraInfo` topic that has the longest common path with an image's topic."""
     infos = bag.topic_names_of_types(_CAMERA_INFO_MESSAGE)
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
-        what = f"the intrinsics of the camera are not known: the bag has {len(nearest)} topics that may have them"
+        what = f"the intrinsics of the camera are unknown: {len(nearest)} topics of the bag may contain them"
         allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
         raise DataError(what, where=str(bag.path), allowed=allowed, hint=f"record {beside_it}/camera_info as well")
     info = _first(bag, nearest[0])
@@ -150,7 +150,7 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     fx, _, cx, _, fy, cy = matrix[:6]
     if not (fx > 0 and fy > 0):
         hint = "calibrate the camera, or write a folder of frames with camera.json"
-        what, allowed = "the camera is not calibrated: its focal length is 0", "a focal length above 0 [pixels]"
+        what, allowed = "the camera is not calibrated: a focal length is not above 0", "focal lengths above 0 [pixels]"
         raise DataError(what, where=f"{bag.path}: {nearest[0]}", allowed=allowed, hint=hint)
     model = {"": "plumb_bob", "fisheye": "equidistant"}.get(str(info.distortion_model), str(info.distortion_model))
     return CameraIntrinsics(*size, fx, fy, cx, cy, model, tuple(bent))
@@ -174,7 +174,7 @@ def _depth(content: Any, per_metre: float, where: str) -> Array:
 
 
 def _cloud_columns(content: Any, names: Iterable[str], where: str) -> list[NDArray[Any]] | None:
-    """Some fields (N,) of a PointCloud2; None if one is missing."""
+    """The fields `names` of a PointCloud2, each (N,). None if the cloud lacks one of them."""
     fields = {str(field.name): field for field in content.fields}
     height, width, step, row = (int(getattr(content, k)) for k in ("height", "width", "point_step", "row_step"))
     data = np.asarray(content.data, np.uint8).tobytes()
@@ -232,7 +232,7 @@ def read_frames(
         return _read_bag_frames(place, pose, unit or "m", topic)
     if place.exists():
         allowed = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})"
-        hint = "write the depth images of another camera as 16-bit PNG into a folder with camera.json"
-        raise DataError("this is not a sequence of frames", where=str(place), allowed=allowed, hint=hint)
+        hint = "write depth images as 16-bit PNG into a folder with timestamps.csv and camera.json"
+        raise DataError("the file or folder is not a frame sequence", where=str(place), allowed=allowed, hint=hint)
     allowed = "a folder of frames, or a bag"
     raise DataError("there is no such file or folder", where=str(place), allowed=allowed, hint="check the path")

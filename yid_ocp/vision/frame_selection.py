@@ -1,4 +1,4 @@
-"""Selection of good frames, choice of the object's root end in them, and uncertainty of their points."""
+"""Selection of good frames, choice of the object's root end in all frames, and uncertainty of the points."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from yid_ocp.vision.track_result import FrameReport
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """The settings for the conversion of a frame sequence to measured points, and the selection of good frames."""
+    """The settings of the tracking: how measured points are computed from frames, and which frames are used."""
 
     filters: Annotated[CloudFilterOptions, OptionInfo("selection of the object's points")] = field(
         default_factory=CloudFilterOptions
@@ -115,7 +115,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
-        off = f"{1e3 * fit.mean_distance:.1f} mm off on average, max_mean_surface_distance_in_radii"
+        off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, max_mean_surface_distance_in_radii"
         return f"{_NO_FIT}: {off} allows {1e3 * limit:.1f} mm"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > _MAX_BEND_ANGLE:
@@ -137,7 +137,7 @@ def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], options: Trac
         reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
         if fit.mean_distance > _MAX_DISTANCE_OVER_MEDIAN * usual:
-            off = f"{1e3 * fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
+            off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, {1e3 * usual:.1f} mm are usual"
             reason = f"the shape fits worse than in other frames: {off}"
         elif apart > _MAX_GRASP_GAP_CHANGE:
             reason = f"{_END_ELSEWHERE}: {1e3 * apart:.0f} mm more than usual (a late stamp?)"
@@ -146,7 +146,7 @@ def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], options: Trac
 
 
 def _good_fits(frames: Sequence[FrameReport]) -> dict[int, FrameShapeFit]:
-    """Shapes of the good frames, by position in the sequence."""
+    """Fitted shapes of the good frames, by the position of the frame in `frames`."""
     return {k: frame.shape_fit for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None}
 
 
@@ -158,10 +158,10 @@ def good_frame_configurations_and_points(
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Collect times, configurations and points of the good frames, with the points' and the calibration's stds.
+    """Return times (M,), configurations (M, n) and points (M, np, 3) of the M good frames, and two std of the points.
 
-    Only good frames and the system's points with the indices `columns` are included. Raises `DataError` if no frame is
-    good, or if no point is known well enough in any frame.
+    The first std is the total, the second is its part from the calibration, common to all frames. `columns` are the
+    indices of the points. Raises `DataError` if no frame is good, or if no frame shows a point well enough.
     """
     good, sizes, calibration = _good_fits(frames), common.dimensions, common.camera_calibration
     if not good:
@@ -182,10 +182,10 @@ def good_frame_configurations_and_points(
     if unseen.all():
         best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
         wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_seen_point_std).all())
-        limit = f"the best within {best:.0f} mm, max_seen_point_std is {1e3 * options.max_seen_point_std:g} mm"
+        limit = f"the smallest std is {best:.0f} mm, max_seen_point_std is {1e3 * options.max_seen_point_std:g} mm"
         what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
         check = f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame"
-        allowed = f"a frame with a point known within {1e3 * options.max_seen_point_std:g} mm"
+        allowed = f"a frame in which a point has a std of at most {1e3 * options.max_seen_point_std:g} mm"
         raise DataError(what, where=source, allowed=allowed, hint=_hint(sizes, foreign_objects, check))
     position, std, shared = (np.where(unseen[..., None], np.nan, entry) for entry in (position, std, shared))
     return t, np.array([fit.q for fit in fits]), position, std, shared
@@ -210,12 +210,12 @@ def _none_good(
 
 
 def _because(sizes: TubeDimensionEstimates, matters: bool) -> str:
-    """Beginning of a refusal if the sizes of the object are the likely cause."""
+    """Beginning of an error message: the contradicted dimensions of the object, if they are the likely cause."""
     return f"{sizes.contradiction_message}: " if matters and sizes.contradiction_message else ""
 
 
 def _hint(sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], otherwise: str) -> str:
-    """Advice in an error message: first known errors of the object and foreign objects near it, then general advice."""
+    """Advice in an error message: on wrong dimensions and foreign objects first, then the advice `otherwise`."""
     notes = [*sizes.messages, *(thing.text for thing in things)]
     return "; ".join([*notes[:_MAX_NOTES], otherwise])
 
@@ -230,18 +230,18 @@ _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends; height differe
 
 
 def align_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
-    """Return the frames with the object's root at the same end in all fits, and a text on how it was chosen.
+    """Return the frames with the object's root at the same end in all fits, and a text on how this end was chosen.
 
     A choice is needed if a shape fits equally well with its root at another end. Ends are first followed from frame to
-    frame. The root is then the end that does not move (if it is fixed) or the higher end.
+    frame. The root is then the end that does not move (if the root is fixed) or the higher end.
     """
     if options.root_placement == "model":
         return list(frames), ""
     fitted = _good_fits(frames)
     two = [k for k in fitted if frames[k].alternative_fit is not None]
     if not two:
-        near = "it is the one nearest to approximate_root_position"
-        said = "lengths and branches tell it" if options.approximate_root_position is None else near
+        near = "the end nearest to approximate_root_position"
+        said = "determined by lengths and branches" if options.approximate_root_position is None else near
         return _fixed(frames, options), f"root: {said}"
     made, last = list(frames), None
     for k in fitted:
@@ -255,13 +255,13 @@ def align_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tup
     between = float(np.median(np.linalg.norm(roots - tips, axis=1)))
     own = float(np.median(np.linalg.norm(roots - _ends(made[k].alternative_fit for k in two)[0], axis=1)))
     if own < _SAME_ROOT_FRACTION * between:
-        other, said = False, "branches that are alike were followed from frame to frame, which is which is not known"
+        other, said = False, "determined; equal branches were followed from frame to frame, and may be exchanged"
     elif options.root_placement == "fixed" and max(moving) > _FIXED_ROOT_MOTION_RATIO * min(moving):
-        other, said = moving[0] > moving[1], "it is the end that stays in its place"
+        other, said = moving[0] > moving[1], "the end that stays in its place"
     elif abs(above) > _HANGING_HEIGHT_FRACTION * between:
-        other, said = above < 0, "it is the higher end"
+        other, said = above < 0, "the higher end"
     else:
-        other, said = False, "either end may be it, one was taken: approximate_root_position says which"
+        other, said = False, "either end may be the root, one was chosen; approximate_root_position selects it"
     if other:
         made = [_exchanged(frame) for frame in made]
     return _fixed(made, options), f"root: {said}"
@@ -280,7 +280,7 @@ def _apart(one: FrameShapeFit | None, other: FrameShapeFit | None) -> float:
 
 
 def _ends(fits: Iterable[FrameShapeFit | None]) -> tuple[Array, Array]:
-    """Positions of roots and tips."""
+    """Positions of the roots, and of the tips of the last links, (fits, 3) each [m]."""
     lines = np.array([fit.link_ends for fit in fits if fit is not None])
     return lines[:, 0, 0], lines[:, -1, 1]
 
@@ -292,13 +292,13 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std:
-                reason = f"its root is not where it is in other frames: {1e3 * away:.0f} mm away"
+                reason = f"the object's root is not where other frames have it: {1e3 * away:.0f} mm away"
                 made[k] = replace(frames[k], drop_reason=reason)
     return made
 
 
 def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
-    """Check whether a shape touches itself at parts that are far apart along it. Links: (K, 2, 3), radii: (K,) [m]."""
+    """Check whether parts of a shape touch that are far apart along it. `centre_line` (K, 2, 3), `radius` (K,) [m]."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
     edges = np.where(near < _TOUCHING_DISTANCE, 1e-6, 0.0)  # zero would mean no edge

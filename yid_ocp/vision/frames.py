@@ -33,7 +33,7 @@ from yid_ocp.model.mechanism import homogeneous_transform
 PointColourArray = NDArray[np.uint8]
 
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-"""Models of distortion, and how many coefficients each may have: k1, k2, p1, p2, k3 (k4, k5, k6), or k1 to k4."""
+"""Allowed numbers of coefficients by distortion model. Order: k1, k2, p1, p2, k3 (k4, k5, k6); equidistant k1 to k4."""
 _MAX_UNDISTORTION_STEPS = 30  # largest number of Newton steps for a pixel's direction
 _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
@@ -58,10 +58,10 @@ class CameraIntrinsics:
     def __post_init__(self) -> None:
         if self.has_distortion and self.model not in _DISTORTION_COEFFICIENT_COUNTS:
             known = unknown_name_error_arguments(self.model, _DISTORTION_COEFFICIENT_COUNTS)
-            raise DataError(f"the distortion model is '{self.model}'", where="intrinsics", **known)
+            raise DataError(f"the distortion model '{self.model}' is unknown", where="intrinsics: model", **known)
         count = _DISTORTION_COEFFICIENT_COUNTS.get(self.model, ())
         if self.has_distortion and (len(self.coefficients) not in count or not np.isfinite(self.coefficients).all()):
-            what = f"the distortion '{self.model}' has the coefficients {self.coefficients}"
+            what = f"the distortion model '{self.model}' has the coefficients {self.coefficients}"
             allowed = f"{' or '.join(map(str, count))} finite numbers"
             raise DataError(what, where="intrinsics: coefficients", allowed=allowed)
 
@@ -78,13 +78,13 @@ class CameraIntrinsics:
 
     @property
     def pixel_rays_at_unit_depth(self) -> Array:
-        """The direction (height, width, 3) of every pixel, with z = 1. NaN for pixels outside the lens."""
+        """The ray (height, width, 3) of every pixel in the camera's frame, with z = 1. NaN outside the lens model."""
         return _rays(self)
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
         """Convert a depth image (height, width) to points (N, 3) [m] in the camera's frame, row by row.
 
-        Zero or NaN marks missing depth. Errors are as in `_measured_depth_mask`.
+        Pixels without depth (zero or NaN) give no point. Raises `DataError` if the image has not the camera's size.
         """
         image = np.asarray(depth, float)
         seen = np.flatnonzero(self._measured_depth_mask(image))
@@ -96,8 +96,8 @@ class CameraIntrinsics:
     def _measured_depth_mask(self, depth: Array) -> BoolArray:
         """Mask (height, width) of measured pixels in a depth image. Raises `DataError` for another size."""
         if depth.shape != (self.height, self.width):
-            allowed = f"({self.height}, {self.width}), as the intrinsics say"
-            hint = "correct the intrinsics, or the image"
+            allowed = f"({self.height}, {self.width}), as in the intrinsics"
+            hint = "correct width and height of the intrinsics, or export the image in this size"
             raise DataError(f"the image has shape {depth.shape}", where="depth image", allowed=allowed, hint=hint)
         return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays_at_unit_depth[..., 0]))
 
@@ -127,7 +127,7 @@ def _rays(lens: CameraIntrinsics) -> Array:
 
 
 def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[Array, Array]:
-    """Solution of distort(x, y) = aim by Newton's method; NaN outside the range of the distortion model."""
+    """Solution (x, y) of distort(x, y) = (aim_x, aim_y) by Newton's method; NaN outside the range of the distortion."""
     x, y, h = aim_x, aim_y, 1e-6
     if lens.model == "equidistant":  # the aim is an angle, which is nearer to the answer as one
         bent = np.maximum(np.hypot(aim_x, aim_y), 1e-9)
@@ -148,7 +148,7 @@ def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[A
 
 
 XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58.0))
-"""The depth camera of the Asus Xtion Pro Live: 640 x 480 pixels, 58 degrees wide."""
+"""Intrinsics of the Asus Xtion Pro Live's depth camera: 640 x 480 pixels, horizontal field of view 58 degrees."""
 
 
 @cache
@@ -169,16 +169,16 @@ def import_open3d() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """The point clouds of one camera with stamps, names and camera pose. Each cloud is loaded on demand."""
+    """The point clouds of one camera with time stamps, names and camera pose. Each cloud is loaded on demand."""
 
-    stamps: Array  # (M,), as the camera gave them, in the order of the frames: neither sorted nor unique [s]
+    stamps: Array  # (M,), the camera's time stamps in the order of the frames; may be unsorted or repeated [s]
     frame_names: tuple[str, ...]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world [m]
-    # from a frame's index to its cloud in the camera's frame, shape (N, 3) [m]; `DataError` where it cannot be read
+    # from a frame's index to its cloud (N, 3) [m] in the camera's frame; `DataError` if it cannot be read
     load_cloud: Callable[[int], Array]
     intrinsics: CameraIntrinsics | None = None
     source: str = "sequence"  # origin of the frames, for messages
-    # from a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none
+    # from a frame's index to red, green and blue (N, 3) of its points; None if the frame has no colours
     load_colours: Callable[[int], PointColourArray | None] | None = None
 
     def __len__(self) -> int:
@@ -247,7 +247,7 @@ class OcclusionMap:
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def hidden_mask(self, places: Array, radius: Array, margin: float) -> BoolArray:
-        """Check for world positions (S, 3) whether they are hidden, shadowed by something nearer, or outside the image.
+        """Return the mask (S,) of world positions (S, 3) that are hidden or shadowed by a surface, or out of the image.
 
         A surface occludes a position if it is nearer to the camera by more than `radius` (S,) plus `margin` [m].
         `radius` is also the extent of the position across the line of sight.
@@ -295,7 +295,7 @@ class OcclusionMap:
         return borders
 
     def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
-        """Image points near the given positions: their image coordinates and depths."""
+        """Search tree of the image coordinates of measured points near the positions `asked`, and their depths."""
         # distance in the image at which the nearest point can cast a shadow
         shadow, narrow = _MAX_STEREO_BASELINE / float(self._all[1].min(initial=np.inf)), float(wide.min())
         reach = max(float(wide.max()), shadow)
@@ -318,7 +318,7 @@ class OcclusionMap:
 
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
-        """Whether a nearer surface hides the point from the projector or second camera."""
+        """Whether a nearer surface hides a position from the depth camera's projector or second lens."""
         nearest = max(float(distance.min()), _MIN_DEPTH)
         widest = _MAX_STEREO_BASELINE * (1.0 / nearest - 1.0 / limit) if limit > 0 else 0.0
         if widest <= 0:

@@ -40,7 +40,7 @@ class WeightedCloud:
     """A point cloud with weights. A weight is the number of camera points that a point represents."""
 
     points: Array  # (N, 3), in the world [m]
-    point_weights: Array  # (N,), how many of the camera's points each one represents
+    point_weights: Array  # (N,), number of camera points that each point represents
 
     def __len__(self) -> int:
         return len(self.points)
@@ -93,7 +93,7 @@ class CloudFilterOptions:
 
 
 class ReachableObjectRegion:
-    """The region that the object's branches can reach above the floor. For a root `anywhere`, the options define it."""
+    """The region that the object's branches can reach above the floor. With `anywhere`, only the options limit it."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class ReachableObjectRegion:
         self._base = np.mean(bases, axis=0) if bases else None
 
     def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
-        """Make a function that tests if points (N, 3) are in the region, for a configuration and a camera position."""
+        """Return a function from world points (N, 3) to the mask (N,) of those in the region. `camera`: position."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:
@@ -157,7 +157,7 @@ def _square_distances(points: Array, place: Array) -> Array:
 
 
 def voxel_averages(points: Array, size: float) -> WeightedCloud:
-    """Average the points (N, 3) in each voxel of edge `size` [m]. Weights are the numbers of points."""
+    """Return the mean of the points (N, 3) in each voxel of edge `size` [m], weighted by the number of these points."""
     if not len(points):
         return WeightedCloud(np.empty((0, 3)), np.empty(0))
     cell = np.floor((points - points.min(0)) / size).astype(np.int64)
@@ -210,7 +210,7 @@ def _light_directions(colours: Array) -> Array:
 
 
 def weighted_median(values: Array, weight: Array) -> float:
-    """Compute the weighted median of values."""
+    """Return the weighted median: the smallest value up to which the weights sum to at least half of the total."""
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
@@ -228,23 +228,23 @@ class SkeletonOptions:
     max_edge_length: Annotated[PositiveFloat, OptionInfo("largest distance of connected nodes", "m")] = 0.15
 
     def __post_init__(self) -> None:
-        check_option_bounds(self, "walk options")
+        check_option_bounds(self, "skeleton options")
 
 
 @dataclass(frozen=True, eq=False)
 class CloudSkeleton:
-    """The skeleton of a cloud: nodes, a spanning forest between them, and the node of each point."""
+    """The skeleton of a cloud: nodes, edges that connect them without cycles, and the node of each point."""
 
     nodes: Array  # (K, 3), centroids of the kept segments, in order of extraction [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
-    edges: IntArray  # (E, 2), minimum spanning forest of the graph of nearest neighbours
+    edges: IntArray  # (E, 2), minimum spanning forest of the nodes' nearest-neighbour graph
     component_of_node: IntArray  # (K,), connected part of each node, largest part first
 
 
 def _thin_to_nodes(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions
 ) -> tuple[Array, Array, IntArray]:
-    """Thin a cloud to nodes, segment by segment: nodes, their weights, and the node of each point."""
+    """Thin a cloud to nodes, segment by segment. Returns nodes (K, 3), their weights (K,), and points' nodes (N,)."""
     label, alive = np.full(len(cloud), -1), np.arange(len(cloud))
     points, weight = cloud.points, cloud.point_weights
     nodes, size = list[Array](), list[float]()
@@ -271,7 +271,7 @@ def _thin_to_nodes(
 
 
 def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
-    """The nearest points of a centre within the radius, at most as many as a segment has."""
+    """Indices of the points nearest to a centre, within `neighbour_radius`, at most `max_cloud_points_per_node`."""
     square, within = _square_distances(points, centre), options.neighbour_radius**2
     if len(square) > options.max_cloud_points_per_node:
         found = np.argpartition(square, options.max_cloud_points_per_node - 1)[: options.max_cloud_points_per_node]
@@ -280,7 +280,7 @@ def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
 
 
 def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, IntArray]:
-    """The shortest edges that connect nodes to their nearest neighbours, and the connected part of each node."""
+    """Edges (E, 2) of the shortest forest that connects near nodes, and the connected part (K,) of each node."""
     count = len(nodes)
     if count < 2:
         return np.empty((0, 2), dtype=np.int64), np.zeros(count, dtype=np.int64)
@@ -302,7 +302,7 @@ _DEFAULT_OPTIONS = SkeletonOptions()
 def extract_skeleton_graph(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULT_OPTIONS
 ) -> CloudSkeleton:
-    """Extract the skeleton of a cloud, starting at its lowest point. Connected parts with few points are omitted."""
+    """Extract the skeleton of a cloud, from its lowest point on. Connected parts with few points are omitted."""
     nodes, size, label = _thin_to_nodes(cloud, rng, options)
     edges, part = _spanning_forest(nodes, options)
     if not len(nodes):

@@ -39,7 +39,7 @@ _MIN_REPORTED_FRAMES = 2  # frames in which a thing is worth a word
 
 @dataclass(frozen=True, eq=False)
 class BackgroundPoints:
-    """The points of the static scene. Cloud points within a distance of them are removed as background."""
+    """The points of the static scene. Cloud points within `match_distance` of them are removed as background."""
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3), in the world [m]
     match_distance: float = 0.0  # distance at which a point belongs to it [m]
@@ -127,10 +127,10 @@ def foreign_objects_from_clusters(
         link = _carrying_link(places, poses) if moving else ""
         low, high = places.min(axis=0) - 0.5 * size, places.max(axis=0) + 0.5 * size
         beside = bool(((low > box[1]) | (high < box[0])).any())
-        how = f"moving with {link}" if link else "moving" if moving else "still"
+        how = f"moving with {link}" if link else "moving" if moving else "static"
         big, where = (mark.join(f"{x:.2f}" for x in of) for mark, of in ((" x ", size), (", ", centre)))
-        text = f"something of {big} m at ({where}) m is not the object, {how}, "
-        text += f"in {len(group)} of {len(clusters)} frames: "
+        text = f"a foreign object of {big} m at ({where}) m ({how}, "
+        text += f"in {len(group)} of {len(clusters)} frames): "
         boxed = "leave it out with track.options.filters.box_lower and box_upper"
         if link:
             text += f"give its shape under model.surfaces_missing_from_urdf with parent_frame: {link}"
@@ -153,7 +153,7 @@ def _apart(one: ForeignCluster, other: ForeignCluster) -> float:
 
 
 def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
-    """Link relative to which positions move much less than in the world; empty if none."""
+    """Name of the link relative to which the positions move much less than in the world; empty if there is none."""
 
     def wandering(own: Array) -> float:
         return MAD_TO_STD * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
@@ -195,12 +195,12 @@ class TubeDimensionEstimates:
 
     @property
     def determined_dimension_mask(self) -> BoolArray:
-        """The mask (2 s,) of the dimensions that the frames determine, for lengths and radii of s tubes."""
+        """The mask (2 s,) of the dimensions that the frames determine: lengths, then radii, of s tubes."""
         return np.asarray((self.dimension_log_ratio_std < _MAX_KNOWN_LOG_STD) & (self.n_frames > 0))
 
     @property
     def contradicted_model_value_mask(self) -> BoolArray:
-        """The mask (2 s,) of the model dimensions that the frames contradict, for lengths and radii of s tubes."""
+        """The mask (2 s,) of the model dimensions that the frames contradict: lengths, then radii, of s tubes."""
         off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
         return np.asarray(self.determined_dimension_mask & off)
 
@@ -209,10 +209,10 @@ class TubeDimensionEstimates:
         """A text on model dimensions that contradict the frames and are not estimated. Empty if there are none."""
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
-            f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
+            f"{self.names[i]}: {values[i]:.4g} mm in the model, {fitting[i]:.4g} mm by the fit"
             for i in np.flatnonzero(self.contradicted_model_value_mask & ~np.array(self.estimated_dimension_mask))
         ]
-        return f"the object seems to be other than the model says ({', '.join(wrong)})" if wrong else ""
+        return f"the object's dimensions contradict the model ({'; '.join(wrong)})" if wrong else ""
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -258,7 +258,7 @@ def estimate_and_check_dimensions(
     """Estimate the tubes' dimensions from some frames and compare them with the model.
 
     `std` holds the standard deviations [m] of a point's distance from the surface and of the position error shared by
-    all frames. `fitted` fits the frames, given parameter values and the configurations of the previous round.
+    all frames. `fitted` returns the frames' fits for given parameter values and the configurations of the last round.
     """
     sizes = model_link_lengths_and_radius_by_segment(system, given).values()
     told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
@@ -293,7 +293,7 @@ def estimate_and_check_dimensions(
 
 
 def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
-    """Fits whose free ends agree with those of other fits, relative to the shape."""
+    """Fits whose free ends are where most other fits have them, relative to the fitted shape."""
     if not fits:
         return []
     ends, noise = np.array([fit.end_offsets for fit in fits]), float(np.median([fit.noise_std for fit in fits]))
@@ -318,6 +318,6 @@ def _changed(system: System, given: Mapping[str, float] | None, change: Array) -
 class SequenceEstimates:
     """The estimates that all frames of a sequence share: camera calibration, tube dimensions and background."""
 
-    camera_calibration: CameraCalibration  # the camera's pose, how it scales depth, and its clock
-    dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them
+    camera_calibration: CameraCalibration  # the camera's pose, its depth error and its clock
+    dimensions: TubeDimensionEstimates  # the object's lengths and radii by the frames
     background: BackgroundPoints  # static points in all frames

@@ -1,7 +1,7 @@
 """Assessment of a shape by a frame's cloud: own points, foreign points, and links without points.
 
 Points away from the tubes' surface form a foreign cluster if they are connected and as many as on a piece of tube as
-long as its diameter. Where it continues the shape's surface, points within two tube radii are contested and not used.
+long as its diameter. Where a cluster touches the shape, points within two tube radii are contested and not used.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Project points (N, 3) on the nearest tube axis. Axes have ends `corners` (K, 2, 3) and radii (K,) [m].
+    """Project points (N, 3) on the axis of the nearest link. Axes have ends `corners` (K, 2, 3), radii are (K,) [m].
 
-    The nearest link has the smallest distance minus `share` times its radius. Returns link index (N,), position along
-    the link from 0 to 1 (N,), unit vectors (N, 3) from axis to point, and distances (N,) from the axis [m].
+    The nearest link has the smallest distance minus `share` times its radius. Returns its index (N,), the position
+    along it from 0 to 1 (N,), unit vectors from the axis to the point (N, 3), and distances from the axis (N,) [m].
     """
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
@@ -68,7 +68,7 @@ def tube_link_projections(
 
 
 def link_axes(link_ends: Array) -> Array:
-    """Compute unit vectors (K, 3) along links (K, 2, 3)."""
+    """Return unit vectors (K, 3) along the links with the ends `link_ends` (K, 2, 3)."""
     edge = link_ends[:, 1] - link_ends[:, 0]
     return np.asarray(edge / np.linalg.norm(edge, axis=1)[:, None])
 
@@ -94,7 +94,7 @@ class ForeignCluster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQuality:
-    """A measure of how well a shape fits a frame: noise, distances, link coverage, end offsets, foreign clusters."""
+    """The quality of a shape's fit to a frame: noise, distances, link coverage, end offsets, foreign clusters."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of nearby points that are not foreign [m]
@@ -113,9 +113,9 @@ class ShapeFitQuality:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQualityAndPointClasses(ShapeFitQuality):
-    """The fit quality of a shape, with the frame's own, contested and foreign points."""
+    """The fit quality of a shape, and the class of each of the frame's points: own, contested or foreign."""
 
-    # (N,), own points of the shape; points on it that can be foreign; foreign points
+    # (N,), masks of the shape's own points, of points on it that may be foreign, and of foreign points
     is_own: BoolArray
     is_contested: BoolArray
     is_foreign: BoolArray
@@ -128,7 +128,7 @@ class ProcessedFrameCloud:
 
     points: Array  # (N, 3), surface points in the world [m]
     point_weights: Array  # (N,)
-    skeleton_nodes: Array  # (K, 3), of their skeleton [m]
+    skeleton_nodes: Array  # (K, 3), nodes of the points' skeleton [m]
     camera_position: Array  # (3,) [m]
     occlusion_map: OcclusionMap | None = None  # of all measured points; None: no position counts as hidden
     is_filtered_out: Callable[[Array], BoolArray] | None = None  # positions (S, 3) removed by filters
@@ -145,7 +145,7 @@ class ProcessedFrameCloud:
         return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
     def _is_hidden_or_filtered(self, places: Array, radius: Array, margin: float) -> BoolArray:
-        """Whether positions (S,) are hidden from the camera or removed by filters."""
+        """Mask (S,) of the positions (S, 3) that are hidden from the camera or in a region that the filters remove."""
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
             hidden |= self.occlusion_map.hidden_mask(places, radius, margin)
@@ -155,7 +155,7 @@ class ProcessedFrameCloud:
 def fit_quality_and_point_classes(
     tubes: TubeLinks, seen: ProcessedFrameCloud, near: float
 ) -> ShapeFitQualityAndPointClasses:
-    """Classify a frame's points by a fitted shape and assess its coverage. Points beyond `near` [m] are ignored."""
+    """Classify a frame's points by a fitted shape, and assess the fit by points within `near` [m] of its surface."""
     link, along, normal, distance = tube_link_projections(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
@@ -223,7 +223,7 @@ def tube_like_node_and_point_masks(cloud: ProcessedFrameCloud, radius: float) ->
 
 
 def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> IntArray:
-    """Component index of points in large connected parts, 0 for the largest; -1 for all other points."""
+    """Index (N,) of the large connected part of each chosen point, 0 for the largest part; -1 for all other points."""
     part, index = np.full(len(chosen), -1), np.flatnonzero(chosen)
     if not len(index):
         return part
@@ -242,7 +242,7 @@ def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> In
 def _contacts(
     tree: cKDTree, seen: ProcessedFrameCloud, shape: BoolArray, foreign: BoolArray, within: float
 ) -> BoolArray:
-    """Points of the shape from which a foreign surface continues, nearly as dense as the shape's."""
+    """Mask of the shape's points that touch foreign points: these are at least half as dense within `within` [m]."""
     contact = np.zeros(len(shape), bool)
     if not foreign.any():
         return contact
@@ -257,7 +257,7 @@ def _contacts(
 def _coverage(
     tubes: TubeLinks, seen: ProcessedFrameCloud, own: BoolArray, link: IntArray, along: Array, gate: float
 ) -> tuple[Array, Array]:
-    """Fractions of each link with own points, and visibly without points."""
+    """Fractions (K,) of each link's length that have own points, and that are visible without own points."""
     lengths = np.linalg.norm(tubes.link_ends[:, 1] - tubes.link_ends[:, 0], axis=1)
     count = np.maximum(_MIN_LINK_STATIONS, np.ceil(lengths / (2 * tubes.radius))).astype(np.int64)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
@@ -274,7 +274,7 @@ def _coverage(
 
 
 def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link: IntArray, offset: Array) -> Array:
-    """Variance of points across each link, in the camera's view, beyond that of a tube of its radius."""
+    """Variance (K,) [m^2] of points across each link, in the camera's view, in excess of a tube of its radius."""
     across, count = link_normals_perpendicular_to_sight(tubes.link_ends, seen.camera_position), len(tubes.link_ends)
     square = np.einsum("ij,ij->i", offset, across[link]) ** 2
     weight = np.bincount(link[counted], seen.point_weights[counted], minlength=count)
@@ -284,7 +284,7 @@ def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link
 
 
 def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: float) -> tuple[float, BoolArray]:
-    """Offset [m] of the last point along a tube's last link from its tip, NaN if unseen, and the points between."""
+    """Offset [m] of a tube's last point beyond its tip (NaN if unseen), and the mask of the points between them."""
     (start, tip), radius, axis = tubes.link_ends[link], float(tubes.radius[link]), link_axes(tubes.link_ends)[link]
     thick = max(radius, 2 * seen._point_spacing)
     behind = max(3, int(float(np.linalg.norm(tip - start)) / thick))
@@ -310,7 +310,7 @@ def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: fl
 
 
 class _SurfaceResiduals(NamedTuple):
-    """Signed distances of points from the tubes' surface, with derivatives."""
+    """Signed distances [m] of points from the tubes' surface, with derivatives by the link's ends and radius."""
 
     point_indices: IntArray
     link_indices: IntArray
@@ -322,10 +322,10 @@ class _SurfaceResiduals(NamedTuple):
 def nearest_surface_residuals(
     corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
 ) -> _SurfaceResiduals:
-    """Compute distances of points p (N, 3) from tube surfaces: e = |p - c| - f r, with the nearest axis point c.
+    """Return distances of points p (N, 3) from tube surfaces: e = |p - c| - f r, with the nearest axis point c.
 
-    f = `share` scales the radius r. Axis ends `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point nearest
-    to a tube's far side is assigned to the near side.
+    f = `share` scales the radius r. Axis ends `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point on the
+    far side of a tube, which the camera cannot see, is compared with the near side: e = -|p - c| - f r.
     """
     link, along, normal, distance = tube_link_projections(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
@@ -337,7 +337,7 @@ def nearest_surface_residuals(
 
 
 def surface_distances_along_sight(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
-    """Compute the errors of points from the tubes along the line of sight. Parameters: `nearest_surface_residuals`.
+    """Return the distances of points from the tubes along the line of sight. Arguments: `nearest_surface_residuals`.
 
     At a distance u from the axis across the line of sight, the surface of a tube of radius r is sqrt(r^2 - u^2) nearer
     to the camera than the axis. Errors along the surface normal would give the same tube position, but a radius too
@@ -370,19 +370,19 @@ class FrameTubeDimensionCost:
 
     gradient: Array  # (2 s,)
     hessian: Array  # (2 s, 2 s)
-    point_jacobian: Array  # (np, 3, 2 s), how the system's points move with them [m]
+    point_jacobian: Array  # (np, 3, 2 s), derivatives of the system's points by x [m]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameShapeFit(ShapeFitQuality):
-    """The fitted shape of one frame with its uncertainty and quality."""
+    """The fitted shape of one frame, with the uncertainty of its points and the quality of the fit."""
 
     q: Array  # (n,), configuration with zero twists
     point_positions: Array  # (np, 3), positions of the system's points [m]
-    point_std: Array  # (np, 3), standard deviation of each coordinate by the curvature of the cost [m]
-    is_point_seen: BoolArray  # (np,), whether a gripper holds the point or enough points are near it
-    grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
-    contested_fraction: float  # of the points on the shape: contested by a touching foreign object and not used
+    point_std: Array  # (np, 3), standard deviation of each coordinate [m]
+    is_point_seen: BoolArray  # (np,), whether a gripper holds the point or a link beside it has enough own points
+    grasp_gaps: Array  # (grasps, 3), vector between the held frame and the gripper of each grasp [m]
+    contested_fraction: float  # fraction of the points on the shape that a touching foreign object makes unusable
     dimension_equations: FrameTubeDimensionCost  # cost of lengths and radii in this frame
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 

@@ -43,10 +43,10 @@ _MAX_POINTS = 2500  # points
 class _Centerline:
     """Centerline of an object in a cloud, as a tree of nodes."""
 
-    nodes: Array
-    edges: IntArray
-    loop_positions: Array
-    slice_width: float
+    nodes: Array  # (K, 3) [m]
+    edges: IntArray  # (E, 2), indices of connected nodes
+    loop_positions: Array  # (., 3), positions at which the object closes a loop [m]
+    slice_width: float  # distance along the object that one node represents [m]
 
     @property
     def to_skeleton(self) -> CloudSkeleton:
@@ -76,9 +76,9 @@ class _Centerline:
 
 
 def cloud_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
-    """Compute the centerline of the object in a cloud, a tree of nodes plus loops. Empty if there are too few points.
+    """Compute the centerline of the object in a cloud: a tree of nodes, and positions of loops. Empty for few points.
 
-    `diameter` [m] is the diameter of the thickest tube. Parts with a distance of more than `gap` [m] are not connected.
+    `diameter` [m] is the diameter of the thickest tube. Parts of the cloud more than `gap` [m] apart are not connected.
     """
     points = cloud.points
     if len(points) > _MAX_POINTS:
@@ -101,7 +101,7 @@ def _graph(nodes: Array, edges: IntArray) -> csr_matrix:
 
 
 def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
-    """The points of parts that are large and near enough, and the graph that connects them."""
+    """The points of large parts within `gap` [m] of each other, and the graph that connects them."""
     distance, index = cKDTree(points).query(points, k=_N_NEIGHBOURS + 1)
     rows = np.repeat(np.arange(len(points)), _N_NEIGHBOURS)
     columns, lengths = index[:, 1:].ravel(), distance[:, 1:].ravel()
@@ -133,7 +133,7 @@ def _renumbered(kept: IntArray, count: int) -> IntArray:
 
 
 def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, IntArray]:
-    """Connected parts of every slice, and which of them touch."""
+    """Centres (K, 3) of the connected parts of every slice, and the pairs of parts that touch."""
     links = graph.tocoo()
     same = slices[links.row] == slices[links.col]
     within = coo_matrix((np.ones(int(same.sum())), (links.row[same], links.col[same])), shape=graph.shape)
@@ -157,7 +157,7 @@ def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
 
 
 def _pruned(trace: _Centerline, twig: float) -> _Centerline:
-    """The trace without branches shorter than `twig` [m], removed shortest first; chains are kept whole."""
+    """The centerline without branches shorter than `twig` [m], shortest removed first. A chain is not shortened."""
     nodes, edges = trace.nodes, trace.edges
     while len(edges):
         count = np.bincount(edges.ravel(), minlength=len(nodes))
@@ -193,14 +193,14 @@ _WHOLE_OBJECT_TOLERANCE = 0.08  # relative length error of a centerline that sho
 class ObservedObjectEnd:
     """The observed position of one end of an object, measured along the object's axis there."""
 
-    link_end_index: int  # among the links' starts and ends, in this order link by link
+    link_end_index: int  # index in the list of start and end of link 0, start and end of link 1, ...
     direction: Array  # (3,), unit vector along the object
     position: Array  # (3,), point of the plane across the object that contains the end [m]
-    position_std: float
+    position_std: float  # standard deviation of the position along `direction` [m]
 
 
 class _InitialShape(NamedTuple):
-    """Initial shape: configuration (n,), root position (3,) [m] and observed ends."""
+    """Initial shape of a fit: configuration (n,), root position (3,) [m] and observed ends."""
 
     q: Array
     root_position: Array
@@ -228,7 +228,7 @@ class _Link(NamedTuple):
 
 
 class ShapeGuessFinder:
-    """A finder of object shapes that bends joints from `rest` (n,) along a centerline; `lengths` are of links [m]."""
+    """A finder of initial shapes, which bends joints from `rest` (n,) along a centerline. `lengths`: of links [m]."""
 
     def __init__(
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]
@@ -291,7 +291,7 @@ class ShapeGuessFinder:
         return [self._along(trace, [int(leaves[k]) for k in chosen]) for chosen in kept]
 
     def _along(self, trace: _Centerline, ends: Sequence[int]) -> _InitialShape:
-        """The initial shape whose root and tips are at some nodes of the centerline."""
+        """The initial shape whose root and tips, in this order, are at the nodes `ends` of the centerline."""
         reaches = zip(ends[1:], self._root_to_tip_lengths, strict=True)
         courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
         q, first = self._rest.copy(), self._links[0]
@@ -318,7 +318,7 @@ class ShapeGuessFinder:
         return np.asarray(self._placed[joint] @ Rotation.from_rotvec(value * self._axis[joint]).as_matrix())
 
     def _bend(self, q: Array, joints: Sequence[int], aim: Array, turned: list[Array]) -> None:
-        """Set the bends of a link such that its z axis (its long axis) has the required direction."""
+        """Set the bends in `q` of a link so that its long axis z has the direction `aim`. Updates `turned`, too."""
         bends, carrier = [j for j in joints if j in self._bends], self._parent[joints[0]]
         base, ahead = turned[carrier] if carrier >= 0 else np.eye(3), np.array([0.0, 0.0, 1.0])
         for j in joints:

@@ -1,7 +1,7 @@
 """Surface meshes of robot, tubes and surroundings, and a virtual depth camera that renders them.
 
-Each surface is in a joint's moving frame. Noise and quantization of the structured-light camera are uniform in the
-disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
+Each surface is in a joint's moving frame. The structured-light camera has uniform noise and quantization dd of the
+disparity d = f b/z [pixels], with focal length f [pixels], baseline b and depth z. In depth they are dz = z^2/(f b) dd.
 
 References
 ----------
@@ -153,7 +153,7 @@ class ArticulatedSurfaces:
         return np.asarray(stacked.reshape(4, len(self.part_joints), 4).transpose(1, 0, 2))
 
     def _near(self, points: Array, part: int, pose: Array, margin: float) -> tuple[IntArray, Array]:
-        """World points in a part's box, widened by a margin [m]: indices, and positions in the part's frame."""
+        """Indices of the world points in a part's box, widened by `margin` [m], and their positions in its frame."""
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         (low, high), inside = self._boxes[part], np.ones(len(local), bool)
         for axis in range(3):  # column by column, which is faster
@@ -164,7 +164,7 @@ class ArticulatedSurfaces:
     def within_surface_distance_mask(
         self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
     ) -> BoolArray:
-        """Check which world points (N, 3) are within `reach` [m] of a surface, or a moving one, at a configuration."""
+        """Return the mask of world points (N, 3) within `reach` [m] of a surface; `moving_only`: of a moving one."""
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
             asked = np.flatnonzero(~result)
@@ -175,7 +175,7 @@ class ArticulatedSurfaces:
         return result
 
     def distance_to_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
-        """Find distance [m], normal towards the point and part of the nearest moving surface; inf, 0, -1 if none."""
+        """Return distance [m], normal towards the point and part of the nearest moving surface; inf, 0, -1 if none."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
@@ -245,7 +245,7 @@ class ArticulatedSurfaces:
     def _window(
         self, pinhole: frames.CameraIntrinsics, rotation: Array, origin: Array, part: int
     ) -> tuple[slice, slice] | None:
-        """Rows and columns of the image that can show a part."""
+        """Rows and columns of the image that can show a part; None if the part is out of view."""
         seen = (np.array(list(product(*self._boxes[part].T))) - origin) @ rotation
         if (seen[:, 2] < _MIN_PROJECTED_DISTANCE).all():
             return None
@@ -298,7 +298,7 @@ def load_robot_meshes_by_joint(
                 joint, placement = _carrier(mechanism, link.name)
                 parts.setdefault(joint, []).append(mesh.transformed(placement @ origin))
     if not parts:
-        what, hint = f"the URDF has no {kind} meshes", "choose the other kind: track.options.robot_mesh_kind"
+        what, hint = f"the URDF has no {kind} meshes", "set track.options.robot_mesh_kind to the other kind"
         raise ModelError(what, where=str(path), allowed="a URDF with meshes or primitive shapes", hint=hint)
     return {joint: TriangleMesh.concatenate(entries) for joint, entries in parts.items()}
 
@@ -315,7 +315,7 @@ def mesh_sources_sha256(urdf: str | Path, mechanism: Mechanism) -> str:
 
 
 def _carrier(mechanism: Mechanism, frame: str) -> tuple[int, Array]:
-    """Joint that carries a frame, and the frame's pose relative to it."""
+    """Index of the joint that carries a frame (-1: the world), and the frame's pose (4, 4) relative to the joint."""
     found = mechanism.frames[frame]
     return found.joint_index, np.array(ca.DM(found.placement.homogeneous_matrix()))
 
@@ -340,7 +340,7 @@ def extra_meshes_by_joint_index(extra: Sequence[ExtraMesh], mechanism: Mechanism
         where = f"model: surfaces_missing_from_urdf: {number}"
         given = [kind for kind in _EXTRA_MESH_SHAPES if getattr(entry, kind) is not None]
         if len(given) != 1:
-            what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "keep or add one shape"
+            what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "define exactly one shape"
             raise ConfigError(what, where=where, allowed=f"one of {', '.join(_EXTRA_MESH_SHAPES)}", hint=hint)
         mesh = _solid(entry.box_size, entry.cylinder_radius_and_length, entry.sphere_radius)
         if entry.mesh_file is not None:
@@ -364,7 +364,7 @@ def _load_mesh_file(file: Path) -> TriangleMesh:
 
 @lru_cache(maxsize=64)
 def _mesh_of_file(file: Path, changed: int) -> TriangleMesh:
-    """The mesh of a file that was last `changed` at a time [ns]."""
+    """The mesh of a file. It is cached for the path and for the time [ns] at which the file was last changed."""
     import trimesh
 
     try:
@@ -385,8 +385,8 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
         candidates = [above / Path(*rest) for above in urdf.parents for rest in (parts, parts[1:]) if rest]
     if found := next((candidate for candidate in candidates if candidate.is_file()), None):
         return found
-    what, allowed = f"the mesh file '{name}' does not exist", "meshes where the URDF refers to them"
-    raise ModelError(what, where=str(urdf), allowed=allowed, hint="put the meshes into the package of the URDF")
+    what, allowed = f"the mesh file '{name}' does not exist", "mesh files at the paths that the URDF states"
+    raise ModelError(what, where=str(urdf), allowed=allowed, hint="copy the meshes into the URDF's package folder")
 
 
 def model_link_lengths_and_radius_by_segment(
@@ -401,9 +401,9 @@ def model_link_lengths_and_radius_by_segment(
 
 
 def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
-    """Cylinders along the object's links, joined by balls, in joint frames by joint. `DataError` without tubes."""
+    """Meshes of the object's links by joint index: cylinders, joined by balls, in joint frames. `DataError` if none."""
     if not system.segment_layouts:
-        what, hint = "the model has no object to see", "set model.object with segments"
+        what, hint = "the model has no object that a camera could see", "set model.object with segments"
         raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
     meshes, sizes = dict[int, TriangleMesh](), model_link_lengths_and_radius_by_segment(system, values)
     for segment in system.segment_layouts:
@@ -499,7 +499,7 @@ class VirtualCameraTiming:
     def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
         if not self.mean_rate > 0:
-            raise ConfigError(f"mean_rate = {self.mean_rate}", where="mean_rate", allowed="a number above 0 [Hz]")
+            raise ConfigError(f"mean_rate = {self.mean_rate}", where="mean_rate", allowed="a frame rate above 0 [Hz]")
         count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
         taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
         taken = taken[taken < stop]
@@ -509,7 +509,7 @@ class VirtualCameraTiming:
 
 @dataclass(frozen=True, eq=False)
 class VirtualFramesWithTruth:
-    """The frame sequence of a virtual camera, with the true times and configurations."""
+    """The frame sequence of a virtual camera, with the true capture times and the true motion."""
 
     sequence: frames.FrameSequence
     capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
@@ -529,11 +529,11 @@ class VirtualCameraSetup:
 def render_virtual_frames(
     scene: SceneDescription, t: ArrayLike, q: ArrayLike, camera: VirtualCameraSetup
 ) -> VirtualFramesWithTruth:
-    """Render the frames that a virtual camera takes of a motion. Each frame is rendered, reproducibly, on loading.
+    """Return the frames that a virtual camera takes of a motion. A frame is rendered when it is loaded, reproducibly.
 
     The configurations `q` (N, n) at times `t` (N,) [s] can come from any simulator; a cubic spline interpolates them.
     In a scene with a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or
-    `ModelError` if Open3D or an object is missing, a mesh is unreadable, or the pose is invalid.
+    `ModelError` if Open3D or the object is missing, a mesh is unreadable, or the camera's pose is invalid.
     """
     lens, pose = camera.sensor_model.intrinsics, frames.validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)

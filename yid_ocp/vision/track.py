@@ -79,7 +79,7 @@ def track_object(
 
 @dataclass(eq=False)
 class _Work:
-    """A frame in processing: its report so far and its remaining cloud."""
+    """A frame during its processing: its report so far, its filtered cloud and its skeleton."""
 
     report: FrameReport
     filtered: WeightedCloud | None = None
@@ -90,7 +90,7 @@ class _Work:
 
 
 class _Look(NamedTuple):
-    """Views of a frame under each hypothesis, the robot's configuration, and initial guesses."""
+    """Data of a frame for the shape fit: its cloud with each assignment of ends, configuration, and initial shapes."""
 
     sights: Sequence[ProcessedFrameCloud]
     q: Array
@@ -156,7 +156,7 @@ class FrameTracker:
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
 
     def _configuration_at_rest(self, t: float) -> Array:
-        """Configuration at a time of the joints' clock, with an undeformed object; constant beyond the recording."""
+        """Configuration (n,) at a time of the joints' clock, with an undeformed object; constant beyond the joints."""
         q = self.shape_fitter.rest_configuration.copy()
         if self.joint_angles_at is not None:
             index = [self.system.mechanism.joint_index(name) for name in self.shape_fitter.recorded_joint_names]
@@ -164,7 +164,7 @@ class FrameTracker:
         return q
 
     def estimate_shared_values(self) -> SequenceEstimates:
-        """Estimate from some frames what all frames share: camera calibration, tube dimensions and background."""
+        """Estimate camera calibration, tube dimensions and background, which all frames share, from some frames."""
         calibration = self._calibration()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
         scene, to_world = self.empty_scene, calibration.camera_state.measured_to_world_points
@@ -222,7 +222,7 @@ class FrameTracker:
             hint = f"set track.options.clock_offset.initial_stamp_minus_joint_time ({first + offset - begin:.3f} s if "
             hint += "they started together)"
             what, where = f"the clocks differ: {spans}", self.sequence.source
-            raise DataError(what, where=where, allowed="times that overlap", hint=hint)
+            raise DataError(what, where=where, allowed="frames and joints whose times overlap", hint=hint)
 
     def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
         """The shape fitter with the estimated dimensions of the object."""
@@ -236,7 +236,7 @@ class FrameTracker:
     def _removed(
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
     ) -> Callable[[Array], BoolArray]:
-        """Test of positions that the filters remove, with the robot at a configuration."""
+        """Function that returns the mask of the positions (S, 3) that the filters remove, for the robot at `q`."""
         is_inside = self.object_region.membership_test_at(q, calibration.camera_position)
         within = self.options.filters.robot_padding + self._widest
 
@@ -263,21 +263,21 @@ class FrameTracker:
         return points, finite
 
     def _read(self, index: int, calibration: CameraCalibration) -> tuple[WeightedCloud, Array]:
-        """A frame's world points where the object can be, which of them are the robot's, and all its points."""
+        """A frame's averaged world points in the region that the object can reach, and all its world points."""
         found, finite = self._finite(self.sequence, index)
         state, filters = calibration.camera_state, self.options.filters
         points = state.measured_to_world_points(found)
         q = self._configuration_at_rest(float(state.stamps_to_joint_clock(self.sequence.stamps[index])))
         inside = self.object_region.membership_test_at(q, calibration.camera_position)(points)
         if not inside.any():
-            raise DataError("no point lies where the object can reach: check the camera's pose")
+            raise DataError("no point lies in the region that the object can reach: check track.camera_pose")
         if filters.object_colours and self.sequence.load_colours is not None:
             colours = self.sequence.load_colours(index)
             if colours is None:
                 raise DataError("the cloud has no colours")
             inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], filters.object_colours)
             if not inside.any():
-                raise DataError("no point has one of the object's colours: check filters.object_colours")
+                raise DataError("no point has a colour of the object: check track.options.filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
     def process_frame(self, index: int, common: SequenceEstimates) -> FrameReport:
@@ -311,13 +311,13 @@ class FrameTracker:
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
     def frame_report_before_processing(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
-        """Make the report of a frame before it is processed, with a reason if the frame is dropped."""
+        """Return a frame's report before its processing. `reason` says why the frame is dropped; empty if it is not."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def align_root_ends_and_mark_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
-        """Choose which end is the root; mark outlying frames as dropped. Returns all frames and a note on the root."""
+        """Choose one root end for all frames, and mark outlying frames as dropped. Returns frames and a root note."""
         rooted, note = frame_selection.align_root_ends(frames, self.options)
         return frame_selection.mark_outlying_frames_as_dropped(rooted, self.options), note
 
@@ -342,7 +342,7 @@ class FrameTracker:
         )
 
     def find_foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
-        """Find things near the object that are neither it nor the robot, each followed over the fitted frames."""
+        """Return what is near the tracked object and neither it nor the robot, one entry for each foreign object."""
         fitted = [(frame.joint_time, frame.shape_fit) for frame in frames if frame.shape_fit is not None]
         if not fitted:
             return ()
@@ -366,7 +366,7 @@ class FrameTracker:
     def _look(
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
-        """The object's part of a frame, or None with the reason in its report."""
+        """The work on a frame, and its data for the shape fit; None, with a reason in the report, if it is dropped."""
         work = _Work(self.frame_report_before_processing(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
@@ -375,13 +375,13 @@ class FrameTracker:
             return work, None
 
     def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
-        """The object's part of a frame. Raises `DataError` with the reason if the frame is dropped."""
+        """Prepare a frame's data for the shape fit. Raises `DataError` with the reason if the frame is dropped."""
         index, stamp, t = work.report.index, work.report.stamp, work.report.joint_time
         options, state = self.options, calibration.camera_state
         cloud, raw = self._read(index, calibration)
         work.say(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
-            raise DataError("there are no joint angles at its time")
+            raise DataError("no joint angles were recorded at its time")
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
@@ -415,7 +415,7 @@ class FrameTracker:
         return look
 
     def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
-        """View of an object whose root position follows from the model."""
+        """Data for the fit of an object whose root position follows from the model: one cloud with its skeleton."""
         found = point_cloud.extract_skeleton_graph(cloud, rng, self.options.skeleton)
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
@@ -427,7 +427,7 @@ class FrameTracker:
     def _anywhere(
         self, starts: ShapeGuessFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
     ) -> _Look:
-        """Views of an object with an unknown root position, with its possible ends."""
+        """Data for the fit of an object with an unknown root position: a cloud for each assignment of its ends."""
         diameter, options = 2.0 * self._widest, self.options
         course = cloud_centerline_tree(cloud, diameter, options.skeleton.max_edge_length, rng)
         work.skeleton = course.to_skeleton
@@ -447,7 +447,7 @@ class FrameTracker:
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
     held = {grasp.held_frame for grasp in system.grasps}
-    require_known_names(wanted or (), system.point_frames, "point", "track.options.points", ConfigError)
+    require_known_names(wanted or (), system.point_frames, "point", "track.options.tracked_points", ConfigError)
     free = tuple(name for name in system.point_frames if name not in held) or system.point_frames
     return free if wanted is None else wanted
 
@@ -466,25 +466,25 @@ def _joint_angles(
     joints = recording.joints
     if joints is None:
         what, where = f"the recording has no joint angles, {need}", f"recording '{recording.name}'"
-        hint = "give the recording with the joints, or set model.robot to null"
+        hint = "list a recording with the joints, or set model.robot to null"
         raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
     t, position = joints.t, joints.position[:, recorded_joint_column_indices(joints, tuple(known), recording.name)]
     return (float(t[0]), float(t[-1])), lambda at: np.array([np.interp(at, t, column) for column in position.T])
 
 
 def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
-    """Frames by time stamp, and reasons to drop frames without a stamp or with a repeated stamp."""
+    """Indices of the frames by time stamp, and why frames without a stamp or with a repeated stamp are dropped."""
     reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
     for i in (i for i in order if i not in reasons):
         if stamps[i] - before < _SAME_TIME_TOLERANCE:
-            reasons[i] = "its time stamp is that of the frame before: a duplicate"
+            reasons[i] = "its time stamp equals that of another frame: a duplicate"
         else:
             before = float(stamps[i])
     return tuple(order), reasons
 
 
 def _spread(indices: Sequence[int], most: int) -> tuple[int, ...]:
-    """At most a given number of the indices, evenly spread."""
+    """At most `most` of the indices, evenly spread over them."""
     return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, min(len(indices), most)).round())

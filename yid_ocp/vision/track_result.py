@@ -1,4 +1,4 @@
-"""Results of tracking: frame reports, shapes and points of good frames, and figures."""
+"""Results of tracking: reports on all frames, shapes and points of the good frames, and figures."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class FrameReport:
     name: str
     stamp: float  # stamp of the camera [s]
     joint_time: float  # time on the joints' clock [s]
-    drop_reason: str  # why it was dropped; empty for a good one
+    drop_reason: str  # why the frame was dropped; empty for a good frame
     n_raw_points: int  # number of points of the cloud
-    n_filtered_points: int  # left by the filters
+    n_filtered_points: int  # number of points that the filters keep
     n_skeleton_nodes: int
     stamp_delay: float  # delay of the stamp beyond the common offset, NaN if unknown [s]
     cpu_seconds: float  # processor time from the filtered cloud to the fitted points [s]
@@ -43,12 +43,12 @@ class FrameReport:
 
     @property
     def is_good(self) -> bool:
-        """Whether the frame was used."""
+        """Whether the frame was not dropped."""
         return not self.drop_reason
 
 
 def count_dropped_frames_by_reason(frames: Iterable[FrameReport]) -> dict[str, int]:
-    """Count the dropped frames for each reason. Numbers in the reasons are ignored."""
+    """Count the dropped frames by reason. The part of a reason after a colon, such as numbers, is ignored."""
     return dict(Counter(frame.drop_reason.partition(":")[0] for frame in frames if not frame.is_good).most_common())
 
 
@@ -59,29 +59,29 @@ class FrameProcessingStages:
     report: FrameReport
     camera_position: Array  # (3,) [m]
     raw_points: Array  # (N, 3), in the world [m]
-    filtered_points: Array | None  # (N, 3), what the filters left [m]
+    filtered_points: Array | None  # (N, 3), points that the filters keep [m]
     skeleton: CloudSkeleton | None
 
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """The result of tracking: shapes and points of the good frames."""
+    """The result of tracking: shapes and points of the good frames, and reports on all frames."""
 
-    point_names: tuple[str, ...]  # points written down
+    point_names: tuple[str, ...]  # names of the tracked points
     t: Array  # (M,), times of the good frames on the joints' clock [s]
     configurations: Array  # (M, n), configurations with zero twists
     position: Array  # (M, np, 3), NaN (as in `std`) if a point was not seen well enough [m]
-    std: Array
-    shared_std: Array  # common part of all frames, from the camera's pose, depth and clock
-    frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
+    std: Array  # (M, np, 3), standard deviation [m]
+    shared_std: Array  # (M, np, 3), part of `std` from the camera's pose, depth and clock: an error of all frames [m]
+    frame_reports: tuple[FrameReport, ...]  # reports on all frames, by time stamp
     camera_calibration: CameraCalibration
-    dimensions: TubeDimensionEstimates  # the object's lengths and radii as the frames show them
+    dimensions: TubeDimensionEstimates  # the object's lengths and radii by the frames
     foreign_objects: tuple[ForeignObject, ...]  # objects near the modelled object
     root_note: str  # how the root end was chosen; empty if the model defines it
-    _place: Callable[[Array], Array]  # function of the configuration: the points
+    _place: Callable[[Array], Array]  # from a configuration to the positions of the tracked points
 
     def configuration_at_time(self, t: float) -> Array:
-        """Return the configuration (n,) at a time, by a cubic spline through the good frames; constant beyond them."""
+        """Return the configuration (n,) at time `t` [s] by a cubic spline through good frames; constant beyond them."""
         if len(self.t) < 2:
             return self.configurations[0].copy()
         return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
@@ -120,7 +120,7 @@ _GREY, _BLUE, _ORANGE, _GREEN = "#9a9a9a", "#1f5fa8", "#e07a1f", "#2a8f4f"
 
 
 class _Picture(NamedTuple):
-    """A picture: points with colour and size, lines (2, 3) and their colour."""
+    """A picture for a figure: points with colour and size, lines (2, 3) and their colour."""
 
     name: str
     title: str
@@ -130,10 +130,10 @@ class _Picture(NamedTuple):
 
 
 def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit.
+    """Draw a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit. Returns their paths.
 
-    Files are `NAME_1_cloud.png` to `NAME_5_fit.png` in `folder`, which is created. The last title says why the frame
-    was dropped. Raises `OutputError` if writing fails.
+    The files are `NAME_1_cloud.png` to `NAME_5_fit.png` in `folder`, which is created. If the frame was dropped, the
+    title of the last picture states the reason. Raises `OutputError` if writing fails.
     """
     path, report, parts = make_folder(folder), stages.report, [np.empty((0, 3))]
     parts += [] if stages.filtered_points is None else [stages.filtered_points]
@@ -192,7 +192,7 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
 
 
 def write_tracked_points_plot(track: TrackResult, file: str | os.PathLike[str]) -> None:
-    """Plot the points over time with two standard deviations and the spline. Errors are as in `atomic_write`."""
+    """Plot the tracked points over time, with two standard deviations and a spline. Errors are as in `atomic_write`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 2.2 * len(track.point_names) + 0.8), layout="constrained")
