@@ -141,7 +141,7 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     assert main(shlex.split(said)[1:]) == 0
     told = capsys.readouterr().out
     assert "position [rad], velocity [rad/s], effort [N m]" in told
-    assert "on one clock" in told
+    assert "have one clock" in told
     recording = read_recording(odd / "joints_merged.h5")
     assert recording.joints is not None
     assert recording.joints.names == ("a",)

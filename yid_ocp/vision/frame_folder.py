@@ -349,5 +349,5 @@ def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
             times.append(float(row["t"]))
         except (TypeError, ValueError) as error:
             where, hint = f"{path}, line {number}", "correct the time, or remove the row"
-            raise DataError(f"the stamp is {row['t']!r}", where=where, allowed="a number [s]", hint=hint) from error
+            raise DataError(f"the time is {row['t']!r}", where=where, allowed="a number [s]", hint=hint) from error
     return tuple(str(row["file"]) for row in rows), np.array(times)
