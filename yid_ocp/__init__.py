@@ -1,6 +1,6 @@
 """Identification of the stiffness of flexible objects from robot recordings, and diagnosis of the sim-to-real gap.
 
-Names load on first use, so that `import yid_ocp` and `yid-ocp --help` are quick.
+Each name is imported on its first use, so that `import yid_ocp` and `yid-ocp --help` are quick.
 """
 
 from __future__ import annotations

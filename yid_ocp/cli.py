@@ -1,6 +1,6 @@
-"""Command-line interface with commands, arguments and shell completion.
+"""Command-line interface: the arguments of all commands, their execution, error output and shell completion.
 
-`workflow` implements the commands. A command's module is imported when it runs; `--help` loads no numerical library.
+The package `workflow` implements the commands. A command's module is imported only when the command runs.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _repeated(parser: argparse.ArgumentParser, flag: str, metavar: str, text: st
 def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     what = "the run's settings; an embedded example when absent" if optional else "the run's settings"
     parser.add_argument("config", metavar="CONFIG.yaml", help=what, nargs="?" if optional else None)
-    parser.add_argument("--out", metavar="DIR", help="run folder to make (default: runs/NAME-DATE-TIME)")
+    parser.add_argument("--out", metavar="DIR", help="run folder to create (default: runs/NAME-DATE-TIME)")
     text = "set a setting, for example problem.time_step=0.005; a section, 'solver={max_iterations: 9}', merges with "
     text += "the existing one, and an empty one clears it"
     _repeated(parser, "--set", "KEY=VALUE", text, "overrides")
@@ -110,11 +110,11 @@ def _overrides(parser: argparse.ArgumentParser) -> None:
 
 
 def _blind(parser: argparse.ArgumentParser) -> None:
-    text = "settings of experiments, varied if there are enough cases; embedded ones when absent"
+    text = "settings of experiments, varied if there are enough cases; embedded settings when absent"
     parser.add_argument("configs", metavar="CONFIG.yaml", nargs="*", help=text)
     parser.add_argument("--out", metavar="DIR", help="folder of the proof; an existing one is completed")
-    parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
-    parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
+    parser.add_argument("--cases", type=int, default=20, help="number of cases in the ensemble")
+    parser.add_argument("--seed", type=int, default=1, help="random seed of the ensemble")
     text = "make and diagnose the K-th of N slices of the ensemble only, in a folder of its own"
     parser.add_argument("--slice", metavar="K/N", default="1/1", help=text)
     text = "score slices of one ensemble together: their files slice.json, or folders that hold one"
@@ -130,7 +130,7 @@ def _batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("configs", metavar="CONFIG.yaml", nargs="+", help="settings of one run each")
     text = "pattern of recordings in quotes, such as 'fleet/*.h5': every configuration runs for each of them"
     parser.add_argument("--recordings", metavar="GLOB", help=text)
-    parser.add_argument("--command", dest="each", choices=("solve", "diagnose"), default="solve", help="to run")
+    parser.add_argument("--command", dest="each", choices=("solve", "diagnose"), default="solve", help="command to run")
     text = "folder of all runs (default: runs/batch-DATE-TIME); an existing one is completed"
     parser.add_argument("--out", metavar="DIR", help=text)
     _overrides(parser)
@@ -145,7 +145,7 @@ def _track(parser: argparse.ArgumentParser) -> None:
 
 def _simulate(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
-    parser.add_argument("--seed", type=int, default=0, help="of the noise and of a virtual experiment's motion")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of noise and virtual motion")
     _switch(parser, "--noise", "add noise of the recorded standard deviations")
 
 
@@ -170,7 +170,7 @@ def _import(parser: argparse.ArgumentParser) -> None:
 
 
 def _importing(parser: argparse.ArgumentParser) -> None:
-    """Flags for the keys of the section `import`. A list may be separated by commas, or its flag repeated."""
+    """Add a flag for each key of the section `import`. A flag for a list accepts commas, and may be repeated."""
     group = parser.add_argument_group("reading files of other tools")
     listed = (
         ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are merged on one clock"),
@@ -241,7 +241,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
 def _report(parser: argparse.ArgumentParser) -> None:
     text = "run folders of solve or diagnose, in the order of time; two of the same recordings are overlaid"
     parser.add_argument("runs", metavar="RUN", nargs="+", help=text)
-    parser.add_argument("--out", metavar="DIR", help="folder to make (default: a dated one in runs)")
+    parser.add_argument("--out", metavar="DIR", help="folder to create (default: a dated one in runs)")
     _printing(parser, "folder's path")
 
 
@@ -264,7 +264,7 @@ def _print_schema(arguments: argparse.Namespace) -> int:
 
 
 def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
-    """Print completions for the calling shell and exit. Does nothing without the package argcomplete."""
+    """Print completions for the calling shell and exit. Without the package argcomplete, return without output."""
     try:
         library = import_module("argcomplete")
     except ImportError:
@@ -326,7 +326,7 @@ COMMANDS = tuple(
 
 
 class _Parser(argparse.ArgumentParser):
-    """An argument parser that raises `ConfigError` with the nearest known name."""
+    """An argument parser that raises `ConfigError` for invalid arguments, with the nearest known name as hint."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         found, rest = super().parse_known_args(args, namespace)
@@ -357,7 +357,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_argument_parser() -> argparse.ArgumentParser:
-    """Build the parser for the arguments of all commands. Invalid arguments raise `ConfigError`."""
+    """Return the argument parser of all commands. It raises `ConfigError` if an argument is invalid."""
     from yid_ocp import __version__
 
     top = _Parser(prog="yid-ocp", description="Stiffness of flexible objects from robot recordings.")
@@ -371,7 +371,7 @@ def build_argument_parser() -> argparse.ArgumentParser:
 
 
 class _LossyStream:
-    """Standard error that discards text that it cannot write, because a full disk should not stop a command."""
+    """A wrapper of standard error that discards text that it cannot write, so that a full disk stops no command."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -389,13 +389,13 @@ class _LossyStream:
 
 
 def _discard_what_follows(stream: TextIO) -> None:
-    """Redirect a stream that cannot be written to the null device, because Python would fail again at exit."""
+    """Redirect an unwritable stream to the null device, because otherwise Python fails again when it exits."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextlib.contextmanager
 def _reliable_streams() -> Iterator[None]:
-    """Context manager in which standard output and error exist and escape unprintable text, and error never fails."""
+    """Ensure that output streams exist and escape unprintable text in a `with` block. Standard error never fails."""
     with contextlib.ExitStack() as held:
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:  # closed by who started the program
@@ -420,7 +420,7 @@ def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
 
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
-    """Context manager that prints the package's warnings on standard error, each once."""
+    """Print each different warning of the package once on standard error, inside a `with` block."""
     handler, shown = logging.StreamHandler(sys.stderr), set[str]()
 
     def is_new(record: logging.LogRecord) -> bool:
@@ -441,14 +441,14 @@ def _notices() -> Iterator[None]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit code.
+    """Run the command in `argv` (default: the arguments of this process) and return its exit code.
 
     Returns
     -------
     int
         0: done. 1: the solve failed; the run folder states why. 2: wrong input, or an error of the operating system.
-        3: a bug. 128 plus the signal number (130 for an interruption) if a signal ended the command. With `--json` an
-        error is also printed as `yid-error/1`: kind, what, where, allowed, hint and exit_code.
+        3: a bug. 128 plus the signal number (130 for Ctrl-C) if a signal ended the command. With `--json` an error is
+        also printed on standard output, as JSON `yid-error/1`: kind, what, where, allowed, hint and exit_code.
     """
     if "_ARGCOMPLETE" in os.environ:
         _print_shell_completions(build_argument_parser())
@@ -479,7 +479,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     try:
         os.getcwd()
     except OSError:
-        what, allowed = "the working directory does not exist any more", "an existing working directory"
+        what, allowed = "the working directory has been deleted or moved", "an existing working directory"
         return _wrong(OutputError(what, where=".", allowed=allowed, hint="cd to an existing folder"), as_json)
     # matrices are small: threads of the linear algebra library cost more than they gain, in workers as well
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -512,7 +512,7 @@ def _failed(error: Exception, as_json: bool) -> int:
         return _wrong(error, as_json)
     if isinstance(error, BrokenPipeError):
         _discard_what_follows(sys.stdout)
-        what = "standard output was closed before all was printed"
+        what = "the reader of standard output closed it before the whole output was printed"
         hint = "read the output to its end, or write it to a file"
         return _wrong(OutputError(what, where="standard output", allowed="an open pipe or file", hint=hint), False)
     if isinstance(error, OSError):
@@ -521,10 +521,10 @@ def _failed(error: Exception, as_json: bool) -> int:
         hint = "check permissions and free disk space"
         return _wrong(OutputError(what, where=str(error.filename or ""), allowed=allowed, hint=hint), as_json)
     if isinstance(error, ValueError) and "embedded null" in str(error):  # what Python says of a NUL in a path
-        what, allowed = "a path has a null character", "paths without null characters"
+        what, allowed = "a path contains a null character", "paths without null characters"
         return _wrong(ConfigError(what, where="command line", allowed=allowed, hint="correct the path"), as_json)
     if isinstance(error, MemoryError):
-        what, hint = f"there is not enough memory: {error}", "shorten the run, or use fewer links or workers"
+        what, hint = f"there is not enough memory: {error}", "use shorter recordings, fewer links or fewer --workers"
         allowed = "a run that fits into the free memory"
         return _wrong(InsufficientMemoryError(what, where="this machine", allowed=allowed, hint=hint), as_json)
     # any other exception is a bug of this package

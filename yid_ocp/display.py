@@ -23,7 +23,7 @@ class ReprTexts:
 
 
 class ReprMixin:
-    """A mixin class that creates `__repr__` and a notebook table from `_summary`. Dataclasses need `repr=False`."""
+    """A mixin class that makes `__repr__` and a notebook table from `_summary`. Its dataclasses need `repr=False`."""
 
     def _summary(self) -> ReprTexts:
         raise NotImplementedError
@@ -53,9 +53,9 @@ def count_with_noun(number: int, noun: str) -> str:
 
 
 def abbreviated_names_text(names: Sequence[str]) -> str:
-    """Join names to one line of text. Three or more consecutive names are merged, as in `joint_coulomb@joint1..7`.
+    """Join names to one line of text. Three or more names with consecutive numbers are merged, as in `joint1..7`.
 
-    A long line is cut, with the number of omitted names.
+    The line has at most `_MAX_NAMES_IN_LINE` entries, followed by the number of omitted names.
     """
     parts = [re.split(r"(\d+)", name) for name in names]
     taken: set[int] = set()
@@ -85,11 +85,11 @@ class Progress:
     """A base class for receivers of progress reports, which ignores all reports. One thread at a time calls it."""
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
-        """Report that a new stage of the work begins.
+        """Report that a new stage of the work, described by `text`, begins.
 
         `work` is the expected time of the stage, `ahead` the expected time of all later stages [s]. Without `ahead`,
-        the remaining time is reduced by `work`. A stage whose duration does not predict later stages (such as
-        compilation) is included in `ahead`.
+        the receiver subtracts `work` from the time that it expected for all later stages. A stage whose duration does
+        not predict the later ones (such as compilation) has `work` zero, and `ahead` includes its time.
         """
 
     def report_iterate(self, entry: Any) -> None:
@@ -121,7 +121,7 @@ class LoggingProgress(Progress):
 
 
 class PartsDoneCounter:
-    """A thread-safe counter of a stage's `total` parallel parts. It reports every count, zero with the text `first`."""
+    """A thread-safe counter of the finished parts of a stage. It reports every count; `first` is the text for zero."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()

@@ -24,7 +24,7 @@ class YidError(Exception):
         super().__init__(what)
 
     def message_parts(self) -> dict[str, str]:
-        """Return the four parts of the message (what, where, allowed, hint). Missing parts have general texts."""
+        """Return the four parts of the message (what, where, allowed, hint). A general text replaces a missing part."""
         said = {
             "what": self.what,
             "where": self.where or "the arguments of this command or function",
@@ -66,22 +66,23 @@ class SolverError(YidError):
 
 
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
-    """Create the `SolverError` for a model that cannot be simulated."""
-    allowed, hint = "values at which the simulation succeeds", "choose other initial values, or a smaller time step"
-    return SolverError(f"the model cannot be simulated: {reason}", where=where, allowed=allowed, hint=hint)
+    """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
+    hint = "set other initial values (parameters.NAME.initial), or a smaller problem.time_step"
+    what, allowed = f"the model cannot be simulated: {reason}", "values at which the simulation succeeds"
+    return SolverError(what, where=where, allowed=allowed, hint=hint)
 
 
 _Error = TypeVar("_Error", bound=YidError)
 
 
 def missing_package_error(kind: type[_Error], what: str, extra: str) -> _Error:
-    """Create the error for a missing package, which belongs to the optional dependencies `extra`."""
+    """Create an error of `kind`: a package of the optional dependencies `extra` is missing. `what` is the message."""
     where, hint = f"the Python environment {sys.prefix}", f"pip install 'yid-ocp[{extra}]'"
     return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
 
 
 def import_optional(module: str, extra: str, what: str, kind: type[YidError] = DataError) -> ModuleType:
-    """Import a module from the optional dependencies `extra`. Raises an error of `kind` (`what`) if it is missing."""
+    """Import and return a module of the optional dependencies `extra`. Raises `kind` with the text `what` if absent."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -122,9 +123,9 @@ _MAX_LISTED_NAMES, _MAX_LISTED_CHARACTERS, _N_NEAREST_NAMES = 40, 240, 8
 
 
 def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str = "") -> dict[str, str]:
-    """Return the arguments `allowed` and `hint` for an error about an unknown name. Long lists are shortened.
+    """Return the arguments `allowed` and `hint` of an error about an unknown name. A long list is shortened.
 
-    The hint is the most similar known name; `otherwise` if no name is similar.
+    The hint asks whether the most similar known name was meant. If no name is similar, it is `otherwise`.
     """
     names = [str(entry) for entry in known]
     otherwise = otherwise or ("use one of the allowed names" if names else "leave it out")
@@ -146,7 +147,7 @@ def _close(name: str, names: Sequence[str], count: int) -> list[str]:
 
 
 def nearest_name_question(name: str, names: Iterable[str]) -> str:
-    """Return the question whether the user meant the most similar known name. Empty if no name is similar."""
+    """Return the question "did you mean NAME?" for the most similar known name. Empty if no name is similar."""
     close = _close(name, [*names], 1)
     return f"did you mean '{close[0]}'?" if close else ""
 

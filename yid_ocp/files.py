@@ -42,12 +42,12 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         absent = isinstance(error, FileNotFoundError)
         what = "there is no such file" if absent else f"the file cannot be read ({os_error_reason(error)})"
         if isinstance(error, ValueError):
-            what, allowed = "the path has a null character", "a path without null characters"
+            what, allowed = "the path contains a null character", "a path without null characters"
         near = os.listdir(path.parent) if absent and os.access(path.parent, os.R_OK) else ()
         hint = nearest_name_question(path.name, near) or "check the path"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
     if not readable:
-        hint = "chmod it, or copy it to a folder of your own"
+        hint = "allow reading with chmod, or copy it to a folder of your own"
         raise DataError("the file cannot be read (Permission denied)", where=str(path), allowed=allowed, hint=hint)
     if not stat.S_ISREG(info.st_mode):
         what = "this is a folder" if stat.S_ISDIR(info.st_mode) else "this is a pipe or a device"
@@ -64,7 +64,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 def process_memory_limit() -> Iterator[None]:
     """Limit the additional memory of this process to 1.75 GiB inside a `with` block (on Linux only).
 
-    It protects against libraries that unpack input files: a larger request raises MemoryError.
+    A library that needs more memory to unpack an input file gets a MemoryError. An existing limit stays unchanged.
     """
     before = None
     with contextlib.suppress(ImportError, OSError):
@@ -119,9 +119,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """
     if path.is_dir() or not path.parent.is_dir():
         what, allowed = "the folder to write to does not exist", "a file in an existing folder"
-        hint = "make the folder first"
+        hint = "create the folder first, or correct the path"
         if path.is_dir():
-            what, allowed, hint = "this path is a folder", "the name of a file", f"write {path / 'NAME'}{path.suffix}"
+            what, allowed, hint = "this path is a folder", "the name of a file", f"use {path / 'NAME'}{path.suffix}"
         raise OutputError(what, where=str(path), allowed=allowed, hint=hint)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
@@ -149,7 +149,7 @@ def write_strict_json(path: Path, data: Any) -> None:
 
 
 def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Path:
-    """Create a folder and its missing parents. Raises `OutputError`, which calls the folder `what`, if that fails."""
+    """Create a folder and its missing parents, and return its path. Raises `OutputError`, which calls it `what`."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -160,12 +160,12 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
 
 
 def is_file(path: Path) -> bool:
-    """Check whether the path is an existing file. Returns False also for names that are too long or invalid."""
+    """Check whether the path is an existing file. For a name that is too long or invalid, return False."""
     return os.path.isfile(path)
 
 
 def file_sha256(path: Path) -> str:
-    """Compute the SHA-256 (hexadecimal) of a file or a folder's files. Raises `DataError` if a file is unreadable."""
+    """Compute the SHA-256 (hexadecimal) of a file or all files in a folder. Raises `DataError` if one is unreadable."""
     digest = hashlib.sha256()
     for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
         with check_input_file(entry).open("rb") as file:
@@ -180,7 +180,7 @@ def json_sha256(data: Any) -> str:
 
 
 def to_json_types(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
-    """Convert a value to JSON types. Numbers that are not finite become None, with a line in `notes`."""
+    """Convert a value to JSON types. A number that is not finite becomes None, and its path is added to `notes`."""
     if isinstance(value, Mapping):
         return {str(k): to_json_types(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
@@ -195,7 +195,7 @@ def to_json_types(value: Any, notes: list[str] | None = None, path: str = "") ->
 
 
 def to_lossless_plain_data(value: Any) -> Any:
-    """Convert nested dataclasses, containers and arrays to JSON data. NaN and infinities become text."""
+    """Convert nested dataclasses, containers and arrays to JSON data without loss. NaN and infinities become text."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {entry.name: to_lossless_plain_data(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
@@ -210,7 +210,7 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 
 def attributes_to_dict(value: Any, names: str) -> dict[str, Any]:
-    """Return attributes of `value` as a dictionary. `names` lists them, separated by blanks; `key=name` renames one."""
+    """Return attributes of `value` as a dictionary. `names` lists them with blanks; `key=name` stores one as `key`."""
     return {key: getattr(value, name or key) for key, _, name in [name.partition("=") for name in names.split()]}
 
 

@@ -1,4 +1,4 @@
-"""Handling of signals that end a command. Suppressed signals are raised again; finally the process is killed."""
+"""Signals that end a command: they raise an exception, again if it is lost, and after 10 s they end the process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TERMINATION_SIGNALS = [number for number in signal.Signals if number.name in ("
 
 
 class InterruptedBySignal(KeyboardInterrupt):
-    """An exception that is raised when a signal ends the command."""
+    """An exception that is raised when SIGINT, SIGTERM or SIGHUP requests the end of the command."""
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(signal.Signals(signal_number).name)
@@ -28,7 +28,7 @@ class InterruptedBySignal(KeyboardInterrupt):
 
 @dataclass
 class _State:
-    """State of interruptions in this process."""
+    """State of this process: the received signal, nesting of deferring blocks, folders to remove on a forced exit."""
 
     asked: int | None = None
     deferring: int = 0
@@ -51,7 +51,7 @@ def raise_if_interrupted() -> None:
 
 @contextlib.contextmanager
 def defer_interruption() -> Iterator[None]:
-    """Delay the handling of termination signals until a short `with` block has ended."""
+    """Delay the exception for a termination signal until the `with` block has ended. The block should be short."""
     _STATE.deferring += 1
     before = _STATE.asked
     try:
@@ -64,7 +64,7 @@ def defer_interruption() -> Iterator[None]:
 
 @contextlib.contextmanager
 def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
-    """Remove a folder if the process is killed inside a `with` block."""
+    """Remove a folder if the process has to be ended by force inside a `with` block."""
     _STATE.unfinished.add(folder)
     try:
         yield
@@ -78,7 +78,7 @@ def raise_on_termination_signals() -> Iterator[None]:
 
     The exception is raised again every `_RERAISE_INTERVAL` seconds, because it can be lost in garbage collection, in
     callbacks of libraries, or in a call that does not return. After `_FORCED_EXIT_DELAY` seconds the process is ended
-    with the exit code that shells expect; only the folders of `remove_folder_on_forced_exit` are removed before.
+    with the exit code that shells expect; before, only the folders of `remove_folder_on_forced_exit` are removed.
     Signals that the parent process ignores (`nohup`) stay ignored. Outside the main thread the block has no effect.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -117,7 +117,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 
 
 def _watch(told: socket.socket, ended: threading.Event, main: int) -> None:
-    """Wait for a signal and ensure that the process ends."""
+    """Wait in a thread for a signal, then send it to the thread `main` again and again until the process ends."""
     number = None
     while number is None:
         received = told.recv(64)

@@ -1,7 +1,4 @@
-"""Levenberg-Marquardt method for small dense least-squares problems, such as the shape of a chain.
-
-docs/design/solvers.md compares it with SciPy's method.
-"""
+"""Levenberg-Marquardt method for small dense least-squares problems (docs/design/solvers.md compares SciPy's)."""
 
 from __future__ import annotations
 
@@ -27,7 +24,7 @@ class LocalQuadraticModel:
     hessian: Array
 
     def damped_step(self, damping: float) -> Array:
-        """Compute the step (n,) that minimises the model with Levenberg-Marquardt damping."""
+        """Compute the step (n,) that minimises the model, with the Hessian's diagonal multiplied by 1 + `damping`."""
         return np.asarray(-np.linalg.solve(self.hessian + damping * np.diag(np.diag(self.hessian)), self.gradient))
 
 
@@ -87,8 +84,8 @@ def minimize_by_damped_newton(
     """Minimise a cost by damped Newton steps on the local models that `model_at` returns.
 
     The search converges if no component would move by more than `step_tolerance`, or if the cost decreases by less than
-    the fraction `cost_tolerance`. `min_damping` keeps a search on a robust cost in its local minimum. The projection
-    maps a trial point to an admissible point.
+    the fraction `cost_tolerance`. `min_damping` is the least damping; it keeps a search on a robust cost in its local
+    minimum. The projection maps a trial point to an admissible point.
     """
     x = np.array(initial_guess, float)
     model, damping = model_at(x), _FIRST_DAMPING

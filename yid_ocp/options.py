@@ -44,16 +44,16 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """An annotation of a type whose setting names a registered class, by `selector_key` or by a mapping entry's key."""
+    """An annotation: a setting chooses a class of `registry` by its key `selector_key` or by its key in a mapping."""
 
     registry: Registry[Any]
     default_name: str = ""
-    selector_key: str = "name"  # another one is a field of every class as well
+    selector_key: str = "name"  # if it is not "name", it is a field of every class
 
 
 @dataclass(frozen=True)
 class Option:
-    """The annotated type, default and dataclass field name of an option. `MISSING` means that there is no default."""
+    """An option: annotated type, default (`MISSING` if the setting is required) and name of its dataclass field."""
 
     type_hint: Any
     default_value: Any
@@ -74,7 +74,7 @@ def options_by_key(kind: type) -> Mapping[str, Option]:
 
 
 def split_annotated(hint: Any) -> tuple[Any, list[Any]]:
-    """Split a type into the bare type and its `Annotated` metadata."""
+    """Split a type into the bare type and the list of its `Annotated` metadata, such as bounds and `OptionInfo`."""
     markers: list[Any] = []
     while get_origin(hint) is Annotated:
         markers += hint.__metadata__
@@ -91,20 +91,20 @@ def non_none_union_members(hint: Any) -> tuple[Any, ...]:
 
 
 def mapping_value_type(hint: Any) -> Any:
-    """Return the value type of a mapping type, or None for other types."""
+    """Return the value type of a mapping type such as `Mapping[str, float]`, or None for other types."""
     found = (split_annotated(member)[0] for member in non_none_union_members(hint))
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
 def variadic_tuple_entry_type(hint: Any) -> Any:
-    """Return the entry type of a tuple type of any length, or None for other types."""
+    """Return the entry type of a tuple type of any length, such as `tuple[float, ...]`, or None for other types."""
     bare, _ = split_annotated(hint)
     arguments = get_args(bare)
     return arguments[0] if get_origin(bare) is tuple and arguments[-1] is Ellipsis else None
 
 
 def describe_type(hint: Any) -> str:
-    """Describe a type, its range and its unit in words, for messages."""
+    """Describe a type, its range and its unit in words for messages, such as "a number above 0 up to 0.1 [s]"."""
     bare, markers = split_annotated(hint)
     unit = next((marker.unit for marker in markers if isinstance(marker, OptionInfo) and marker.unit), "")
     limits = [f"{word} {limit:g}" for limit, _, word in _bounds(markers)]
@@ -131,16 +131,16 @@ def _words(hint: Any) -> str:
 
 
 def check_option_bounds(options: Any, where: str) -> None:
-    """Check that all numbers in an options dataclass are within their annotated bounds. Raises `ConfigError`."""
+    """Raise `ConfigError` if a number in an options dataclass is outside its annotated bounds. `where` is its place."""
     kind: Any = type(options)
     for name, option in options_by_key(kind).items():
         value = getattr(options, option.field_name)
         if not _within(option.type_hint, value):
-            raise ConfigError(f"{name} = {value}", where=where, allowed=describe_type(option.type_hint))
+            raise ConfigError(f"{name} = {value} is out of range", where=where, allowed=describe_type(option.type_hint))
 
 
 def _within(hint: Any, value: Any) -> bool:
-    """Whether every number of a value is within the bounds of its type. True for other values."""
+    """Return whether every number of a value is within the bounds of its type. A value without numbers gives True."""
     if isinstance(value, tuple):
         entries = variadic_tuple_entry_type(hint)
         return entries is None or all(_within(entries, entry) for entry in value)
@@ -151,6 +151,6 @@ def _within(hint: Any, value: Any) -> bool:
 
 
 def _bounds(markers: Iterable[Any]) -> list[tuple[float, Callable[[Any, Any], bool], str]]:
-    """Limit, comparison and word of each bound among the markers of a type."""
+    """Return limit, comparison and word of each bound among the markers of a type."""
     pairs = [(marker, row) for marker in markers for row in _BOUND_MARKERS if isinstance(marker, row[0])]
     return [(getattr(marker, name), compare, word) for marker, (_, name, compare, word) in pairs]

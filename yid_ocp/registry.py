@@ -11,7 +11,7 @@ _Entry = TypeVar("_Entry")
 
 
 class Registry(Generic[_Entry]):
-    """A table of implementations by name, which decorators fill. `entry_noun` names an entry in error messages."""
+    """A table of implementations by name, filled by decorators. Error messages call an entry `entry_noun`."""
 
     def __init__(self, entry_noun: str) -> None:
         self.entry_noun = entry_noun

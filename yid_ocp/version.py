@@ -47,7 +47,7 @@ def software_fingerprint() -> dict[str, str]:
 
 
 def software_fingerprint_differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
-    """Describe the entries in which two fingerprints differ."""
+    """Return a text for each entry in which the fingerprint `there` (of another process) differs from `here`."""
     length = {"code": 12}
     return [
         f"{name} {there.get(name, 'unknown')[: length.get(name)]} instead of {value[: length.get(name)]}"
