@@ -49,7 +49,7 @@ def test_methods_agree_on_what_the_data_inform(problem):
     assert found.is_consistent
     assert {run.method for run in found.method_results} == set(told) == {"gauss_newton", "single_shooting"}
     [sentence] = found.explanations
-    assert sentence.startswith("shoulder.damping (truth 0.1) cannot be found: where it ends is the method's choice")
+    assert sentence.startswith("shoulder.damping (truth 0.1) cannot be found: its value depends on the method")
     for run in found.method_results:
         assert run.wall_seconds > 0
         assert run.peak_memory_mib > 10
@@ -61,7 +61,7 @@ def test_a_method_that_stops_early_is_said_to_differ(problem):
     assert found.reference_method == "gauss_newton"
     assert not found.is_consistent
     assert any("iteration_limit" in sentence for sentence in found.disagreements["steepest_descent"])
-    assert "could be found: the method stopped short (iteration_limit)" in found.explanations[-1]
+    assert "does not find it: the method ended too early (iteration_limit)" in found.explanations[-1]
 
 
 def test_nothing_to_agree_on(repository, tmp_path, capsys):
@@ -110,7 +110,7 @@ def test_command_weighs_all_noise_of_the_embedded_recordings(repository, tmp_pat
     config = repository / "configs" / "dual_arm_no_vision.yaml"
     arguments = ["--out", str(tmp_path / "run"), "--set", "compare.methods={single_shooting: {}}"]
     assert main(["compare", str(config), *arguments]) == 0
-    assert capsys.readouterr().out.startswith("the noise that drives the motion is ignored by single_shooting: ")
+    assert capsys.readouterr().out.startswith("values by single_shooting are not trusted, as they ignore the noise")
     result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
     assert result["judged"]["fit"]["explains"]
     assert not result["methods"]["single_shooting"]["fit"]["explains"]
@@ -202,7 +202,7 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compar
         (LIMIT, 1.0, "it ended with 'iteration_limit' before reaching the optimum"),
         (Status.STALLED, 99.0, "it ended with 'stalled' before reaching the optimum"),
         (CONVERGED, 3.1, "it stopped in another local minimum"),
-        (CONVERGED, 3.0, "its cost weighs the measurements otherwise"),
+        (CONVERGED, 3.0, "its cost weights the measurements differently"),
     ],
 )
 def test_a_difference_has_a_likely_reason(compared, status, cost, why):
@@ -215,8 +215,8 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     )
     assert found.disagreements == {"one": [], "two": [said]}
     assert found.explanations == (
-        "c (truth 11.25) is weakly determined: where it ends is the method's choice (one 5, two 99)",
-        "d cannot be found: where it ends is the method's choice (one 5, two 9)",
+        "c (truth 11.25) is weakly determined: its value depends on the method (one 5, two 99)",
+        "d cannot be found: its value depends on the method (one 5, two 9)",
     )
 
 
@@ -225,8 +225,16 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     [
         (10.9, 2.19, CONVERGED, ["steepest_descent ended within 10 % of the truth everywhere"]),
         (10.0, 3.0, Status.STALLED, ["b (3 for 2, cannot be found); these are exactly the parameters that are not"]),
-        (8.9, 3.0, LIMIT, ["a (8.9 for 10, found), b (3 for 2,", "found: the method stopped short (it"]),
-        (11.1, 2.0, CONVERGED, ["a could be found: its cost weighs", "b (cannot be found) came out near the truth"]),
+        (8.9, 3.0, LIMIT, ["a (8.9 for 10, found), b (3 for 2,", "find it: the method ended too early (it"]),
+        (
+            11.1,
+            2.0,
+            CONVERGED,
+            [
+                "determine a, but steepest_descent does not find it: its cost",
+                "b (cannot be found) ended near the truth",
+            ],
+        ),
     ],
 )
 def test_where_the_papers_method_ended_far_from_the_truth(compared, a, b, status, said):
@@ -274,7 +282,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
     assert found.disagreements["single_shooting"][0].startswith("from steepest_descent (in brackets) in a 7.5 (7)")
-    assert "a could be found: it takes the recorded torques as true" in found.explanations[-1]
+    assert "steepest_descent does not find it: it takes the recorded torques as true" in found.explanations[-1]
 
 
 def test_a_method_is_stopped_after_its_share_of_the_budget(repository):

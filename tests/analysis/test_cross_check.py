@@ -55,7 +55,9 @@ def test_a_built_model_is_pinocchios(urdf_folder, mixed):
     found = compare_system_with_pinocchio(system, theta, posture)
     assert found.agrees_within_rounding
     assert max(found.mass, found.weight, found.motion) < 1e-12
-    assert found.words.startswith("the built model: mass matrix, weight and inverse dynamics are Pinocchio's within ")
+    assert found.words.startswith(
+        "the built model: mass matrix, weight and inverse dynamics agree with Pinocchio's within "
+    )
 
 
 @pytest.mark.parametrize(

@@ -259,7 +259,7 @@ def test_what_cannot_swing_says_so(urdf_folder):
     system = System.build(robot, driven=["shoulder"], prescribed=["elbow"], point_frames=["tip"])
     found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
     assert (len(found.frequencies_hz), found.n_unstable_modes) == (0, 0)
-    assert found.message == "every coordinate is driven or prescribed: with these held still nothing can swing"
+    assert found.message == "every coordinate is driven or prescribed: if they are fixed, nothing can swing"
 
 
 @pytest.fixture(scope="module")

@@ -363,7 +363,7 @@ def test_what_is_said(decades, stable):
     said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
     assert said.keeps_errors_below_resolution is stable
     told = "grows by 29 % in a step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
-    assert said.stability_message.startswith(f"run: the step of 0.005 s is {'' if stable else 'not '}stable")
+    assert said.stability_message.startswith(f"run: the time step of 0.005 s is {'' if stable else 'not '}stable")
     assert said.stability_message.endswith("along the motion" if stable else told)
 
 
@@ -440,7 +440,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
-        assert judged.message.startswith("at the estimate light: the step of 0.005 s is not stable")
+        assert judged.message.startswith("at the estimate light: the time step of 0.005 s is not stable")
         assert found.message in judged.message
     else:
         assert abs(entry.value - 0.5) < 3 * entry.std

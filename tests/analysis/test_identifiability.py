@@ -144,9 +144,9 @@ def test_the_part_that_a_direction_explains_does_not_depend_on_its_length(size):
 @pytest.mark.parametrize(
     ("nuisances", "words"),
     [
-        ((SLOPE,), "the unknown start"),
-        ((GRASP,), "where the grasp sits"),
-        ((GRASP, SLOPE), "the unknown start and where the grasp sits"),
+        ((SLOPE,), "the unknown initial state"),
+        ((GRASP,), "the position of the grasp"),
+        ((GRASP, SLOPE), "the unknown initial state and the position of the grasp"),
     ],
 )
 def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuisances, words):
@@ -165,7 +165,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
     trade = "a +10 % with b +10 % changes nothing that is measured"
     assert said.startswith(f"this: a and b are determined only together: {trade}")
-    assert said.endswith("cannot be separated from the unknown start")
+    assert said.endswith("cannot be separated from the unknown initial state")
 
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):
@@ -263,7 +263,7 @@ def test_two_pairs_that_are_each_seen_together_are_told_apart():
 
     info = identifiability(Formula(rows, {"a": 2.0, "b": 5.0, "c": 3.0, "d": 4.0}))
     assert {d.words for d in info.unidentifiable_directions} == {
-        "a and b are determined only as a + b, as springs side by side are",
+        "a and b are determined only as a + b, like parallel springs",
         "c and d are determined only as the product c x d",
     }
     assert len(info.directions) == 4
@@ -279,11 +279,11 @@ def unseen(function, start=None, **more):
 @pytest.mark.parametrize(
     ("function", "units", "words"),
     [
-        (lambda a, b: 1 / a + 1 / b, ("N/m", "N/m"), "1/a + 1/b, as springs in series are"),
+        (lambda a, b: 1 / a + 1 / b, ("N/m", "N/m"), "1/a + 1/b, like springs in series"),
         (lambda a, b: 1 / a + 1 / b, ("N/m", "kg"), None),
-        (lambda a, b: 1 / a + 1.1 / b, ("N/m", "N/m"), "1/a + 1/b, as springs in series are"),
+        (lambda a, b: 1 / a + 1.1 / b, ("N/m", "N/m"), "1/a + 1/b, like springs in series"),
         (lambda a, b: 1 / a + 1.3 / b, ("N/m", "N/m"), None),
-        (lambda a, b: a + b, ("N/m", "N/m"), "a + b, as springs side by side are"),
+        (lambda a, b: a + b, ("N/m", "N/m"), "a + b, like parallel springs"),
         (lambda a, b: a + b, ("N/m", "kg"), None),
         (lambda a, b: a / b, ("N/m", "kg"), "the ratio a / b"),
         (lambda a, b: a * b, ("N/m", "kg"), "the product a x b"),
@@ -321,7 +321,7 @@ def test_the_combination_that_moves_the_data_least_is_named_where_it_can_be_roll
     assert "a + b" in unseen(lambda a, b: a + b, {"a": 3.0, "b": 3.0})
     assert "a + b" not in unseen(lambda a, b: a + b, {"a": 9.0, "b": 1.0})
     assert "a + b" not in unseen(lambda a, b: a + b, {"a": 3.0, "b": 0.5})
-    assert "as springs" not in unseen(lambda a, b: a + b, fails=lambda values: values["a"] != 2.0)
+    assert "like" not in unseen(lambda a, b: a + b, fails=lambda values: values["a"] != 2.0)
 
 
 def test_many_parameters_trade_in_percent_of_the_largest_change():
@@ -394,7 +394,7 @@ def test_two_springs_in_series_seen_at_the_ends_only(springs):
     info = identifiability(problem, solve(problem, GaussNewton()), intervals="all")
     assert verdicts(info) == ["not_identifiable"] * 2
     [unseen] = info.unidentifiable_directions
-    assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in unseen.words
+    assert "1/spring_1.stiffness + 1/spring_2.stiffness, like springs in series" in unseen.words
     assert info.correlations[0, 1] == pytest.approx(-1, abs=1e-6)
     total = 1 / (1 / 200.0 + 1 / 300.0)
     for entry in info.parameters.values():
@@ -425,7 +425,7 @@ def test_two_torsional_springs_under_a_known_torque(springs, points, verdict):
     info = identifiability(problem, solve(problem, GaussNewton()))
     assert set(verdicts(info)) == {verdict}
     assert bool(info.unidentifiable_directions) == (verdict == "not_identifiable")
-    assert all("as springs in series are" in direction.words for direction in info.unidentifiable_directions)
+    assert all("like springs in series" in direction.words for direction in info.unidentifiable_directions)
 
 
 @pytest.mark.parametrize(("vision", "known_std", "unknown_std"), [(False, 1.17, 2.54), (True, 0.34, 0.38)])

@@ -130,7 +130,7 @@ def offset(torque, column, *, rubs=False):
 
 
 ARM_FLIPPED = {"right_s0": 1.390, "right_s1": 2.551, "right_e0": 1.165, "right_e1": 1.364, "right_w0": 1.022}
-THOUSAND = [("effort_limits", "right_s1", 562.7, "732 times what it can bear (50 N m)")]
+THOUSAND = [("effort_limits", "right_s1", 562.7, "732 times its effort limit (50 N m)")]
 THOUSAND += [("effort_gain", "", 388.8, "about 1.2e+03 times")]
 EFFORTS = {
     "as recorded": (1, lambda j: j.effort, []),
@@ -192,8 +192,8 @@ def swung(drives, change=lambda e: e, size=1.0, rate=2.0, behind=0.0, noise=0.0,
     return Recording(JointGroup(drives.joint_names, t, swing(t, size, rate)[0], effort=effort, **more), name="run")
 
 
-LIMIT = ("effort_limits", "shoulder", 3.218, "of shoulder is 4.18 times what it can bear (6 N m)")
-ELBOW_LIMIT = ("effort_limits", "elbow", 1.345, "of elbow is 1.75 times what it can bear (6 N m)")
+LIMIT = ("effort_limits", "shoulder", 3.218, "of shoulder is 4.18 times its effort limit (6 N m)")
+ELBOW_LIMIT = ("effort_limits", "elbow", 1.345, "of elbow is 1.75 times its effort limit (6 N m)")
 SWUNG = {
     "as needed": (lambda e: e, 0.0, []),
     "one a tenth": (lambda e: e * [0.1, 1.0], 0.0, [("effort_gain", "shoulder", 3.124, "0.1 times what gravity")]),
@@ -294,7 +294,7 @@ def test_limits_of_joints(arms, runs):
     (doubt,) = joint_limit_issues(arm, with_joints(run, t=lambda j: j.t / 30))
     assert (doubt.cause, doubt.channel) == ("speed_limits", "t")
     assert doubt.limit_violation_ratio == pytest.approx(6.959, rel=1e-3)
-    assert "left_e1 turns 10.4 times as fast as it can (1.5 rad/s)" in doubt.what
+    assert "left_e1 turns 10.4 times as fast as its speed limit (1.5 rad/s)" in doubt.what
 
 
 MIRROR, WALK = np.array([1.0, -1.0, 1.0]), np.cumsum(0.02 * np.random.default_rng(0).standard_normal((501, 1, 3)), 0)
@@ -302,8 +302,8 @@ TURN = np.array([[0.9, -np.sqrt(0.19), 0.0], [np.sqrt(0.19), 0.9, 0.0], [0.0, 0.
 HELD = {
     "as recorded": (1, lambda p: p, None, ""),
     "as recorded by two": (2, lambda p: p, None, ""),
-    "mirrored": (1, lambda p: MIRROR * p, "point_mirrored", "(x, -y, z) for (x, y, z), a mirror image, it is"),
-    "turned about x": (1, lambda p: p * [1, -1, -1], "point_mirrored", "with (x, -y, -z) for (x, y, z) it is"),
+    "mirrored": (1, lambda p: MIRROR * p, "point_mirrored", "(x, -y, z) for (x, y, z), a mirror image, they are"),
+    "turned about x": (1, lambda p: p * [1, -1, -1], "point_mirrored", "with (x, -y, -z) for (x, y, z) they are"),
     "axes exchanged": (2, lambda p: p[..., [1, 0, 2]], "point_mirrored", "(y, x, z) for (x, y, z), a mirror"),
     "shifted": (2, lambda p: p + np.array([0.1, 0.0, 0.2]), "point_frame", "shifted by (-0.1"),
     "turned": (2, lambda p: p @ TURN.T, "point_frame", "turned by 25.8 degrees"),
@@ -313,7 +313,7 @@ HELD = {
 # millimetres, centimetres, inches, decimetres and feet, and read as such
 for unit in (1e-3, 1e-2, 0.0254, 0.1, 0.3048):
     for scale in (unit, 1 / unit):
-        HELD[f"times {scale:.3g}"] = (2, lambda p, by=scale: by * p, "point_scale", f"; divided by {scale:g} it is")
+        HELD[f"times {scale:.3g}"] = (2, lambda p, by=scale: by * p, "point_scale", f"; divided by {scale:g} they are")
 
 
 @pytest.mark.parametrize("case", HELD)
@@ -323,7 +323,7 @@ def test_points_that_the_arm_holds(arms, runs, case):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert words in doubt.what
-        assert doubt.what.endswith("explains it" if case == "walking away" else f"it is 0.001{6 + count} m")
+        assert doubt.what.endswith("explains it" if case == "walking away" else f"they are 0.001{6 + count} m away")
         [group] = (group for group in runs[count].points if group.name == "points_arm")
         apart = np.linalg.norm(change(group.position) - group.position, axis=2)
         assert doubt.group == "points_arm"
@@ -368,11 +368,11 @@ def test_a_clocks_offset_is_known_no_better_than_the_errors_that_look_like_it():
 
 def test_clocks_that_are_far_apart(arms, runs):
     (doubt,) = forward_kinematics_issues(arms[2], stamped(runs[2], 0.2, -0.05), usual)
-    assert "taken +0.202 s from the joints, by a clock that runs -52.4 parts per thousand fast" in doubt.what
+    assert "with times +0.202 s off the joints' clock, and -52.4 parts per thousand fast" in doubt.what
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
     (doubt,) = forward_kinematics_issues(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
-    assert ("taken +0.4 s" in doubt.what, doubt.advice) == (True, "subtract 0.4 s from their times")
+    assert ("with times +0.4 s" in doubt.what, doubt.advice) == (True, "subtract 0.4 s from their times")
     (doubt,) = forward_kinematics_issues(arms[1], stamped(runs[1], drift=0.05), usual)
     assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_drift", pytest.approx(1.392, rel=2e-3))
     assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
@@ -449,13 +449,13 @@ def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert doubt.limit_violation_ratio == pytest.approx(ratio, rel=1e-3)
-        assert re.fullmatch(r"w_T1 from the object's root is \S+ m, 0.813 m along the object", doubt.what)
+        assert re.fullmatch(r"w_T1 from the object's root is \S+ m, but only 0.813 m along the object", doubt.what)
 
 
 def test_two_points_on_either_side_of_the_root_are_too_far_apart_for_the_branches_between_them(arms, runs):
     recording = with_points(runs[1], "points_camera", lambda p: p + np.array([[0.0, 0.6, 0.0], [0.0, -0.6, 0.0]]))
     (doubt,) = point_distance_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
-    assert doubt.what == "w_T1 from w_T3 is 1.81 m, 1.14 m along the object"
+    assert doubt.what == "w_T1 from w_T3 is 1.81 m, but only 1.14 m along the object"
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -511,7 +511,7 @@ def applied(pose):
 ROLLED = {
     "as predicted": (lambda p: p + 0.1, True, None, ""),
     "in the camera's frame": (applied(BACK), True, "point_frame", "with the camera's pose applied"),
-    "pose inverted": (applied(BACK @ BACK), True, "point_frame", "with the camera's pose the other way round"),
+    "pose inverted": (applied(BACK @ BACK), True, "point_frame", "with the camera's pose inverted"),
     "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis turned"),
     "no pose is known": (applied(BACK), False, None, ""),
     "in millimetres": (lambda p: 1e3 * p, False, "point_scale", "divided by 1000"),
@@ -563,11 +563,11 @@ def hanging(seed: int = 0) -> Recording:
     [
         (lambda p: p, None, "", 0.0),
         (lambda p: 10 * p, "point_scale", "9.98 times as long", math.log(9.98) / math.log(1.2)),
-        (lambda p: 0.5 * p, "point_scale", "0.499 times as long", math.log(2.0) / math.log(1.2)),
+        (lambda p: 0.5 * p, "point_scale", "0.499 times their undeformed length", math.log(2.0) / math.log(1.2)),
         (lambda p: p * [1, 1, -1], "point_mirrored", "on average 0.192 m above its clamps", 3.798),
         (
             lambda p: p[:, [0, 1, 2, 10, 4, 5, 6, 7, 8, 9, 3, 11]],
-            *("point_swapped", "a2 to a3 is 3.45 times as long as undeformed; with a2 and p3 exchanged, 3 edges are"),
+            *("point_swapped", "a2 to a3 has 3.45 times its undeformed length; with a2 and p3 exchanged, 3 more"),
             math.log(3.45) / math.log(1.6),
         ),
     ],
@@ -588,7 +588,7 @@ def test_a_cable_of_which_a_point_is_missing_is_judged_by_the_others():
     (group,) = with_points(hanging(), "points", lambda p: 10 * p).points
     fewer = Recording(None, (replace(group, names=group.names[:-1], position=group.position[:, :-1]),), name="c")
     (doubt,) = cable_point_geometry_issues(CABLE, fewer, GRAVITY)
-    assert (doubt.cause, "9.98 times as long" in doubt.what) == ("point_scale", True)
+    assert (doubt.cause, "9.98 times their undeformed length" in doubt.what) == ("point_scale", True)
     two = Recording(None, (replace(group, names=group.names[:3], position=group.position[:, :3]),), name="c")
     assert list(cable_point_geometry_issues(CABLE, two, GRAVITY)) == []
 

@@ -125,7 +125,7 @@ def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
 def test_an_entry_names_or_counts_its_variables_and_says_where_it_vanishes(symbols):
     entry = symbols.equation_or_derivative("constraint[hand.x], T1.bend")
     assert entry.is_identically_zero
-    assert entry.text_lines == ["d constraint[hand.x] / d T1.bend = 0 whatever the state"]
+    assert entry.text_lines == ["d constraint[hand.x] / d T1.bend = 0 for every state"]
     stiffness = symbols.equation_or_derivative("del[elbow], elbow.stiffness")
     assert stiffness.variable_names == ("q0[elbow]", "elbow.rest", "h", "q1[elbow]")
     assert "8 of q0" in symbols.equation_or_derivative("del[T1_0_z]").variable_names

@@ -226,7 +226,10 @@ def test_check(carried_out, pendulum):
     assert not any("effort_kind" in text for text in result["warnings"])
     assert set(result["mechanics"]) == {"built", "file"}
     assert all(entry["agrees"] for entry in result["mechanics"].values())
-    assert "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics are Pinocchio's within" in done.out
+    assert (
+        "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics agree with Pinocchio's within"
+        in done.out
+    )
 
 
 def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendulum_data, tmp_path):
@@ -297,7 +300,7 @@ def test_inspect(carried_out, pendulum, tmp_path):
     assert slope["value"] == pytest.approx(0.0, abs=1e-12)
     assert abs(before) > 1e-3
     assert momentum["value"] == pytest.approx(before, rel=1e-9)
-    assert f"  which is {before:.6g} at rest at the first posture of estimate" in done.out
+    assert f"  its value is {before:.6g} at rest at the first posture of estimate" in done.out
     files = {path.name for path in (tmp_path / "eq").iterdir()}
     assert files == {pathlib.Path(name).name for name in result["exported"]}
     assert {"rows.casadi", "equations.c", "names.json"} <= files
@@ -355,8 +358,8 @@ def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(cli, tmp_pat
     (tmp_path / "arm.yaml").write_text("model: {robot: arm.xml, arms: {joints: [j], mode: driven}}\n")
     done = cli("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
     assert done.code == 0, done.err
-    assert "is not compared" not in done.out
-    assert "the built model: mass matrix, weight and inverse dynamics are Pinocchio's" in done.out
+    assert "cannot be compared" not in done.out
+    assert "the built model: mass matrix, weight and inverse dynamics agree with Pinocchio's" in done.out
 
 
 def test_what_is_simulated_is_exported_and_imported(cli, pendulum_data, tmp_path):

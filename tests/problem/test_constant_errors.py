@@ -186,7 +186,7 @@ def test_damping_is_right_where_markers_are_late(tmp_path):
     ]
     problem = EstimationProblem(step, far[:2], tuple(truth), told, held_out=far[2:])
     problems["fitted"], doubts = problem_with_fitted_point_clocks(problem)
-    said = [float(doubt.what.split(" come ")[1].split()[0]) for doubt in doubts]
+    said = [float(doubt.what.split(") are ")[1].split()[0]) for doubt in doubts]
     assert said == pytest.approx([30.5, 19.5, 25.5], abs=0.5), "of held-out recordings too"
     before, after = (solve(own, GaussNewton()).goodness_of_fit.chi2_per_dof for own in (problem, problems["fitted"]))
     assert before > 1.5

@@ -1,12 +1,12 @@
 """Checks of the clocks of measured points for an offset or drift relative to the clock of the joints.
 
 A point with the time stamp t was measured at the time t - late - drift (t - middle), where `middle` is the middle of
-the group in time. To first order
+the recorded time. The position expected at the time t differs from the measured one, to first order, by
 
     expected - seen = speed (late + drift (t - middle)) + other errors of the expected position,
 
-which is linear in the unknowns. The standard deviations account for correlated errors of neighbouring samples (blocks
-of time, Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136). Only motion is informative: the speed is a factor.
+which is linear in the unknowns `late` [s] and `drift`. A point at rest gives no information. The standard deviations
+account for correlated errors in blocks of time (Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.solvers import base as solvers
 
-# From times on the joints' clock (N,) to positions (N, np, 3) [m].
+# Function from N times on the joints' clock (N,) to the positions of np points (N, np, 3) [m].
 PositionsAtTimesFunction = Callable[[Array], Array]
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
@@ -53,7 +53,7 @@ _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
 
 @dataclass(frozen=True)
 class _ClockError:
-    """Stamp minus true time [s] in the middle of a group, and the relative rate by which its clock is too fast."""
+    """Clock error of a group: stamp minus true time [s] in the middle of `span`, and relative rate of a fast clock."""
 
     span: tuple[float, float]
     delay: float
@@ -68,19 +68,19 @@ class _ClockError:
         return self.drift * (self.span[1] - self.span[0])
 
     def drifts_beyond(self, limit: float) -> bool:
-        """Whether the drift is significant and its total exceeds a limit [s]."""
+        """Return whether the drift is significant and its total exceeds a limit [s]."""
         return abs(self.drift) > _MIN_Z * self.drift_std and abs(self.whole_drift) > limit
 
 
 def _offset_tolerance(joints: JointGroup, group: PointGroup) -> float:
-    """Clock offset that is too small to be resolved with these sample periods [s]."""
+    """Return the largest clock offset [s] that is too small to be resolved with the sample periods of both groups."""
     return 0.5 * (median_sample_period(joints.t) + min(median_sample_period(group.t), _MAX_EXPOSURE_TIME))
 
 
 def _clock_error(
     t: Array, residual: Array, speed: Array, others: Array, size: Array, span: tuple[float, float]
 ) -> _ClockError | None:
-    """Offset and drift from a residual (R,) by least squares, with derivatives `speed` by the clock and `others`."""
+    """Estimate offset and drift from a residual (R,), with derivatives `speed` by them and `others` of std `size`."""
     length, data = max(span[1] - span[0], 1e-9), len(t)
     if not np.all(np.sum(speed**2, axis=0) > 0) or data < 3 * _N_TIME_BLOCKS:
         return None
@@ -105,7 +105,7 @@ def _clock_error(
 
 
 def _by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
-    """Derivatives (R, 2) of predicted values by the clock's offset and by its accumulated drift."""
+    """Return the derivatives (R, 2) of predicted values by the clock's offset and by its total drift over `span`."""
     return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
 
 
@@ -122,7 +122,7 @@ def robot_held_point_clock_issues(
 
     The measured positions `seen` (N, np, 3) [m] at the times `t` (N,) are compared with the positions that `path`
     computes from the joint angles at given times. `by_angle` (N, np, 3, k) is the derivative of these positions with
-    respect to the k angles. `std` is the noise of the points [m], zero if unknown.
+    respect to the k angles. `std` is the standard deviation of the points' noise [m], zero if unknown.
     """
     span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
@@ -151,8 +151,8 @@ def robot_held_point_clock_issues(
     if found.drifts_beyond(limit):
         yield _drift_issue(found, group.name, limit, severity)
     elif abs(late) > _MIN_Z * found.delay_std and abs(late) > limit:
-        words = f"{group.name} is stamped {1e3 * late:+.3g} ± {1e3 * found.delay_std:.2g} ms from the joints"
-        words = f"{words}; {1e3 * limit:.3g} ms cannot be resolved (sample period)"
+        error = f"{1e3 * late:+.3g} ± {1e3 * found.delay_std:.2g} ms off the clock of the joints"
+        words = f"time stamps of {group.name} are {error}; the sample periods hide errors below {1e3 * limit:.3g} ms"
         camera = "camera" in f"{group.name} {group.sensor_name}".lower() or group.camera_pose is not None
         setting = f"sensors.{group.name}.use: false"
         if camera and late > 0:
@@ -165,14 +165,14 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSe
     late, drift, whole = found.delay, found.drift, found.whole_drift
     begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
     size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
-    words = f"{group} is stamped {begin} from the joints at its beginning, {end} at its end"
+    words = f"time stamps of {group} are {begin} off the joints' clock at its beginning, {end} at its end"
     words = f"{words}: its clock runs {size} parts per thousand too {how}"
     advice, setting = timestamp_correction_advice(late, drift, 0.5 * sum(found.span)), f"sensors.{group}.use: false"
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
-    """Return advice on how to correct time stamps with a delay (`late` [s] at the time `middle`) and a `drift`."""
+    """Return the formula that corrects time stamps which are `late` [s] at the time `middle` [s] and have a `drift`."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
@@ -182,8 +182,8 @@ def clock_offset_drift_and_rms_distance(
     """Find the clock offset [s] and drift that bring points nearest to a known path, and the remaining rms error [m].
 
     The search goes from coarse to fine steps. The path is known from the first to the last time in `knots` [s]. The
-    points `seen` (N, np, 3) [m] were measured at the times `t` (N,). With `drifts`, a drift of up to `_MAX_DRIFT` is
-    searched too, otherwise it is zero.
+    points `seen` (N, np, 3) [m] have the time stamps `t` (N,). With `drifts`, a drift of up to ± `_MAX_DRIFT` is
+    searched, too; otherwise it is zero.
     """
     middle, span = 0.5 * float(t[0] + t[-1]), float(t[-1] - t[0])
 
@@ -213,10 +213,10 @@ def clock_offset_drift_and_rms_distance(
 
 
 def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[EstimationProblem, list[Issue]]:
-    """Correct the times of points if their clock offset is uncertain by over half a sample, and report it as an issue.
+    """Return the problem with corrected times of points whose clock is uncertain, and an issue for each correction.
 
-    So large an offset is not linear in the residual. Fits, with what is left of it as a linear error of unknown size,
-    alternate with steps along the predicted paths, also of held-out recordings, which keep `clock_offset_std`.
+    A group is corrected if its `clock_offset_std` exceeds half a sample period: the residual is not linear in so large
+    an offset. Fits alternate with shifts of the times to the predicted paths. Held-out recordings are shifted, too.
     """
     recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
     sensors, count, late = problem.options.sensors, len(problem.episodes), dict[tuple[int, str], tuple[float, float]]()
@@ -248,13 +248,13 @@ def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[Estima
     issues, advice = list[Issue](), "import it with --clock-offset where the offset is known"
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
-        words = f"{name} of {own}, known to ± {1e3 * std:.3g} ms, come {said} by a fit, which is corrected"
+        words = f"time stamps of {name} of {own} (stated: ± {1e3 * std:.3g} ms) are {said} by a fit; they are corrected"
         issues.append(Issue("clock_offset", words, "warning", abs(shift) / std, advice, own, name, "t"))
     return problem, issues
 
 
 def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
-    """Return issues about drifting clocks and overstated sensor noise, found in the residuals of a fit.
+    """Return issues about drifting clocks and overstated sensor noise, found in the residuals of a fit at `x` (nx,).
 
     Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has
     the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).
@@ -299,7 +299,7 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
 def _by_lateness(
     problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction
 ) -> Array:
-    """Whitened prediction minus measurement per second of lateness of the stamps, shape (M, k)."""
+    """Return the derivative (M, k) of whitened prediction minus measurement by the lateness [s] of the time stamps."""
     shared, _ = problem.unpack_episode_unknowns(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     state = result.rollout.state
@@ -312,7 +312,7 @@ def _by_lateness(
 
 
 def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[Issue]:
-    """Groups whose residuals, both per sample and summed over time blocks, are far below the stated noise."""
+    """Yield issues for groups whose residuals, per sample and summed over time blocks, are far below stated noise."""
     by_group: dict[str, list[tuple[float, float, int]]] = {}
     units = {}
     for series in channels_with_residual_indices(problem):
@@ -333,9 +333,9 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
-        leaves = f"the fit leaves {seen * usual:.2g} {unit} of {group}, all slow errors counted"
-        words = f"{leaves}; {usual:.2g} {unit} is stated"
-        advice = "state the noise that is there: as stated every ± is too wide, and a small gap is not seen"
+        leaves = f"the fit leaves {seen * usual:.2g} {unit} of {group} (rms, slow errors included)"
+        words = f"{leaves}; the stated noise is {usual:.2g} {unit}"
+        advice = "state the actual noise: with the stated one every ± is too wide, and a small gap is not found"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         severity = 1 / (least * max(seen, 1e-9))
         where = group.partition(".")[0]

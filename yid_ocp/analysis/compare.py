@@ -1,4 +1,4 @@
-"""Comparison of several estimation methods on one problem, and with published results."""
+"""Comparison of several estimation methods on one problem, and published estimates to compare them with."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SOLVE_LABEL = "solve"  # the run that gives the verdicts, by all noise
 
 @dataclass(frozen=True)
 class _MethodResult:
-    """Result of one method: solution, cost in the problem's own weighting, times and largest resident memory."""
+    """Result of one method: solution, cost with the problem's whitened residual, times and largest resident memory."""
 
     method: str
     solution: Solution
@@ -49,11 +49,11 @@ class _MethodResult:
 
 @dataclass(frozen=True)
 class MethodsComparisonResult:
-    """The results of all estimation methods on one problem, with the identifiable parameters that differ."""
+    """The results of all estimation methods on one problem, and the parameters on which the methods disagree."""
 
     method_results: tuple[_MethodResult, ...]
     reference_method: str  # method of lowest cost, with which the other methods are compared
-    has_process_noise: bool  # whether the problem has process noise; the comparison ignores it
+    has_process_noise: bool  # whether the problem has process noise, which all compared methods ignore
     # result of `solve`: the checked reference or, with process noise, that of a method that models it
     verdict_solution: Solution
     disagreements: Mapping[str, list[str]]  # identifiable parameters that differ, with the reason, as one sentence
@@ -62,7 +62,7 @@ class MethodsComparisonResult:
 
     @property
     def is_consistent(self) -> bool:
-        """True if all methods agree on every identifiable parameter."""
+        """True if the estimates of all methods agree on every identifiable parameter."""
         return not any(self.disagreements.values())
 
 
@@ -77,10 +77,10 @@ def compare_methods(
     """Run several estimation methods (`solvers`) from the same initial values and compare their estimates.
 
     Steepest descent minimises the published cost (points in metres, no noise levels, no weak prior). The other methods
-    minimise the problem's cost without process noise, which not every method supports. If the problem has process
+    minimise the problem's cost without process noise, because not every method supports it. If the problem has process
     noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run that includes it.
-    `truth` holds known parameter values. `callback` receives the method's name and every `Iterate`. `limits` are the
-    criteria by which a residual exceeds noise. A method may use an equal part of the remaining `total_time_budget` [s].
+    `truth` holds known true values by parameter. `callback` receives the method's name and every `Iterate`. `limits`
+    states when a residual exceeds noise. Each method gets an equal part of the remaining `total_time_budget` [s].
     """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
     deadline = time.perf_counter() + total_time_budget
@@ -94,7 +94,7 @@ def compare_methods(
             if callback is not None:
                 callback(name, entry)
             if time.perf_counter() - begun > share:
-                raise StopSearch(f"stopped after {share:.3g} s, its share of compare.total_time_budget")
+                raise StopSearch(f"stopped after {share:.3g} s, its part of compare.total_time_budget")
 
         return told
 
@@ -139,7 +139,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
     elif run.whitened_cost > best.whitened_cost + 2.0:
         why = "it stopped in another local minimum"
     else:
-        why = "its cost weighs the measurements otherwise"
+        why = "its cost weights the measurements differently"
     return [f"from {best.method} (in brackets) in {', '.join(values)}: {why}"] if values else []
 
 
@@ -153,7 +153,7 @@ def _explanations(
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
         said = VERDICT_SENTENCE_TEXTS[reference.verdict]
-        sentences.append(f"{name}{known} {said}: where it ends is the method's choice ({places})")
+        sentences.append(f"{name}{known} {said}: its value depends on the method ({places})")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
     return sentences + [_descent_errors(run, judged, truth, disturbed) for run in descents]
 
@@ -161,7 +161,7 @@ def _explanations(
 def _descent_errors(
     run: _MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> str:
-    """Sentence on the parameters that a method left far from the truth, and whether the data determine them."""
+    """Return a sentence on the parameters that a method left far from `truth`, and whether the data determine them."""
     known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
     # the same limit applies to the standard deviation of an identifiable parameter
@@ -177,17 +177,17 @@ def _descent_errors(
         return f"{text}; these are exactly the parameters that are not found"
     seen, lucky = [name for name in wrong if name not in hidden], [name for name in hidden if name not in wrong]
     if seen:
-        why = "it takes the recorded torques as true" if disturbed else "its cost weighs the measurements otherwise"
+        why = "it takes the recorded torques as true" if disturbed else "its cost weights the measurements differently"
         if run.solution.status != Status.CONVERGED:
-            why = f"the method stopped short ({run.solution.status.value})"
-        text += f"; {', '.join(seen)} could be found: {why}"
+            why = f"the method ended too early ({run.solution.status.value})"
+        text += f"; the recordings determine {', '.join(seen)}, but {run.method} does not find it: {why}"
     if lucky:
-        text += f"; {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} came out near the truth all the same"
+        text += f"; {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} ended near the truth nevertheless"
     return text
 
 
 class _Memory:
-    """Largest resident memory of this process during a block, sampled by a thread [MiB]."""
+    """A context manager whose thread samples the resident memory of this process; `peak` is the largest value [MiB]."""
 
     def __enter__(self) -> _Memory:
         self.peak, self._stop = 0.0, threading.Event()
@@ -222,4 +222,4 @@ PAPER_ESTIMATES: dict[str, dict[str, float]] = {
     "dual_arm_no_vision": dict(zip(_PAPER_PARAMETERS, (19.559, 4.965, 8.575, 10.374, 0.000, 11.287), strict=True)),
     "dual_arm_vision": dict(zip(_PAPER_PARAMETERS, (24.840, 0.000, 12.373, 30.775, 1.406, 24.900), strict=True)),
 }
-"""Estimates of Caldwell et al. (2014) for their four experiments [N m/rad]; the data are not public."""
+"""Published stiffness estimates [N m/rad] of Caldwell et al. (2014), by experiment. Their data are not public."""

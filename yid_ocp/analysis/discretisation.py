@@ -1,4 +1,4 @@
-"""Errors due to finite links and time steps, natural frequencies, gaps at grasps, and numerical stability."""
+"""Errors due to finite links and finite time steps, natural frequencies, gaps at grasps, and numerical stability."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class _FinerDiscretisationProblem:
         return float(self.parameter_factors.get(name.split("[")[0], 1.0))
 
     def _unknowns(self, names: Sequence[str], x: Array) -> Array:
-        """Unknowns that correspond to coarse ones, within bounds. Divided links share the angle of the coarse link."""
+        """Return the fine unknowns for coarse unknowns `x`, within bounds. Divided links share their link's angle."""
         made, at = self.problem.initial_unknowns, {name: i for i, name in enumerate(self.problem.unknown_names)}
         for name, value in zip(names, x, strict=True):
             base, bracket, recording = name.partition("[")
@@ -80,7 +80,7 @@ class _FinerDiscretisationProblem:
 
 
 def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
-    """For each divided joint of the coarse model, the names of the fine joints that replace it."""
+    """Return the names of the fine joints that replace each divided joint of the coarse model."""
     found = {}
     for segment in coarse.segment_layouts:
         links = fine.layout_of_segment(segment.name).link_joints
@@ -99,11 +99,11 @@ def _gauss_newton_step_in_finer_model(
     *,
     model_difference_only: bool = False,
 ) -> tuple[dict[str, float], Array] | str:
-    """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns x (nx,).
+    """Make one Gauss-Newton step in a finer model, from the coarse unknowns x (nx,).
 
-    Also returns the linearised residual after the step, or a message if the step fails. Data, bounds and priors are
-    those of the coarse problem, evaluated in `at_x`. With `model_difference_only`, for points that are no estimate, the
-    coarse prediction replaces the data. With process noise, only the residual is the finer model's (Richardson).
+    Returns the shift of each shared free parameter and the linearised residual after the step, or a message if the step
+    fails. `at_x` is the coarse evaluation at `x`. With `model_difference_only`, for points that are no estimate, coarse
+    predictions replace the data. With process noise, Jacobian and priors are coarse, only the data residual is fine.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -111,7 +111,7 @@ def _gauss_newton_step_in_finer_model(
     problem = _with_coarse_weights(refined.problem, coarse) if weighted else refined.problem
     own, other = problem.residual_rows, coarse.residual_rows
     if (model_difference_only and own != other) or (weighted and own.measurements != other.measurements):
-        return "the finer model is compared at other samples"
+        return "the finer model does not use the same samples as the coarse one"
     evaluation = problem.evaluate(point, derivatives=not weighted, equilibrium_guesses=warm)
     residual, jacobian = evaluation.residual, evaluation.jacobian
     if not evaluation.ok:
@@ -136,8 +136,8 @@ def predicted_refit_residual_at_finer_step(
     """Predict the whitened residual that a fit with a shorter time step would have, or return None if this fails.
 
     `fine` is the problem with the shorter time step. One Gauss-Newton step is made from the coarse fit `x` (nx,), where
-    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without, `fine` is
-    fitted if the shorter step changes predictions by more than the residual, which is too much for one linear step.
+    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without it,
+    `fine` is fitted if the shorter step changes predictions by more than the residual, too much for one linear step.
     """
     refined = _FinerDiscretisationProblem(fine)
     made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)
@@ -156,11 +156,11 @@ def predicted_refit_residual_at_finer_step(
 def problem_corrected_for_few_links(
     problem: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
 ) -> EstimationProblem | None:
-    """Subtract from all data the amount by which the predictions change if each link is divided in two.
+    """Return the problem with all data corrected for the error of too few links.
 
-    `at_x` is the evaluation at the fit `x` (nx,), with Jacobian. The finer model is refitted first if the change is
-    much larger than the residual: a linear step is too inaccurate there. Returns None if a refit would not lower r'r by
-    `min_chi2_decrease`, if the object cannot be divided, if torques have noise, or if the finer model fails.
+    The change of the predictions by dividing each link in two is subtracted. `at_x` is the evaluation at the fit `x`
+    (nx,), with Jacobian. If this change is large, the finer model is refitted first. Returns None if a refit would not
+    lower r'r by `min_chi2_decrease`, if links cannot be divided, if torques have noise, or if the finer model fails.
     """
     divided, segments = problem.options.divided_links_model, problem.system.segment_layouts
     if divided is None or not segments or problem.has_process_noise:
@@ -196,7 +196,7 @@ def problem_corrected_for_few_links(
 
 
 def _with_data_shifted(episode: Episode, before: EpisodePrediction | str, after: EpisodePrediction | str) -> Episode:
-    """The episode minus the change of its predictions, where both exist and have the same samples."""
+    """Return the episode with the change of its predictions subtracted from its data, if both predictions succeeded."""
     if isinstance(before, str) or isinstance(after, str):
         return episode
     triples = zip(episode.measurements, before.predicted_outputs, after.predicted_outputs, strict=True)
@@ -208,8 +208,8 @@ def longest_accurate_time_step(problem: EstimationProblem) -> float:
     """Find the longest time step [s] whose error is small compared with the residual at the initial values.
 
     Starting at 20 ms, the step is halved, at most five times, until a further halving changes the predictions by at
-    most 3 % of the larger of residual and noise (root mean squares of whitened values). A poor initial guess has a
-    larger residual and therefore allows a larger error.
+    most 3 % of the larger of residual and noise (root mean squares of whitened values). Poor initial values have a
+    larger residual and therefore allow a larger error.
     """
     x, problem = problem.initial_unknowns, problem.with_time_step(_MAX_TIME_STEP)
     for _ in range(_MAX_HALVINGS):
@@ -222,7 +222,7 @@ def longest_accurate_time_step(problem: EstimationProblem) -> float:
 
 
 def _half_step_error(problem: EstimationProblem, fine: EstimationProblem, x: Array) -> float | None:
-    """Change of whitened predictions by a finer step as a fraction of their residual; None if not comparable."""
+    """Return the rms change of whitened predictions by a finer step, over their residual or 1; None if incomparable."""
     try:
         coarse = problem_with_whitening_at(problem, x)
         if any(own is not None for own in coarse.whitening_filters):
@@ -240,21 +240,21 @@ def _half_step_error(problem: EstimationProblem, fine: EstimationProblem, x: Arr
 
 @dataclass(frozen=True)
 class _CoarseWeights:
-    """Filter of a coarser rollout, for finer steps of which `ratio` average to one coarse torque."""
+    """The whitening filter of a coarser rollout, applied to finer steps. `ratio` fine steps make one coarse step."""
 
     coarse: ProcessNoiseWhitener
     input_error_model: TorqueAndAngleErrorModel
     ratio: int
 
     def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten as the coarser filter; see `ProcessNoiseWhitener`."""
+        """Whiten with the coarser filter; see `ProcessNoiseWhitener`. `push` is averaged over each coarse step."""
         if push is not None:
             push = np.mean(push.reshape(-1, self.ratio, *push.shape[1:]), axis=1)
         return self.coarse.whiten_residuals_and_estimate_torque_bias(rows, push)
 
 
 def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> EstimationProblem:
-    """The finer problem with the input errors and filters of the coarse one, over the same whole steps."""
+    """Return the finer problem with the input errors and filters of the coarse one, over whole coarse steps."""
     ratio, episodes = round(coarse.step.time_step / fine.step.time_step), []
     filters: list[ProcessNoiseWhitener | None] = []
     for own, other, whitening in zip(fine.episodes, coarse.episodes, coarse.whitening_filters, strict=True):
@@ -273,11 +273,11 @@ def estimate_shifts_by_discretisation(
     *,
     model_difference_only: bool = False,
 ) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
-    """Measure how much estimates change if every link is divided in two, and if the time step is halved.
+    """Compute how much estimates change if every link is divided in two, and if the time step is halved.
 
     `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. If `x`
-    is not a minimum of the cost, set `model_difference_only`. Returns the shifts of every shared free parameter (empty
-    if nothing was tried), and notes on shifts that could not be computed.
+    is not a minimum of the cost, set `model_difference_only`. Returns the shifts by shared free parameter (empty if no
+    refinement succeeded), and a note on each refinement that failed.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
@@ -294,7 +294,7 @@ def estimate_shifts_by_discretisation(
         except YidError as error:
             own = error.what
         if isinstance(own, str):
-            notes.append(f"what {words} would change is not known: {own}")
+            notes.append(f"the effect of {words} on the estimates is unknown: {own}")
         else:
             found[key], _ = own
     links, steps = found.get("links", {}), found.get("time_step", {})
@@ -331,8 +331,8 @@ def estimates_with_discretisation_error(
 ) -> dict[str, ParameterEstimate]:
     """Return estimates whose standard deviations, intervals and verdicts include the discretisation error.
 
-    The error is taken from the shifts `found` at finer discretisations. A verdict can only get worse. `sizes` are
-    typical sizes, as in `inference.uncertainty.parameter_verdict`.
+    `found` holds the shifts of the estimates at finer discretisations. Shifts below the standard deviation are ignored.
+    A verdict can only get worse. `sizes` are typical sizes, as in `inference.uncertainty.parameter_verdict`.
     """
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
@@ -361,13 +361,13 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 class StepMapNaturalFrequencies:
     """The natural frequencies of a system near an equilibrium, as the integrator reproduces them with a fixed robot.
 
-    Unstable modes grow from step to step although damping is included: the equilibrium is unstable, or the time step is
-    too long for the tension of the object.
+    `n_unstable_modes` counts the modes that grow from step to step although damping is included: the equilibrium is
+    unstable, or the time step is too long for the tension of the object.
     """
 
-    frequencies_hz: Array  # undamped, ascending, shape (k,)
+    frequencies_hz: Array  # without damping, ascending, shape (k,)
     n_unstable_modes: int = 0
-    message: str = ""  # why there are no frequencies
+    message: str = ""  # reason if there are no frequencies
 
 
 def step_map_natural_frequencies(
@@ -388,7 +388,7 @@ def step_map_natural_frequencies(
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
-        held = "every coordinate is driven or prescribed: with these held still nothing can swing"
+        held = "every coordinate is driven or prescribed: if they are fixed, nothing can swing"
         return StepMapNaturalFrequencies(np.zeros(0), message=held)
     step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
     known = np.array([configuration[name] for name in still.prescribed])
@@ -404,7 +404,7 @@ def step_map_natural_frequencies(
 
 
 def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:
-    """Eigenvalues of A at equilibrium that belong to motion, without those of the constraints."""
+    """Return the eigenvalues of the state's Jacobian A at an equilibrium, without those of the constraints."""
     n = step.system.n_coordinates
     q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
     a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
@@ -419,8 +419,8 @@ def min_gap_by_grasp_at_robot_posture(
 ) -> dict[str, float]:
     """Compute the smallest gap [m] that each grasp can reach if the robot is fixed and the object can bend freely.
 
-    `configuration` holds the driven and prescribed coordinates [rad or m]. `theta` gives the lengths. The search starts
-    at the configuration `near` (n,), if given.
+    `configuration` holds the driven and prescribed coordinates by name [rad or m]. `theta` are all parameters; only
+    lengths matter. The search starts at the configuration `near` (n,), if given, and at random ones.
     """
     if not system.grasps:
         return {}
@@ -466,31 +466,31 @@ class AlternatingErrorGrowth:
     """
 
     recording_name: str
-    growth_decades: float  # powers of ten, over the stretch on which it grows most
+    growth_decades: float  # powers of ten, over the part of the motion with the largest growth
     max_step_factor: float  # largest growth in one step
     max_growth_time: float  # time of that step from the start of the motion [s]
     time_step: float
 
     @property
     def keeps_errors_below_resolution(self) -> bool:
-        """True if alternating errors grow by at most a factor of 10^6, and thus stay below the sensors' resolution."""
+        """True if alternating errors grow by at most 10^6, so that they stay below the sensors' resolution."""
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
     @property
     def stability_message(self) -> str:
         """A sentence that states whether the time step is stable, with a remedy if it is not."""
-        step = f"{self.recording_name}: the step of {self.time_step:g} s is"
+        step = f"{self.recording_name}: the time step of {self.time_step:g} s is"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along the motion"
-        grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % in a step at {self.max_growth_time:.3g} s"
-        remedy = f"take a shorter problem.time_step ({self.time_step / 2:g} s, say)"
-        return f"{step} not stable: an error that alternates from step to step {grows}; {remedy}"
+        grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % per step at {self.max_growth_time:.3g} s"
+        remedy = f"set a shorter problem.time_step, such as {self.time_step / 2:g} s"
+        return f"{step} not stable: an error that changes its sign at every step {grows}; {remedy}"
 
 
 def _error_growth_along(
     step: Step, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, name: str, looks: int
 ) -> AlternatingErrorGrowth:
-    """Growth of alternating errors along a rollout, from eigenvalues at some nodes, up to its first failed step."""
+    """Return the growth of alternating errors along a rollout to its first failed step, from `looks` nodes at most."""
     failed = np.flatnonzero(~np.isfinite(rollout.state).all(axis=1))
     steps = (int(failed[0]) if len(failed) else len(rollout.state)) - 1
     at, magnitudes = [], []
@@ -512,7 +512,7 @@ def _error_growth_along(
 def _alternating_mode_magnitude(
     step: Step, theta: Array, rollout: Rollout, node: int, feedback: TrackingFeedback | None
 ) -> float | None:
-    """Largest magnitude of eigenvalues of A - B K with negative real part at a node; None if A is not finite."""
+    """Return the largest |eigenvalue| of A - B K with negative real part at a node, or None if A is not finite."""
     n, fixed = step.system.n_coordinates, list(step.system.prescribed_coordinate_indices)
     state, after = rollout.state[node], rollout.state[node + 1]
     q, p, z, path = state[:n], state[n : 2 * n], state[2 * n :], (state[fixed], after[fixed])
@@ -527,7 +527,7 @@ def _alternating_mode_magnitude(
 
 
 def alternating_error_growth_of_worst_recording(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
-    """Return the largest growth of alternating errors in any rollout at `x` (until it fails). None if none starts."""
+    """Return the largest growth of alternating errors over all rollouts at `x` (nx,). None if no rollout can start."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)

@@ -49,9 +49,9 @@ def solve(
 
     The steps are: the best fit of several starts (`solvers.solve`); a refit without cable memory if the recordings do
     not support it; profile-likelihood intervals of weakly determined parameters; the errors of the discretisations in
-    `problem.options.checked_discretisations`, which the standard deviations include. Verdicts are `not_trusted` if the
-    time step is unstable, if clocks drift, or if a prediction without a model has a smaller error. A search that does
-    not converge raises no error; see `status` and `message` of the solution.
+    `problem.options.checked_discretisations`, which are added to the standard deviations. Verdicts are `not_trusted` if
+    clocks drift, or if a prediction without a model has a smaller error than the model. A search that does not converge
+    raises no error; see `status` and `message` of the solution. An unstable time step has the status `stalled`.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def solve(
 def add_intervals_and_checks(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
-    """Add confidence intervals, discretisation errors, held-out predictions and data checks to a fit. See `solve`."""
+    """Return the fit with intervals, discretisation errors, held-out predictions and data checks, as `solve` does."""
     start, problem = problem, solution.problem or problem
     if solution.evaluation is not None:
         problem = _with_equilibrium_guesses(problem, solution.evaluation.episode_predictions, ())
@@ -99,7 +99,7 @@ def _with_equilibrium_guesses(
     predictions: Sequence[EpisodePrediction],
     held_out_predictions: Sequence[EpisodePrediction | str],
 ) -> EstimationProblem:
-    """The problem with equilibria of predictions at its solution as starts of further searches for equilibria."""
+    """Return the problem in which later searches for equilibria start from the equilibria of the given predictions."""
 
     def guessed(episodes: Sequence[Episode], found: Sequence[EpisodePrediction | str]) -> Sequence[Episode]:
         pairs = zip(episodes, found or [""] * len(episodes), strict=True)
@@ -113,7 +113,7 @@ def _with_equilibrium_guesses(
 def _with_discretisation_errors(
     problem: EstimationProblem, solution: Solution, progress: Progress
 ) -> tuple[Solution, EstimateChecksBeyondFit]:
-    """The solution with standard deviations that include the discretisation, and its shifts with notes."""
+    """Return the solution with standard deviations that include the discretisation error, and the shifts with notes."""
     if solution.evaluation is None:
         return solution, EstimateChecksBeyondFit()
     kinds = problem.options.checked_discretisations
@@ -132,7 +132,7 @@ def _with_discretisation_errors(
 def _checked_solution_and_issues(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
 ) -> tuple[Solution, tuple[Issue, ...]]:
-    """The solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit."""
+    """Return the solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit."""
     if solution.evaluation is None:
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_units_and_fit_errors(problem, solution, held_out)
@@ -148,9 +148,9 @@ def _checked_solution_and_issues(
 def _checked_solution_and_step_stability(
     start: EstimationProblem, problem: EstimationProblem, solution: Solution
 ) -> tuple[Solution, dict[str, Any]]:
-    """The solution, marked as not converged if the step is unstable, and stability data for result.json.
+    """Return the solution, marked as stalled if the time step is unstable, and stability data for result.json.
 
-    The start is examined only if the search failed.
+    The stability at the initial values is examined only if the search failed.
     """
     growth = discretisation.alternating_error_growth_of_worst_recording
     begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
@@ -177,7 +177,7 @@ _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 @dataclass(frozen=True)
 class CableMemoryChoice:
-    """The chosen fit, with or without shape memory of the cable. `message` is the reason, empty without a choice."""
+    """The chosen fit, with or without shape memory of the cable. `message` is the reason, empty if none is needed."""
 
     problem: EstimationProblem
     solution: Solution
@@ -192,9 +192,9 @@ def choose_cable_memory_fit(
 ) -> CableMemoryChoice:
     """Decide whether to keep the cable's shape memory in the fit, if the cable already moves when a recording starts.
 
-    The load of a cable that moves at the start of a recording is unknown, and this motion can be mistaken for memory.
-    Leave-one-out prediction decides: each such recording is predicted from all others, with and without memory (by one
-    Gauss-Newton step from the fit of all). The memory is kept if it has the smaller total error.
+    What loaded such a cable before is unknown, so its motion can be mistaken for memory. Leave-one-out prediction
+    decides: each such recording is predicted from all others, with and without memory (by one Gauss-Newton step from
+    the fit of all). The memory is kept if its total error is smaller; it is dropped if only one recording moves.
     """
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
@@ -205,14 +205,14 @@ def choose_cable_memory_fit(
     if other.evaluation is None:
         return CableMemoryChoice(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
-        words = "memory is not kept: too few recordings start in motion to bear it out"
+        words = "cable memory is not kept: fewer than two recordings start in motion, too few to test it"
         return CableMemoryChoice(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
-    told = "recordings that start in motion, each predicted from the others, have the root mean square error"
-    errors = f"{told} {kept:.3g} with it and {dropped:.3g} without, in standard deviations"
+    told = "recordings that start in motion, each predicted from the others, have the rms error"
+    errors = f"{told} {kept:.3g} with memory and {dropped:.3g} without (in standard deviations of the noise)"
     if kept < dropped:
-        return CableMemoryChoice(problem, solution, f"memory is kept: {errors}")
-    return CableMemoryChoice(without, other, f"memory is not kept: {errors}")
+        return CableMemoryChoice(problem, solution, f"cable memory is kept: {errors}")
+    return CableMemoryChoice(without, other, f"cable memory is not kept: {errors}")
 
 
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
@@ -233,7 +233,7 @@ def _moving(problem: EstimationProblem) -> list[int]:
 
 
 def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int]) -> float:
-    """Root mean square of the whitened residuals of recordings, each predicted by parameters from the other ones."""
+    """Return the rms whitened residual of the recordings `moving`, each predicted with parameters from all others."""
     guesses = None if solution.evaluation is None else solution.evaluation.equilibrium_guesses
     fitted = problem.evaluate(solution.x, equilibrium_guesses=guesses)
     assert fitted.jacobian is not None
@@ -257,14 +257,14 @@ _N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the tor
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
-    """Return the unit of a channel, or of the first channel in a group, from `units`. Empty if it is unknown."""
+    """Return the unit of a channel, or of the first channel of a group, from `units` by channel. Empty if unknown."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
 def prediction_errors_units_and_fit_errors(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
-    """Return the prediction errors of every recording (held-out first), and the unit and fit error of every channel."""
+    """Return the prediction errors of every recording (held-out first), and by channel the units and fit errors."""
     residuals: Mapping[str, Any] = {}
     pairs = list(held_out)
     if solution.evaluation is not None:
@@ -279,7 +279,7 @@ def prediction_errors_units_and_fit_errors(
 def _prediction_error_entry(
     problem: EstimationProblem, episode: Episode, outcome: EpisodePrediction | str
 ) -> dict[str, Any]:
-    """RMSE of one recording per channel and point group (without frames that fixed the start) and per baseline."""
+    """Return a recording's rms errors (groups without frames that fixed the start), of the model and each baseline."""
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
     options = problem.options
     window = options.initial_state_fit_window / problem.step.time_step
@@ -299,7 +299,7 @@ def _prediction_error_entry(
 def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
 ) -> tuple[list[PredictedEpisodeOrFailure], dict[str, dict[str, float]]]:
-    """Predictions of held-out recordings, and the errors that sensor and torque noise cause, by channel."""
+    """Predict the held-out recordings, and compute by channel the rms errors that sensor and torque noise cause."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
     pairs: list[PredictedEpisodeOrFailure] = []
     expected: dict[str, dict[str, float]] = {}
@@ -335,7 +335,7 @@ def _expected_errors(
 
 
 def _rms_by_channel(sensor: Sensor, square: Array) -> tuple[dict[str, float], Array]:
-    """Root mean squares by channel with finite samples, and sums (M, channels), of squared outputs (M, outputs)."""
+    """Return rms values by channel with finite samples, and the sums (M, channels) of squared outputs (M, outputs)."""
     # a slow camera may have no frame, for which reshape cannot infer an axis
     summed = square.reshape(len(square), len(sensor.channel_names), sensor.outputs_per_channel).sum(axis=2)
     found = {}
@@ -347,7 +347,7 @@ def _rms_by_channel(sensor: Sensor, square: Array) -> tuple[dict[str, float], Ar
 
 
 def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) -> tuple[str, float, float] | None:
-    """Best baseline common to all channels, its error and the model's error (rms); None if the model is as good."""
+    """Return the best baseline of all channels, its error and the model's (rms), or None if the model is as good."""
     rms = {
         name: float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
         for name, errors in {"": entry["rmse"], **entry["baselines"]}.items()
@@ -361,7 +361,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
 def channels_worse_than_naive_prediction(
     entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """List the channels that a simple guess without a model predicts clearly better than the model does."""
+    """List the channels that a baseline without a model predicts clearly better (by over 5 %) than the model."""
     worse = []
     for entry in entries:
         for channel in entry["rmse"]:
@@ -373,7 +373,7 @@ def channels_worse_than_naive_prediction(
 
 
 def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
-    """Issues for sensors that a baseline without a model predicts better than the model, over all their channels."""
+    """Return an issue for each sensor that a baseline predicts better than the model, over all its channels."""
     found = []
     for entry in entries:
         groups: dict[str, list[str]] = {}
@@ -386,7 +386,7 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
                 unit = units[channels[0]]
                 what = f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
-                advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
+                advice = "look at the residuals; `yid-ocp diagnose` can find what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)
                 what = f"{what} {guess:.3g} {unit}"

@@ -1,4 +1,4 @@
-"""The information that a recorded experiment would give if its grasps, arms, motions or sensors were changed."""
+"""Fisher information that a recorded experiment would give if its grasps, arms, motions or sensors were changed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CAMERA_GROUP, ARM_GROUP = "points_camera", "points_arm"
 _MARKER_AXIS_DISTANCE = 0.03  # distance of a marker from the axis [m]
 _DEFAULT_CAMERA_STD, _DEFAULT_CAMERA_RATE = 5e-3, 3.0  # of a hypothetical camera [m], [Hz]
 _DEFAULT_ARM_POINT_STD = 1e-3  # of hypothetical points measured by an arm [m]
-ASSUMED_TORQUE_NOISE_STD = 0.1  # of joint torques without stated noise [N m]
+ASSUMED_TORQUE_NOISE_STD = 0.1  # noise of joint torques for which none is stated [N m]
 _MOTION_SEED = 11  # of alternative motions
 # Offsets of two grippers towards each other and away from the robot: a fully stretched branched tube snaps through [m].
 _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
@@ -50,7 +50,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 @dataclass(frozen=True)
 class PointObservationSchedule:
-    """The sample times and standard deviations of one point in a group of measured points."""
+    """The sample times and noise standard deviations with which one point of a group is measured."""
 
     point_group: str
     frame: str
@@ -60,7 +60,7 @@ class PointObservationSchedule:
 
 @dataclass(frozen=True)
 class UnchangedExperiment:
-    """A recorded experiment before any change, with its problem, unknowns and prior knowledge."""
+    """A recorded experiment before any change: its problem, unknowns, and knowledge of initial states and grasps."""
 
     problem: EstimationProblem
     x: Array  # unknowns at which the information is evaluated, shape (nx,)
@@ -70,17 +70,17 @@ class UnchangedExperiment:
 
     @property
     def parameter_values(self) -> dict[str, float]:
-        """The values of all model parameters at the unknowns `x`."""
+        """The values of all model parameters by name, at the unknowns `x`."""
         theta, _ = self.problem.unpack_episode_unknowns(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Return the points that a camera sees (or None), their frame times [s] and typical noise [m], or defaults."""
+        """Return the points that a camera sees, with times [s] and median noise [m]. Without any: None and defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: measuring_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_with_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Return the points that arms measure (or None), their sample times [s] and typical noise [m], or defaults."""
+        """Return the points that arms measure, with times [s] and median noise [m]. Without any: None and defaults."""
         t = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor_name == "arm", t, _DEFAULT_ARM_POINT_STD)
 
@@ -92,7 +92,7 @@ class UnchangedExperiment:
         return None, times, std
 
     def existing_point_observation_schedules(self, episode: Episode) -> list[PointObservationSchedule]:
-        """Return the sample times and standard deviations of every point measured in a recording."""
+        """Return the sample times and noise standard deviations of every point that is measured in a recording."""
         found = []
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
@@ -120,12 +120,12 @@ def _used_point_groups(problem: EstimationProblem, episode: Episode) -> list[Poi
 
 
 def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
-    """Return evenly spaced sample times [s] at `rate` [Hz], from zero to the end of a recording."""
+    """Return evenly spaced sample times [s] at `rate` [Hz], from zero to the end of a recording's grid."""
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
 class _MeasurablePoint(NamedTuple):
-    """A frame that a camera or also an arm could measure. `added_frame` is set if the mechanism lacks it."""
+    """A point that a camera (or also an arm) could measure. `added_frame` is its frame if the mechanism lacks one."""
 
     name: str
     description: str
@@ -134,7 +134,7 @@ class _MeasurablePoint(NamedTuple):
 
 
 def measurable_points(system: System) -> list[_MeasurablePoint]:
-    """List points that could be measured: on segments or, if there are none, on moving frames and springs."""
+    """List the points that could be measured: on segments or, without segments, on moving frames and spring joints."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[_MeasurablePoint] = []
@@ -166,7 +166,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 
 
 def step_with_frames_at_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
-    """Return the step with a frame added at each measurable point, and these points. The equations stay the same."""
+    """Return the step with a frame at each measurable point, and these points. The equations do not change."""
     mechanism, seen = step.system.mechanism, measurable_points(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
@@ -178,10 +178,10 @@ class VariantPositionSensitivities:
     """The derivatives of the positions of all measurable points in one variant of an experiment.
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
-    with respect to the nx unknowns and to the episode's q torque-error unknowns (see `sensitivities_and_information`).
+    with respect to the nx unknowns and to q unknowns for torque and encoder errors (`sensitivities_and_information`).
     """
 
-    problem: EstimationProblem  # includes nuisances; every measurable frame is observed at every node
+    problem: EstimationProblem  # with nuisance unknowns; every measurable frame is observed at every node
     x: Array
     free_parameters: tuple[str, ...]
     position_sensitivities: Mapping[tuple[int, str, str], Array]  # shape (N + 1, 3, nx + q)
@@ -192,7 +192,7 @@ class VariantPositionSensitivities:
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def fisher_information_with_prior(self, views: Sequence[Sequence[PointObservationSchedule]]) -> Array:
-        """Sum the Fisher information (nx, nx) of the observations and the prior. `views` has one list per recording."""
+        """Return the Fisher information (nx, nx) of observations (`views`, one list per recording) and prior."""
         total = self.prior_information.copy()
         nx = len(total)
         for i, episode in enumerate(self.problem.episodes):
@@ -228,7 +228,7 @@ SETUP_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 
 
 class ExperimentVariantSensitivityBuilder:
-    """A cache that computes sensitivities for variants of an experiment, such as a second arm or another motion."""
+    """Computes and keeps the sensitivities for variants of an experiment, such as a second arm or another motion."""
 
     def __init__(self, setting: UnchangedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
@@ -236,7 +236,7 @@ class ExperimentVariantSensitivityBuilder:
         self._layouts: dict[frozenset[str], VariantPositionSensitivities | str] = {}
 
     def position_sensitivities_of_variant(self, setup_changes: frozenset[str]) -> VariantPositionSensitivities | str:
-        """Compute the sensitivities for the experiment with the given changes, or return the reason for a failure."""
+        """Return the sensitivities for the experiment with the given changes, or the reason of a failure as text."""
         if setup_changes not in self._layouts:
             if setup_changes:
                 words = " and ".join(SETUP_CHANGE_DESCRIPTIONS[name] for name in sorted(setup_changes))
@@ -248,7 +248,7 @@ class ExperimentVariantSensitivityBuilder:
         return self._layouts[setup_changes]
 
     def applicable_setup_changes(self) -> list[str]:
-        """List the names of the changes that are possible for this experiment."""
+        """List the keys of `SETUP_CHANGE_DESCRIPTIONS` whose change is possible for this experiment."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos
         measured = any(s.sensor.effort_joints for e in episodes for s in e.measurements)
@@ -303,7 +303,7 @@ class ExperimentVariantSensitivityBuilder:
         return sensors
 
     def _finest(self, episode: Episode) -> dict[str, float]:
-        """Smallest standard deviation of the points of each group in a recording [m]."""
+        """Return the smallest noise standard deviation [m] of the points of each group in a recording."""
         finest = {}
         samplings = self.setting.camera_point_group_times_and_std, self.setting.arm_point_group_with_times_and_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
@@ -314,7 +314,7 @@ class ExperimentVariantSensitivityBuilder:
         return finest
 
     def _with_encoders(self, problem: EstimationProblem) -> EstimationProblem | None:
-        """The experiment with driven joints' encoders as measurements, if the recorded experiment has them."""
+        """Return the problem with encoder readings of driven joints, or None if the recorded experiment has none."""
         base = self.setting.problem
         used = any(isinstance(samples.sensor, PositionSensor) for e in base.episodes for samples in e.measurements)
         if not used or not problem.system.driven:
@@ -330,7 +330,7 @@ class ExperimentVariantSensitivityBuilder:
         return EstimationProblem(problem.step, recordings, problem.free, options, values)
 
     def _experiment(self, setup_changes: frozenset[str]) -> tuple[System, list[Recording], list[str]]:
-        """System, recordings and notes of the experiment, driven as in the recordings."""
+        """Return system, recordings and notes on feasibility of the changed experiment."""
         base = self.setting.problem
         system = base.system
         if "second_arm" in setup_changes:
@@ -355,11 +355,11 @@ class ExperimentVariantSensitivityBuilder:
 
     @cached_property
     def _corrected(self) -> EstimationProblem:
-        """The problem with the torque errors that its measurements determine."""
+        """The problem with the torque errors that its measurements determine, estimated at `setting.x`."""
         return problem_with_whitening_at(self.setting.problem, self.setting.x, rounds=2)
 
     def _cut(self, episode: Episode) -> Recording:
-        """The part of a recording that the problem uses, with known torque errors subtracted."""
+        """Return the part of a recording that the problem uses, with the estimated torque errors subtracted."""
         recording, errors, joints = episode.recording, episode.input_errors, episode.recording.joints
         if errors is not None and joints is not None and joints.effort is not None:
             effort, driven = joints.effort.copy(), self.setting.problem.system.driven
@@ -389,7 +389,7 @@ class ExperimentVariantSensitivityBuilder:
         return replace(system, grasps=tuple(turned))
 
     def _moved(self, system: System, episode: Episode, seed: int, twice: bool) -> tuple[Recording, list[str]]:
-        """A motion of the driven joints in MuJoCo from the recording's posture, and obstacles on a real robot."""
+        """Simulate a new motion from the recording's posture in MuJoCo. Also return joint limits that it exceeds."""
         base, given = self.setting.problem, self.setting.parameter_values
         values = {name: v for name, v in given.items() if name in system.parameters}
         posture = dict(zip(base.system.driven, map(float, episode.measured_driven_angles[0]), strict=True))
@@ -413,7 +413,7 @@ class ExperimentVariantSensitivityBuilder:
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[_MeasurablePoint], torque: bool) -> Recording:
-        """The recording with every frame seen at every node with unit standard deviation, and with efforts."""
+        """Return the recording with every frame measured at every node with unit noise and, if `torque`, efforts."""
         setting, base = self.setting, self.setting.problem
         episode, joints = base.episodes[index % len(base.episodes)], recording.joints
         t, step = joints.t if joints is not None else episode.recording.points[0].t, base.step.time_step
@@ -444,7 +444,7 @@ class ExperimentVariantSensitivityBuilder:
 
 
 def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequence[Array | float]:
-    """Noise of encoders, of torques and of constant torque errors for driven joints; typical values if not recorded."""
+    """Return the std of encoder noise, torque noise and torque offset of driven joints; medians for a new arm."""
     errors = episode.input_errors
     if errors is None:
         return (0.0, 0.0, 0.0)
@@ -468,7 +468,7 @@ def _frame_positions(system: System, values: Mapping[str, float], frames: Sequen
 
 
 def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, Array]:
-    """Gripper offsets that keep an object held by several grippers below its full stretch [m]."""
+    """Return gripper offsets [m] that keep an object between several grippers from being fully stretched."""
 
     def direction(x: Array) -> Array:
         return np.asarray(x / max(float(np.linalg.norm(x)), 1e-9))

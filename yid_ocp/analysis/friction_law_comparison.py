@@ -1,4 +1,4 @@
-"""Cross-validation of friction laws from simple to complex, and measured friction torques."""
+"""Cross-validation of friction laws, choice of the simplest adequate law, and measured friction torques."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from yid_ocp.sensors.joints import JointSensor
 from yid_ocp.solvers import GaussNewton, Solution
 
 _MAX_FOLD_ITERATIONS = 15
-_MIN_MOTION_KINDS = 3  # fewer kinds by name than this say nothing of each other: every recording is one of its own
+_MIN_MOTION_KINDS = 3  # with fewer kinds by name, every recording counts as a kind of its own
 _MAX_CLOUD_POINTS = 1500
 
 
@@ -29,9 +29,9 @@ _MAX_CLOUD_POINTS = 1500
 class CrossValidatedFrictionLawFit:
     """A friction law fitted to all recordings, with its prediction errors on recordings left out of the fit.
 
-    `left_out_errors` holds the root mean square prediction error of each recording by a fit without the recordings of
-    its kind of motion (NaN if the fit failed). Only what friction changes counts: angles of driven joints [rad] or, in
-    standard deviations and without constant errors of the sensors, efforts of prescribed joints.
+    `left_out_errors` holds, by recording, the rms prediction error of a fit without the recordings of the same kind of
+    motion (NaN if the prediction failed). The error is that of the angles of driven joints [rad] or, for prescribed
+    joints, that of their efforts, in standard deviations and without constant errors of the sensors.
     """
 
     law: str
@@ -42,7 +42,10 @@ class CrossValidatedFrictionLawFit:
 
 
 def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Group recordings whose names differ only in a final number. Motor-off ones are omitted; few groups are split."""
+    """Return the names of the recordings by kind of motion, which is the name without a final number.
+
+    Recordings with the motors off are omitted. With fewer than three kinds, every recording is a kind of its own.
+    """
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
@@ -57,7 +60,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 def cross_validate_over_motion_kinds(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> CrossValidatedFrictionLawFit:
-    """Fit a friction law without each kind of motion in turn, to get its prediction errors for the omitted kind."""
+    """Fit a friction law without each of the `kinds` of motion in turn, and compute its errors on the omitted kind."""
     errors: dict[str, float] = {}
     used = (e.measurements for e in problem.episodes)
     is_whitened = {own[i].sensor.unit for own in used for i in _indices_of_sensors_of_friction(own)} != {"rad"}
@@ -86,9 +89,9 @@ def cross_validate_over_motion_kinds(
 
 
 def _indices_of_sensors_of_friction(samples: Sequence[SensorMeasurements]) -> Sequence[int]:
-    """Find the sensors that friction changes: angles of driven and efforts of prescribed joints; without any, all.
+    """Return the indices of the joint sensors, whose predictions depend on friction; without any, of all sensors.
 
-    Points on an object that a prescribed arm moves have the same error for all laws, which would hide theirs.
+    Points on an object that a prescribed arm moves have the same error for all laws, which would hide differences.
     """
     return [i for i, own in enumerate(samples) if isinstance(own.sensor, JointSensor)] or range(len(samples))
 
@@ -96,7 +99,7 @@ def _indices_of_sensors_of_friction(samples: Sequence[SensorMeasurements]) -> Se
 def mean_and_std_error_over_motion_kinds(
     errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
-    """Return the mean of the prediction errors over all kinds of motion, and the standard error of this mean."""
+    """Return the mean over the kinds of motion of their mean prediction errors, and the standard error of this mean."""
     by_kind = np.array([np.mean([errors[name] for name in own]) for own in kinds.values()])
     return float(np.mean(by_kind)), float(np.std(by_kind, ddof=1) / np.sqrt(len(by_kind)))
 
@@ -114,10 +117,10 @@ def simplest_fit_within_std_error(
 ) -> CrossValidatedFrictionLawFit:
     """Choose the simplest friction law by the one-standard-error rule of cross-validation.
 
-    Returns the first of `fits` whose mean error over the `kinds` of motion is within one standard error of the smallest
-    error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
-    doi:10.1007/978-0-387-84858-7). The larger of two standard errors counts: of the smallest error, or of the
-    difference from it. A difference beyond two of its own standard errors counts in any case.
+    Returns the first of `fits` (simplest first) whose mean error over the `kinds` of motion is within one standard
+    error of the smallest mean error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
+    doi:10.1007/978-0-387-84858-7). This standard error is the larger of that of the smallest error and that of the
+    difference from it, but at most twice the latter.
     """
     means = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)[0] for fit in fits]
     best = fits[int(np.argmin(np.where(np.isfinite(means), means, np.inf)))]
@@ -132,12 +135,12 @@ def simplest_fit_within_std_error(
 
 @dataclass(frozen=True)
 class _FrictionTorqueCloud:
-    """Friction torque of one joint at M points of the recordings' measured motion."""
+    """Measured and predicted friction torque of one joint at M points of its recorded motion."""
 
     joint: str
     speed: Array  # shape (M,) [rad/s]
-    load: Array  # motor torque minus external torque, shape (M,) [N m]
-    measured: Array  # torque missing in the model without friction, against the motion, shape (M,) [N m]
+    load: Array  # torque through the gear: motor torque minus external torque, shape (M,) [N m]
+    measured: Array  # torque against the motion that the model without friction lacks, shape (M,) [N m]
     predicted: Array  # friction of the fitted law, shape (M,) [N m]
 
 
@@ -148,7 +151,7 @@ def measured_and_predicted_friction_torques(
 
     The measured friction torque is the residual of the discrete equations of motion without friction, along the
     smoothed measured angles. The predicted torque is the change of this residual by the fitted law. The result is empty
-    unless every coordinate is driven, without constraints and internal coordinates.
+    if a coordinate is not driven, or if the model has constraints or internal coordinates.
     """
     step, system = problem.step, problem.system
     driven = system.driven
@@ -188,7 +191,7 @@ def measured_and_predicted_friction_torques(
 
 
 def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: Array) -> Array:
-    """Torque (N - 1, n) [N m] that the equations at each inner node lack for the motion q."""
+    """Return the torque (N - 1, n) [N m] that the equations lack at the inner nodes of the motion q (N + 1, n)."""
     step = problem.step
     n, none = step.sizes["n"], np.zeros((len(torque), 0))
     state = np.hstack([q, np.zeros((len(q), n))])
@@ -197,7 +200,7 @@ def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: 
 
 
 def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[EstimationProblem]:
-    """Keep only the samples that all problems contain, so that the errors of the problems are comparable."""
+    """Return the problems with only the samples that all of them contain, so that their errors are comparable."""
     found = []
     for problem in problems:
         episodes = []
@@ -212,7 +215,7 @@ def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[
 
 
 def problem_estimating_from_all_recordings(problem: EstimationProblem) -> EstimationProblem:
-    """Return the problem with its held-out recordings moved to the recordings for estimation."""
+    """Return the problem that estimates from all recordings: held-out recordings become estimation recordings."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)
     return problem.with_episodes((*problem.episodes, *added), (), filters, ())

@@ -35,7 +35,7 @@ InitialStateKnowledge = Literal["assumed", "unknown"]
 
 _GRASP_OFFSET_KIND = "grasp_offset"
 _GRASP_OFFSET_PREFIX = f"{_GRASP_OFFSET_KIND}@"
-GRASP_OFFSET_PRIOR_STD = 0.01  # prior of where a grasp sits [m]
+GRASP_OFFSET_PRIOR_STD = 0.01  # prior standard deviation of the position of a grasp [m]
 # A column this much smaller than the largest counts as zero when nuisances are eliminated.
 _RANK_RTOL = 1e-10
 _MAX_DIRECTION_MISMATCH = 0.05  # between the unit vectors of a direction and of a simple combination
@@ -49,32 +49,32 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that
 class ParameterStdsAndVerdict:
     """The value, standard deviations and identifiability verdict of one parameter.
 
-    The verdict equals that of a solution at the same point (`inference.uncertainty.parameter_verdict`). `interval` is
-    the 95 % profile-likelihood interval, in which all other unknowns are refitted, or None if not requested. The
-    verdict agrees with it.
+    The verdict follows the rules of `inference.uncertainty.parameter_verdict`, as in a solution. `interval` is the 95 %
+    profile-likelihood interval, in which all other unknowns are refitted (an open end is None); the verdict agrees with
+    it. It is None if it was not requested.
     """
 
     value: float
     unit: str
-    std: float  # with all other unknowns free; infinite without information
-    std_relative: float  # divided by the value, or by its typical size where that is zero
+    std: float  # in `unit`, with all other unknowns free; infinite without information
+    std_relative: float  # `std` over the value, or over the typical size of a value that is zero
     std_alone: float  # relative standard deviation if all other unknowns were known
     verdict: str
-    interval: tuple[float | None, float | None] | None = None  # None for an open end
+    interval: tuple[float | None, float | None] | None = None
 
 
 @dataclass(frozen=True)
 class _ParameterDirection:
-    """A direction of relative parameter changes and its uncertainty, judged like a parameter.
+    """A direction in the space of relative parameter changes, with its uncertainty and verdict.
 
     The singular value is that of the whitened sensitivity [stds per unit change] after elimination of nuisances.
     """
 
     singular_value: float
     std_relative: float  # reciprocal of the singular value
-    components: Mapping[str, float]  # the direction by parameter, of unit length
+    components: Mapping[str, float]  # relative change by parameter, together of unit length
     verdict: str
-    words: str
+    words: str  # sentence on what the recordings determine along it
 
 
 @dataclass(frozen=True, repr=False)
@@ -87,11 +87,11 @@ class IdentifiabilityResult(ReprMixin):
 
     parameters: Mapping[str, ParameterStdsAndVerdict]
     parameter_names: tuple[str, ...]  # in the order of the matrices
-    correlations: Array  # shape (p, p), NaN in rows of parameters that nothing informs
+    correlations: Array  # shape (p, p), NaN in rows of parameters without information
     fisher_information: Array  # for relative changes, nuisances eliminated, shape (p, p)
     directions: tuple[_ParameterDirection, ...]  # least observable first
     nuisance_names: tuple[str, ...]  # further unknowns, estimated together with the parameters
-    chi2_per_dof: float  # if above one, its root scales standard deviations at a fit
+    chi2_per_dof: float  # if it is above one, its root multiplies the standard deviations at a fit
     profiles: Mapping[str, ParameterProfileLikelihood] = field(default_factory=dict)
 
     def _summary(self) -> ReprTexts:
@@ -182,7 +182,7 @@ def identifiability(
 def _profiles(
     view: _Sensitivities, wanted: Sequence[str], judged: dict[str, uncertainty.ParameterEstimate], progress: Progress
 ) -> dict[str, ParameterProfileLikelihood]:
-    """Profile likelihoods of the wanted parameters about the best fit of all unknowns; updates `judged`."""
+    """Compute profile likelihoods of the `wanted` parameters about the best fit, and update `judged` by them."""
     problem, sizes = view.problem, uncertainty.typical_parameter_magnitudes(view.problem, view.x)
 
     def one(
@@ -202,7 +202,7 @@ def _profiles(
 
 
 def system_with_grasp_offset_effects(system: System) -> System:
-    """Add a `grasp_offset` effect with zero offset to every grasp of a system that has none."""
+    """Return the system with a `grasp_offset` effect, with zero offset, at every grasp that has no such effect."""
     there = {effect.location for effect in system.effects if effect.kind == _GRASP_OFFSET_KIND}
     places = [grasp.name for grasp in system.grasps if grasp.name not in there]
     return system.with_effects([make_effect(_GRASP_OFFSET_KIND, place, system) for place in places])
@@ -219,7 +219,7 @@ def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution 
         return unknowns_of_other_problem(solution.x, solution.unknown_names, problem)
     x = np.array(solution, float)
     if x.shape != (len(problem.unknown_names),):
-        shape = f"({len(problem.unknown_names)},), as problem.unknown_names"
+        shape = f"shape ({len(problem.unknown_names)},), one value for each of problem.unknown_names"
         raise SolverError(f"the array of unknowns has shape {x.shape}", where="solution", allowed=shape)
     if not np.all(np.isfinite(x)):
         what = f"{problem.unknown_names[int(np.argmin(np.isfinite(x)))]} is not finite"
@@ -230,7 +230,7 @@ def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution 
 def free_starts_and_grasps(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
-    """Add initial states (if `start` is "unknown") and grasp offsets (if `grasp_std` is given) to the unknowns."""
+    """Return the problem with initial states (`start` "unknown") and grasp offsets (`grasp_std` given) as unknowns."""
     options, grasps, priors = problem.options, [], dict(problem.options.prior_stds)
     initial = "estimated" if start == "unknown" else options.initial_state
     if grasp_std is not None:
@@ -256,22 +256,22 @@ def free_starts_and_grasps(
 
 
 def unknowns_of_other_problem(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Copy values of `x` by name to the unknown vector of `other`. Its other entries keep their initial values."""
+    """Return the unknown vector of `other` with the values of `x` by name. Other entries have their initial values."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])
 
 
 @dataclass(frozen=True)
 class _Sensitivities:
-    """Sensitivities of the data to the named parameters at one point."""
+    """Sensitivities of the data to p named parameters at one point `x` (nx,), with the `evaluation` there."""
 
     problem: EstimationProblem
     x: Array
     evaluation: Evaluation
     names: tuple[str, ...]
-    chosen: IntArray
-    scale: Array
-    inflation: float
+    chosen: IntArray  # indices of the parameters in x
+    scale: Array  # absolute value of each parameter, or its typical size if the value is zero
+    inflation: float  # factor on the stated standard deviations of the noise
     by_alone: Array  # whitened, of relative changes with everything else known, shape (nr, p)
     relative: Array  # `by_alone` with nuisances eliminated
     nuisance: Array  # sensitivities of all other unknowns in their scales
@@ -293,15 +293,15 @@ class _Sensitivities:
 
     @property
     def alone(self) -> Array:
-        """Norms (p,) of the whitened sensitivities to relative changes of each parameter, all else being known."""
+        """Norms (p,) of the whitened sensitivities to a relative change of each parameter, if all else is known."""
         return np.linalg.norm(self.by_alone, axis=0)
 
     def unit(self, name: str) -> str:
-        """Unit of a parameter, whose name may include a recording."""
+        """Return the unit of a parameter, whose name may include a recording in brackets."""
         return self.problem.system.parameters[name.split("[")[0]].unit
 
     def correlations(self, covariance: Array) -> Array:
-        """Correlations of the parameters, NaN for parameters without information."""
+        """Return the correlations (p, p) of the parameters, NaN for parameters without information."""
         own = covariance[np.ix_(self.chosen, self.chosen)]
         std = np.sqrt(np.diag(own))
         largest = np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
@@ -311,7 +311,7 @@ class _Sensitivities:
 
 
 def _orthogonal_part(columns: Array, explained: Array) -> Array:
-    """Component of the columns orthogonal to the columns `explained`."""
+    """Return the part of each column that is orthogonal to all columns of `explained`."""
     if explained.shape[1] == 0:
         return columns
     vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
@@ -320,7 +320,7 @@ def _orthogonal_part(columns: Array, explained: Array) -> Array:
 
 
 def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, ...]:
-    """Parameters and combinations without information, then informed directions; least observable first."""
+    """Return parameters and combinations without information, and informed directions, sorted by their information."""
     relative, count = view.relative, len(view.names)
     hidden = view.alone * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0
     found = [
@@ -373,13 +373,13 @@ class _Component(NamedTuple):
     unit: str
 
 
-_SERIES = "1/{a} + 1/{b}, as springs in series are"
+_SERIES = "1/{a} + 1/{b}, like springs in series"
 # combinations of a and b: text, relative change that preserves it, b that preserves it for a new a, whether units must
 # be equal
 _Combination = tuple[str, Callable[[float, float], tuple[float, float]], Callable[[float, float, float], float], bool]
 _COMBINATIONS: tuple[_Combination, ...] = (
     (_SERIES, lambda a, b: (a, -b), lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n), True),
-    ("{a} + {b}, as springs side by side are", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
+    ("{a} + {b}, like parallel springs", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
     ("the ratio {a} / {b}", lambda a, b: (1.0, 1.0), lambda a, b, n: b * n / a, False),
     ("the product {a} x {b}", lambda a, b: (1.0, -1.0), lambda a, b, n: b * a / n, False),
 )
@@ -405,17 +405,17 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
-    for words, prefix in (("the unknown start", "start."), ("where the grasp sits", _GRASP_OFFSET_PREFIX)):
+    for words, prefix in (("the unknown initial state", "start."), ("the position of the grasp", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
         if at:
             remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
             if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
                 return words
-    return "the unknown start and where the grasp sits"
+    return "the unknown initial state and the position of the grasp"
 
 
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
-    """Change of the data for other parameter values, after elimination of nuisances [standard deviations]."""
+    """Return the change of the data [stds] for other parameter values, after elimination of nuisances."""
     problem, x = view.problem, view.x.copy()
     x[[problem.unknown_names.index(name) for name in changes]] = list(changes.values())
     evaluation = problem.evaluate(x, False, view.evaluation.equilibrium_guesses)
@@ -443,7 +443,7 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:
-    """Sentence on the combined change of parameters along an unidentifiable direction."""
+    """Return a sentence on the combined change of parameters along an unidentifiable direction."""
     if len(parts) == 1:
         return f"{parts[0].name} is not observed"
     largest, shown = max(abs(part.coefficient) for part in parts), parts
@@ -462,7 +462,7 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def _combination(view: _Sensitivities, first: _Component, second: _Component) -> str | None:
-    """Text of the simple combination of two parameters that the data determine, also at a finite change, or None."""
+    """Return the simple combination of two parameters that the data determine, also at a finite change, or None."""
     direction = np.array([first.coefficient, second.coefficient])
     direction /= np.linalg.norm(direction)
     (a, b), tried = (first.value, second.value), list[tuple[float, str]]()

@@ -31,21 +31,21 @@ from yid_ocp.sensors.joints import (
     joint_angle_noise_std,
 )
 
-_ANGLE_LIMIT_MARGIN = 0.1  # beyond a joint's limits, as robots differ from their URDF [rad or m]
-_MAX_SPEED_RATIO = 1.5  # factor by which joints may turn faster than the URDF says that they can
-_SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither noise nor steps of encoders count
+_ANGLE_LIMIT_MARGIN = 0.1  # allowed excess over joint limits, because robots differ from their URDF [rad or m]
+_MAX_SPEED_RATIO = 1.5  # allowed ratio of a joint speed to the limit of the URDF
+_SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is averaged, to reduce noise and steps of encoders
 _MOTION_BANDWIDTH_HZ = 5.0  # bandwidth of an arm's motion; faster components are removed [Hz]
 _MAX_MOTION_SAMPLES = 300  # approximate number of samples used of a motion
-_VISCOUS_FRICTION_FRACTION = 0.04  # usual viscous friction beside a joint's largest effort [per rad/s]
-_LOAD_RANGE_FRACTION = 0.1  # typical size of an unknown load parameter, of the range between its bounds
-_MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
+_VISCOUS_FRICTION_FRACTION = 0.04  # typical viscous friction over a joint's effort limit [per rad/s]
+_LOAD_RANGE_FRACTION = 0.1  # typical size of an unknown load parameter over the range between its bounds
+_MIN_SIGNAL_STDS = 5.0  # size over noise from which on a signal is measurable, over all samples and joints
 
 
 @dataclass(frozen=True)
 class RecordedJointsModel:
     """A numeric model of the kinematics and inverse dynamics of the joints whose angles are recorded.
 
-    Driven joints come first, then prescribed joints. Unknown coordinates, such as a beam's bending, are zero.
+    Driven joints come first, then prescribed ones. Coordinates without recorded angles (a beam's bending) are zero.
     """
 
     system: System
@@ -61,7 +61,7 @@ class RecordedJointsModel:
         return RecordedJointsModel(system, names, unknown) if names else None
 
     def has_all_angles_recorded(self, recording: Recording) -> bool:
-        """Check whether a recording contains all joint angles. Clamps that follow measured points have none."""
+        """Check whether a recording contains the angles of all joints. Clamps that follow measured points have none."""
         return all(name in recording.joint_names for name in self.joint_names)
 
     @property
@@ -72,30 +72,30 @@ class RecordedJointsModel:
 
     @property
     def system_configuration_indices(self) -> tuple[int, ...]:
-        """The indices of the joints in the system's configuration vector."""
+        """The indices of the joints in the system's configuration vector q (n,)."""
         return tuple(self.system.mechanism.joint_index(name) for name in self.joint_names)
 
     def is_frame_determined_by_angles(self, frame: str) -> bool:
-        """Check whether the recorded angles alone determine the position of a frame."""
+        """Check whether the recorded angles alone determine the position of the frame named `frame`."""
         tree = self.system.mechanism
         return {*tree.ancestor_joint_indices(tree.frame(frame).joint_index)} <= {*self.system_configuration_indices}
 
     @cached_property
     def _has_no_unknown_descendants(self) -> bool:
-        """Whether no joint with unknown angle is attached to the recorded joints."""
+        """True if no joint with unknown angle is attached to the recorded joints."""
         ancestors, known = self.system.mechanism.ancestor_joint_indices, set(self.system_configuration_indices)
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
         """Compute positions (N, nf, 3) [m] of nf frames, and their derivatives (N, nf, 3, k) with respect to k angles.
 
-        `q` (N, k) holds recorded angles. Every frame must satisfy `is_frame_determined_by_angles`.
+        `q` (N, k) holds the joint angles at N times. Every frame must satisfy `is_frame_determined_by_angles`.
         """
         place, slope = self._places(frames)(q)
         return place.reshape(len(q), len(frames), 3), slope.reshape(len(q), len(frames), 3, len(self.joint_names))
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        """Joint efforts (N, k) [N m] by rigid-body inverse dynamics, without dampers, springs and grasps."""
+        """Return joint efforts (N, k) [N m] by rigid-body inverse dynamics, without dampers, springs and grasps."""
         return self._effort(q, v, a)[0][:, :, 0]
 
     @cached_property
@@ -141,17 +141,17 @@ class RecordedJointsModel:
 
 @dataclass(frozen=True)
 class _SmoothedMotion:
-    """Smoothed recorded motion at N times, without both ends of the recording."""
+    """Smoothed recorded motion of k joints at N times, without both ends of the recording."""
 
     t: Array  # shape (N,) [s]
-    q: Array  # shape (N, k), as `v`, `a` and the effort [N m]
+    q: Array  # shape (N, k), like speed `v`, acceleration `a` and effort [N m]
     v: Array
     a: Array
     effort: Array | None
 
 
 def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMotion | None:
-    """Smoothed motion of the named joints at a few hundred times; None if the recording is too short."""
+    """Return the smoothed motion of the named joints at a few hundred times, or None if the recording is too short."""
     t, step = joints.t, median_sample_period(joints.t)
     if len(t) < 30 or step <= 0 or t[-1] - t[0] > 1e5 * step:
         return None
@@ -169,7 +169,7 @@ def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMot
 
 
 def joint_limit_issues(arm: RecordedJointsModel, recording: Recording) -> Iterator[Issue]:
-    """Yield issues about recorded angles or speeds that exceed the joint limits."""
+    """Yield issues about recorded angles or speeds that exceed the joint limits of the URDF."""
     joints = recording.joints
     if joints is None:
         return
@@ -186,8 +186,8 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
     beyond = np.maximum(low - position, position - high).max(axis=0)
     inside = np.all((degrees > low - margin) & (degrees < high + margin))
     if np.any(beyond > margin) and inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
-        words = f"angles reach {np.max(np.abs(position)):.3g} rad; taken as degrees all are within their limits"
-        advice = "convert angles to radians; a CSV is read with units: {position: deg}"
+        words = f"angles reach {np.max(np.abs(position)):.3g} rad; read as degrees, all are within the joint limits"
+        advice = "convert angles to radians; to import a CSV with degrees, set import.units: {position: deg}"
         yield Issue("degrees", words, "refused", float(np.max(beyond)) / margin, advice, "", channel="position")
         return
     for j in np.flatnonzero(beyond > margin):
@@ -208,13 +208,13 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
     j = int(np.argmax(ratio))
     if ratio[j] > _MAX_SPEED_RATIO:
         able = f"{limits[j]:.3g} {arm.joints[j].coordinate_unit}/s"
-        words = f"{arm.joint_names[j]} turns {ratio[j]:.3g} times as fast as it can ({able})"
+        words = f"{arm.joint_names[j]} turns {ratio[j]:.3g} times as fast as its speed limit ({able})"
         advice, depth = "check the unit of time and of angles", float(ratio[j]) / _MAX_SPEED_RATIO
         yield Issue("speed_limits", words, "not_trusted", depth, advice, "", channel="t")
 
 
 def known_effect_config_line(kind: str, location: str, quantity: str, value: float) -> str:
-    """Return a configuration line that adds an effect with a known parameter value at a location."""
+    """Return the configuration line that adds an effect `kind` at a location, with a known `value` of one quantity."""
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
 
@@ -223,9 +223,9 @@ def slow_motion_excitation_issues(
 ) -> Iterator[Issue]:
     """Yield an issue if the motion is too slow to reveal damping, friction and inertia in the measured efforts.
 
-    Static configurations determine only weight and stiffness. The efforts due to speed and acceleration must exceed the
-    noise of measured efforts; they are estimated by inverse dynamics and friction of a typical size. `effort` holds the
-    options of the effort sensor. All angles of `arm` must be recorded.
+    The efforts due to speed and acceleration must exceed the noise of measured efforts. They are computed by inverse
+    dynamics, plus friction of a typical size. `effort` holds the options of the effort sensor. The recording must
+    contain all angles of `arm`.
     """
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
@@ -244,15 +244,15 @@ def slow_motion_excitation_issues(
     seen = float(np.sqrt(len(joints.t) * np.sum((size / noise) ** 2)))
     if seen < _MIN_SIGNAL_STDS:
         j = int(np.argmax(size / noise))
-        asked = f"speed and acceleration require of {arm.joint_names[j]} {size[j]:.2g} N m (rms)"
-        words = f"{asked}; noise between samples is {noise[j]:.2g} N m; no joint is more informative"
+        asked = f"speed and acceleration require {size[j]:.2g} N m (rms) of {arm.joint_names[j]}, the best joint"
+        words = f"{asked}; noise between samples is {noise[j]:.2g} N m"
         advice = "move faster; static configurations determine weight and stiffness, not damping, friction or inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
 
 
 def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> Array:
-    """White noise (k,) of efforts as stated or, if not stated, as measured [N m]."""
+    """Return the std of white noise (k,) of efforts [N m] as stated or, if none is stated, as measured."""
     given = effort.std if effort.std is not None else joints.effort_std
     if given is not None:
         return expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_SENSOR_KEY}.std")
@@ -263,7 +263,7 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
 def joint_excitation_issues(
     recordings: Sequence[Recording], free_parameters: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
-    """Yield an issue for each joint that hardly moves in any recording, although some of its parameters are free.
+    """Yield an issue for each joint that hardly moves in all recordings, although some of its parameters are free.
 
     `free_parameters` lists these parameters by joint. `position` holds the options of the position sensor.
     """
@@ -281,7 +281,7 @@ def joint_excitation_issues(
             if not name or width > widest:
                 widest, name = width, recording.name
         if name and widest < limit:
-            least = f"{limit:.2g} rad is the minimum that separates {', '.join(parameters)} from a constant effort"
+            least = f"{limit:.2g} rad is the least that distinguishes {', '.join(parameters)} from a constant effort"
             words = f"{joint} turns by {widest:.2g} rad at most, in {name}; {least}"
             advice, depth = f"record a motion that turns {joint}, or fix {parameters[0]}", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
@@ -293,14 +293,14 @@ def joint_excitation_issues(
 #
 #     e_j / g_j = w_j + c_j + d_j v_j + s_j sign(v_j) + k_j q_j + (J' f)_j,
 #
-# linear in 1/g_j, offset, friction, springs and the load f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x) of each
-# grasp on the arm, whatever it holds, and in the unknown parameters of payloads. All have priors of typical size for
-# robots, so that a joint without information keeps g = 1. A joint whose effort is not explained has no issue: a
-# counterbalance missing in the URDF is not a wrong sign.
+# linear in the inverse gain 1/g_j, offset c_j, viscous friction d_j, dry friction s_j, spring k_j, the load f of each
+# grasp on the arm, f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x), and the unknown parameters of payloads. All
+# have priors of a size that is typical for robots, so that a joint without information keeps g = 1. A joint whose
+# effort stays unexplained has no issue: a counterbalance that the URDF lacks is not a wrong sign.
 
-# Error of a robot's model: fraction of the joint's largest effort, fraction of the spread of the required effort.
+# Error of a robot's model: fraction of the joint's effort limit, fraction of the required effort's standard deviation.
 _EFFORT_LIMIT_ERROR_FRACTION, _EFFORT_SPREAD_ERROR_FRACTION = 0.02, 0.1
-# Typical sizes relative to a joint's largest effort: offset, dry friction, spring [per rad].
+# Typical sizes over a joint's effort limit: offset, dry friction, spring [per rad].
 _OFFSET_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.02, 0.02
 # Typical force on a grasp [N], and its derivatives [N/m, N/m^2, N s/m].
 _GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
@@ -309,18 +309,18 @@ _MAX_EXPLAINED_RMS = 1.5  # residual over the model's error, up to which a joint
 _WELL_EXPLAINED_RMS = 0.5  # ratio below which no lag is needed as an explanation
 _WRONG_ROBOT_RMS = 3.0  # ratio above which the efforts do not belong to this robot
 _MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # limits of numbers that a fit can use
-_MIN_Z = 5.0  # standard deviations from which on a number counts
-_INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples further apart than half of its inverse count as independent [Hz]
-_MIN_EFFORT = 1e-3  # efforts below this tell nothing [N m]
+_MIN_Z = 5.0  # standard deviations from which on an error is significant
+_INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples count as independent if they are half of its inverse apart [Hz]
+_MIN_EFFORT = 1e-3  # smaller efforts give no information [N m]
 _LAG_SEARCH_STEP = 0.1  # step of the search for a lag of efforts; a shorter lag is no gross error [s]
-# Fraction of the largest effort that a joint with zero command may seem to require: it swings and has friction.
+# Fraction of the effort limit that a joint with zero command may seem to require, because it swings with friction.
 _IDLE_COMMAND_FRACTION = 0.2
 _MAX_EFFORT_RATIO = 1.3  # allowed ratio to the URDF's effort limit, which may hold for continuous use only
 
 
 @dataclass(frozen=True)
 class _Data:
-    """Motion, recorded efforts (N, k), efforts required by bodies and gravity, and each joint's largest [N m]."""
+    """Motion, recorded efforts (N, k), efforts that bodies and gravity require (`needed`), and effort limits [N m]."""
 
     arm: RecordedJointsModel
     motion: _SmoothedMotion
@@ -330,7 +330,7 @@ class _Data:
 
     @property
     def holders(self) -> tuple[str, ...]:
-        """Frames of the grasps that the arm moves."""
+        """Frames at which the arm holds objects: those of the grasps whose position the angles determine."""
         frames = (grasp.holder_frame for grasp in self.arm.system.grasps)
         return tuple(frame for frame in frames if self.arm.is_frame_determined_by_angles(frame))
 
@@ -342,9 +342,9 @@ class _Fit(NamedTuple):
     std: Array
     offset: Array  # [N m]
     offset_std: Array
-    left: Array  # unexplained part relative to the model's error
-    direct: Array  # gain by which an effort's variation follows what is needed, without prior and noise
-    shift: Array  # mean error without prior and noise [N m]
+    left: Array  # rms of the unexplained part over the model's error
+    direct: Array  # gain from the variation of recorded and required efforts alone, without prior and noise
+    shift: Array  # mean recorded minus mean required effort, without prior and noise [N m]
     cost: float
 
 
@@ -384,7 +384,7 @@ def _limits(arm: RecordedJointsModel, effort: Array, largest: Array) -> Iterator
     ratio = np.percentile(np.abs(effort), 99, axis=0) / largest
     if np.any(ratio > _MAX_EFFORT_RATIO):
         j = int(np.argmax(ratio))
-        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times what it can bear ({largest[j]:.3g} N m)"
+        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times its effort limit ({largest[j]:.3g} N m)"
         advice = "check the unit of efforts (N m) and the robot's description"
         yield _issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j])
 
@@ -392,8 +392,8 @@ def _limits(arm: RecordedJointsModel, effort: Array, largest: Array) -> Iterator
 def _zero(arm: RecordedJointsModel, dead: BoolArray) -> Issue:
     names = [name for name, off in zip(arm.joint_names, dead, strict=True) if off]
     which = "all joints" if dead.all() else ", ".join(names)
-    words = f"the effort of {which} is zero throughout, while gravity and motion need more"
-    advice = "record efforts; to leave these out, move the arms as measured and switch their efforts off"
+    words = f"the effort of {which} is zero throughout, although gravity and motion require more"
+    advice = "record efforts, or use none: prescribe the motion of the arms and switch their effort sensor off"
     setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
     return _issue("effort_zero", words, 1e3, advice, setting=setting)
 
@@ -411,8 +411,8 @@ def _by_joint(data: _Data, fit: _Fit) -> Iterator[Issue]:
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
         if not 1 / factor < scale < factor:
-            words = f"efforts are about {scale:.2g} times what gravity and motion need"
-            advice = f"divide efforts by {1 / common:g}, if their unit is another"
+            words = f"efforts are about {scale:.2g} times what gravity and motion require"
+            advice = f"divide efforts by {1 / common:g}, if they are in another unit than N m"
             yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
             common = 1.0  # said; each joint is compared with the others
     turned = sound & (fit.inverse < -_MIN_Z * fit.std / 2) & (fit.inverse < -0.3)
@@ -422,8 +422,8 @@ def _by_joint(data: _Data, fit: _Fit) -> Iterator[Issue]:
         off = abs(inverse - 1) / (common * float(fit.std[j]))
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
-            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion need"
-            advice = "find out what the recorded effort is (unit, gear side, scale)"
+            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion require"
+            advice = "find out the unit and scale of the recorded effort, and on which side of the gear it is measured"
             yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)
     lost = fit.left > _WRONG_ROBOT_RMS
@@ -431,7 +431,7 @@ def _by_joint(data: _Data, fit: _Fit) -> Iterator[Issue]:
         left = float(np.median(fit.left[lost]))
         strange = f"efforts of {lost.sum()} of {len(names)} joints do not match this robot and motion"
         words = f"{strange}: {left:.2g} times the usual model error"
-        advice = "check that the recording is this robot's, its unit of time, and the order of joints"
+        advice = "check that the recording is of this robot, its unit of time, and the order of its joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
 
@@ -442,8 +442,8 @@ def _signs(arm: RecordedJointsModel, fit: _Fit, turned: BoolArray, upright: Bool
     if turned.sum() >= 2 and not upright.any():
         cases = [("all efforts have", float(np.max(depth[turned])), "")]
     for who, by, joint in cases:
-        words = f"{who} the opposite sign of what gravity and motion need"
-        yield _issue("effort_sign", words, by, "turn the sign; effort is what the motor does to the joint", joint)
+        words = f"{who} the opposite sign of what gravity and motion require"
+        yield _issue("effort_sign", words, by, "reverse the sign; effort is the motor's torque on the joint", joint)
 
 
 def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
@@ -458,10 +458,10 @@ def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
         balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
         if abs(offset[j]) > _MIN_Z * fit.offset_std[j] and not balanced:
             name, value = data.arm.joint_names[j], float(offset[j])
-            words = f"the zero of the effort of {name} is off by {value:+.3g} N m"
+            words = f"the effort of {name} has a constant error of {value:+.3g} N m"
             depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
             setting = known_effect_config_line("effort_offset", name, "offset", value)
-            yield _issue("effort_offset", words, depth, "let it be estimated, or set the sensor's zero", name, setting)
+            yield _issue("effort_offset", words, depth, "estimate it, or correct the sensor's zero", name, setting)
 
 
 def _late(data: _Data, fit: _Fit) -> Iterator[Issue]:
@@ -479,7 +479,7 @@ def _late(data: _Data, fit: _Fit) -> Iterator[Issue]:
     # by a factor of two, because friction and grasp explain part of a lag
     if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
         when, arms = "earlier" if lag > 0 else "later", joint_names_by_arm(data.arm.system)
-        words = f"efforts fit the motion best {abs(lag):.2g} s {when} than they were recorded"
+        words = f"efforts fit the motion best if their times are {abs(lag):.2g} s {when}"
         lines = [known_effect_config_line("effort_delay", name, "delay", lag) for name in arms]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
         yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
@@ -512,7 +512,7 @@ def _fitted(data: _Data) -> _Fit:
 
 
 def _by_itself(data: _Data) -> tuple[Array, Array]:
-    """Columns (N, k, 5 k) of each joint alone, and their typical sizes: 1/g, offset, friction twice, spring."""
+    """Return the columns (N, k, 5 k) of single joints, and their typical sizes: 1/g, offset, friction twice, spring."""
     motion, size, width = data.motion, data.size, data.effort.shape[1]
     # springs are large for joints at which the model estimates a spring
     sprung = {spring.joint_name for spring in data.arm.system.elastic_joints}
@@ -529,7 +529,7 @@ def _by_itself(data: _Data) -> tuple[Array, Array]:
 
 
 def _loaded(data: _Data) -> BoolArray:
-    """Joints on which a held object can act like an offset."""
+    """Return the mask (k,) of joints on which a held object can act like an offset."""
     if not data.holders:
         return np.zeros(len(data.size), bool)
     q = data.motion.q
@@ -539,7 +539,7 @@ def _loaded(data: _Data) -> BoolArray:
 
 
 def _loads(data: _Data) -> tuple[Array, Array]:
-    """Columns (N, k, c) of what the arm holds, and their typical sizes: unknown load parameters, 33 per grasp."""
+    """Return the columns (N, k, c) of held loads and their typical sizes: unknown load parameters, 33 per grasp."""
     motion, arm = data.motion, data.arm
     unknown = [arm.system.parameters[name] for name in arm.unknown_load_parameters]
     columns = [*arm._effort(motion.q, motion.v, motion.a)[1].transpose(2, 0, 1)] if unknown else []

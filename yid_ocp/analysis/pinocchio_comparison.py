@@ -1,7 +1,7 @@
 """Comparison of a model with the library Pinocchio: mass matrix, gravity forces and inverse dynamics.
 
-Pinocchio gets the robot in two ways: from the URDF file, which it reads itself, and joint by joint from the built
-system, including object and effects. The first reveals errors in reading the file, the second errors in the mechanics.
+Pinocchio gets the robot in two ways: it reads the URDF file itself, or it is given the built system joint by joint,
+including object and effects. The first reveals errors in reading the file, the second errors in the mechanics.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ _N_RANDOM_CONFIGURATIONS = 3  # configurations compared in addition to the given
 
 @dataclass(frozen=True)
 class _PinocchioComparison:
-    """Relative differences between a model and Pinocchio's model of the same bodies (over the largest entry)."""
+    """Largest differences between a model and Pinocchio's model of the same bodies, over the largest entry."""
 
-    of: str  # the compared model, in words
+    of: str  # words for the compared model
     mass: float  # difference of mass matrices
     weight: float  # difference of gravity forces
     motion: float  # difference of inverse dynamics
 
     @property
     def agrees_within_rounding(self) -> bool:
-        """Whether all three quantities agree within rounding."""
+        """True if all three quantities agree within rounding (1e-8 of the largest entry)."""
         return all(size <= _RELATIVE_TOLERANCE for size in (self.mass, self.weight, self.motion))
 
     @property
     def words(self) -> str:
-        """Sentence on the agreement, or on each difference."""
+        """The sentence on the agreement, or on each difference."""
         parts = {"mass matrix": self.mass, "weight": self.weight, "inverse dynamics": self.motion}
         if self.agrees_within_rounding:
-            said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
+            said = f"{self.of}: mass matrix, weight and inverse dynamics agree with Pinocchio's"
             return f"{said} within {max(parts.values()):.1g} of the largest entry"
         wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts.items() if not size <= _RELATIVE_TOLERANCE]
         return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} of the largest entry"
 
 
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
-    """Compare a system that has the parameters `theta` with Pinocchio's model of the same joints and bodies.
+    """Compare a system with parameters `theta` (ntheta,) with Pinocchio's model of the same joints and bodies.
 
     The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations.
     """
@@ -117,12 +117,12 @@ def _link(joint: ElementTree.Element, end: str) -> str:
 
 
 def _place(configuration: Array, joint: Any, value: float) -> None:
-    """Set a joint in Pinocchio's configuration, in which a continuous joint is a cosine and a sine."""
+    """Set a joint in a configuration of Pinocchio, in which a cosine and a sine represent a continuous joint."""
     configuration[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
 
 
 def _with_numeric_parameters(system: System, theta: Array) -> System:
-    """The system with numbers instead of its parameters, and zero internal coordinates."""
+    """Return the system with the numbers `theta` instead of its parameters, and zero internal coordinates."""
     inner = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])
@@ -134,7 +134,7 @@ def _with_numeric_parameters(system: System, theta: Array) -> System:
 
 
 def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
-    """Pinocchio's model of a numeric mechanism. With `weight`, gravity acts, and masses are the effective weights."""
+    """Make Pinocchio's model of a numeric mechanism. With `weight`, gravity acts, with masses by effective weight."""
     model = pin.Model()
     model.gravity.linear = gravity if weight else np.zeros(3)
     # Pinocchio's mass matrix requires depth-first order of the joints
@@ -161,7 +161,7 @@ def _number(expression: ca.SX) -> Array:
 def _compared(
     of: str, mechanism: Mechanism, gravity: Array, inert: Any, heavy: Any, posture: Array
 ) -> _PinocchioComparison:
-    """Largest differences from `inert` (mass matrix, inverse dynamics) and `heavy` (gravity), in random motion."""
+    """Compare with Pinocchio's models `inert` (mass matrix, inverse dynamics) and `heavy` (gravity), random motions."""
     n = len(mechanism.joints)
     q, v, a = (ca.SX.sym(name, n) for name in "qva")
     kinematics = forward_kinematics(mechanism, q)

@@ -24,19 +24,19 @@ from yid_ocp.sensors import SensorOptions
 
 _Choices = Callable[[str], SensorOptions]
 
-_HELD_POINT_TOLERANCE = 0.01  # from the position by the arm: errors of calibration and tool size [m]
+_HELD_POINT_TOLERANCE = 0.01  # allowed distance from the position by forward kinematics (calibration, tool) [m]
 # Fraction of the object's length by which points may differ from a model with unknown stiffness.
 _MAX_OBJECT_ERROR_FRACTION = 0.25
-_MAX_REMAINING_FRACTION = 0.5  # a change explains points where it leaves less than this part of their distance
+_MAX_REMAINING_FRACTION = 0.5  # a correction explains an error if less than this fraction of it remains
 # Factors of lengths in a wrong unit, and powers of ten for typing errors.
 _UNIT_SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 100.0, 1e3)
-_MIN_CLOCK_OFFSET = 0.05  # offset between two clocks that explains points far from where they should be [s]
-_PATH_SAMPLE_RATE = 50.0  # rate at which the way of the held points is worked out; splines join what lies between [Hz]
-_LENGTH_RTOL = 0.2  # part by which lengths that cannot change may seem to
+_MIN_CLOCK_OFFSET = 0.05  # smallest clock offset that is tried as the cause of large position errors [s]
+_PATH_SAMPLE_RATE = 50.0  # rate at which paths of held points are computed, with splines in between [Hz]
+_LENGTH_RTOL = 0.2  # allowed relative error of lengths that cannot change
 
 
 class _Change(NamedTuple):
-    """A correction of measured points, and the remaining distance from the model [m]."""
+    """A tried correction of measured points: issue cause, words, advice, and the rms distance [m] that remains."""
 
     cause: str
     words: str
@@ -53,7 +53,7 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
 
 
 def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, options: _Choices) -> Iterator[Issue]:
-    """Yield issues about points that disagree with forward kinematics. `options` returns a group's sensor options."""
+    """Yield issues about points on the arm that contradict forward kinematics. `options`(group): its settings."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
         return
@@ -97,17 +97,17 @@ def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, op
 def _explained(
     changes: Sequence[_Change], apart: Array, names: Sequence[str], allowed: float, recording: str, group: str
 ) -> Issue:
-    """Issue for the change that explains most; the first of equally good changes. It names points that are far off."""
+    """Return the issue for the correction that explains most (the first of equally good ones), with the far points."""
     error, far = _rms(apart), ", ".join(name for i, name in enumerate(names) if _rms(apart[:, i]) > allowed)
     best = min((change.error for change in changes), default=math.inf)
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
-    words, depth = f"points ({far or 'all'}) are {error:.3g} m (rms) from where the model has them", error / allowed
+    words, depth = f"points ({far or 'all'}) are {error:.3g} m (rms) away from the model", error / allowed
     for chosen in good:
-        words, where = f"{words}; {chosen.words} it is {chosen.error:.2g} m", "joints" if chosen.channel else group
-        place = recording, where, chosen.channel
+        words = f"{words}; {chosen.words} they are {chosen.error:.2g} m away"
+        place = recording, "joints" if chosen.channel else group, chosen.channel
         return Issue(chosen.cause, words, "not_trusted", depth, chosen.advice, *place, setting=chosen.setting)
     words = f"{words}, and no simple change explains it"
-    advice = "check the frame of the points, their names and the robot's description"
+    advice = "check the frame and the names of the points, and the URDF of the robot"
     return Issue("point_unlike", words, "not_trusted", depth, advice, recording, group)
 
 
@@ -122,7 +122,7 @@ def _rms(difference: Array) -> float:
 
 
 def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
-    """Corrections by another unit, exchanged or flipped axes about the world's origin, and both."""
+    """Yield corrections: another unit of length, or axes exchanged or flipped about the world's origin."""
     for scale in _UNIT_SCALES:
         words = f"divided by {scale:g}"
         yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
@@ -148,24 +148,24 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
 def _changed_times(
     path: clock_checks.PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array
 ) -> Iterator[_Change]:
-    """Corrections for points recorded earlier or later than the angles, or by a faster or slower clock."""
+    """Yield corrections of the clock: an offset relative to the joints or, if none explains the points, a drift."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
     late, _, error = clock_checks.clock_offset_drift_and_rms_distance(path, knots, t, seen)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
-        words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
+        words, advice = f"with times {late:+.3g} s off the joints' clock", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
         return
     late, drift, error = clock_checks.clock_offset_drift_and_rms_distance(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
-        words = f"taken {late:+.3g} s from the joints, by a clock that runs {1e3 * drift:+.3g} parts per thousand fast,"
+        words = f"with times {late:+.3g} s off the joints' clock, and {1e3 * drift:+.3g} parts per thousand fast,"
         yield _Change("clock_drift", words, clock_checks.timestamp_correction_advice(late, drift, middle), error)
 
 
 def _changed_zeros(
     arm: RecordedJointsModel, frames: tuple[str, ...], q: Array, seen: Array, here: tuple[Array, Array]
 ) -> Iterator[_Change]:
-    """Corrections of the zero of one joint, by Gauss-Newton."""
+    """Yield the best correction of the zero of one joint, found by Gauss-Newton."""
     found = []
     for j, name in enumerate(arm.joint_names):
         offset, (place, by_angle) = 0.0, here
@@ -187,7 +187,7 @@ def _changed_zeros(
 
 
 def _moved(seen: Array, place: Array) -> Iterator[_Change]:
-    """Corrections by another frame: a shift, then also a rotation (Kabsch 1976, doi:10.1107/S0567739476001873)."""
+    """Yield corrections of the frame: a shift, then also a rotation (Kabsch 1976, doi:10.1107/S0567739476001873)."""
     good = np.isfinite(seen).all(axis=-1)
     a, b = seen[good], place[good]
     if len(a) < 4:
@@ -204,7 +204,7 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
 
 
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
-    """Distances from a frame to joint origins along the unknown part of its chain, root first; None without any."""
+    """Return distances along the chain from a frame to its joints with unknown angle, root first; None without any."""
     mechanism, known = system.mechanism, set() if arm is None else set(arm.system_configuration_indices)
     entry = mechanism.frame(frame)
     chain = [i for i in mechanism.ancestor_joint_indices(entry.joint_index) if i not in known]
@@ -222,7 +222,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 def point_distance_issues(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, options: _Choices
 ) -> Iterator[Issue]:
-    """Yield issues about points that are farther apart, or farther from the root, than the object's length allows."""
+    """Yield issues about points that are farther apart, or farther from the root, than the object is long."""
     mechanism = system.mechanism
     for group in recording.points:
         frames = _point_frames(system, group, options(group.name))
@@ -251,16 +251,16 @@ def point_distance_issues(
             if far / allowed > worst:
                 # a point at the root has no information on a scale
                 worst, ratio = far / allowed, far / bound if bound > 0 else 1.0
-                words = f"{said_as} is {far:.3g} m, {bound:.3g} m along the object"
+                words = f"{said_as} is {far:.3g} m, but only {bound:.3g} m along the object"
         if worst > 1:
             cause, advice = "point_reach", "check the frame of the points, the camera's pose and their names"
             if ratio > 5:
-                cause, advice = "point_scale", f"check the unit of positions (they are {ratio:.2g} times too far)"
+                cause, advice = "point_scale", f"check the unit of positions ({ratio:.2g} times the possible distance)"
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
 def object_point_rollout_issues(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
-    """Yield an issue if a simple correction moves points to the rollout `result`. Tolerances scale with `size` [m]."""
+    """Yield issues about points that a simple correction moves to the rollout `result` of an object of `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
         if not names or not size > 0:
@@ -281,7 +281,7 @@ def object_point_rollout_issues(episode: Episode, result: EpisodePrediction, siz
 
 
 def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
-    """Corrections for points in the camera's frame, or transformed with the inverse pose."""
+    """Yield corrections for points in the camera's frame, transformed with its inverse pose, or with a flipped axis."""
     back = np.linalg.inv(pose)
 
     def moved(by: Array) -> Array:
@@ -289,17 +289,17 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 
     advice = "give positions in the world, not in the camera's frame"
     yield _Change("point_frame", "with the camera's pose applied", advice, _rms(moved(pose) - place))
-    turned, advice = "with the camera's pose the other way round", "the pose is of the camera in the world: invert it"
+    turned, advice = "with the camera's pose inverted", "invert the pose: it must be that of the camera in the world"
     yield _Change("point_frame", turned, advice, _rms(moved(pose @ pose) - place))
     for i, axis in enumerate("xyz"):
         flip = np.eye(4)
         flip[i, i] = -1
-        words = f"with the camera's {axis} axis turned round"
+        words = f"with the camera's {axis} axis reversed"
         yield _Change("point_mirrored", words, words, _rms(moved(pose @ flip @ back) - place))
 
 
 def cable_point_geometry_issues(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
-    """Yield issues about cable points that rise too far above the clamps, are exchanged, or have wrong distances."""
+    """Yield issues about cable points that lie too high above the clamps, are exchanged, or have wrong distances."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertex_names if name in group.names}
         edges = [edge for edge in cable.edge_vertex_names if edge[0] in at and edge[1] in at]
@@ -309,7 +309,7 @@ def cable_point_geometry_issues(cable: CableTopology, recording: Recording, grav
         typical = float(np.median(_lengths(at, edges) / _lengths(rest, edges)))
         found: list[Issue | None] = [_exchanged(at, rest, edges), _upside_down(cable, at, rest, gravity)]
         if abs(typical - 1) > _LENGTH_RTOL:
-            words = f"edges between points are {typical:.3g} times as long as in the undeformed shape"
+            words = f"edges between points have {typical:.3g} times their undeformed length"
             depth = abs(math.log(typical)) / math.log(1 + _LENGTH_RTOL)
             found[0] = Issue("point_scale", words, "not_trusted", depth, f"divide positions by {typical:.3g}", "")
         for issue in found:
@@ -322,7 +322,7 @@ def _lengths(where: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Ar
 
 
 def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Issue | None:
-    """Issue for two points whose exchange gives their edges the right length."""
+    """Return the issue for an edge of wrong length, and whether exchanging two points corrects the lengths."""
     known, most = _lengths(rest, edges), math.log(1.6)
     ratio = _lengths(at, edges) / known
     off = np.abs(np.log(ratio)) > most
@@ -335,10 +335,10 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
         if left < least:
             best, least = (one, two), left
     worst = int(np.argmax(np.abs(np.log(ratio))))
-    words = f"the edge {edges[worst][0]} to {edges[worst][1]} is {ratio[worst]:.3g} times as long as undeformed"
+    words = f"the edge {edges[worst][0]} to {edges[worst][1]} has {ratio[worst]:.3g} times its undeformed length"
     cause, advice = "point_reach", "check the names of the points"
     if least < 0.5 * off.sum():
-        words += f"; with {best[0]} and {best[1]} exchanged, {int(off.sum()) - least} edges are right"
+        words += f"; with {best[0]} and {best[1]} exchanged, {int(off.sum()) - least} more edges have the right length"
         cause, advice = "point_swapped", f"exchange {best[0]} and {best[1]}"
     return Issue(cause, words, "not_trusted", float(abs(math.log(ratio[worst]))) / most, advice, "")
 
@@ -346,7 +346,7 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
 def _upside_down(
     cable: CableTopology, at: Mapping[str, Array], rest: Mapping[str, Array], gravity: Array
 ) -> Issue | None:
-    """Issue for a cable that rises between its clamps by more than its shape does: gravity has the wrong sign."""
+    """Return the issue for a cable that rises between its clamps by more than its undeformed shape, or None."""
     pull = float(np.linalg.norm(gravity))
     free = [name for name in cable.unclamped_vertex_names if name in at]
     ends = [name for name in (cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[-1]) if name in at]
@@ -362,6 +362,6 @@ def _upside_down(
     height, allowed = rise(at) / span, 0.05 + abs(rise(rest)) / span
     if not height > allowed:
         return None
-    words = f"the cable's points are on average {height * span:.3g} m above its clamps, against gravity"
+    words = f"the cable's points are on average {height * span:.3g} m above its clamps, although gravity pulls down"
     advice, line = "check which axis points up, or set model.gravity", "model.gravity"
     return Issue("point_mirrored", words, "not_trusted", height / allowed, advice, "", setting=line)

@@ -28,8 +28,8 @@ _Found = TypeVar("_Found")
 _CHI2_QUANTILE_999 = 10.827566170662733  # of one degree of freedom
 _SMALL_VALUE_FRACTION = 0.3  # a value below this part of its typical size is small
 _MAX_LOG_DISTANCE = math.log(1e3)  # range of a positive unknown beyond which its interval is open
-_LOG_PRIOR_STD = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
-_REFIT_CHI2_ATOL = 1e-3  # chi2 that a refit may leave on the table
+_LOG_PRIOR_STD = math.log(1e3)  # prior std of the logarithm that holds other positive unknowns without information
+_REFIT_CHI2_ATOL = 1e-3  # a refit ends if a step would lower chi2 by less
 _TARGET_HEIGHT = math.sqrt(uncertainty.CHI2_95_TWO_SIDED)  # root of delta chi2 at the ends of an interval
 _ROOT_RTOL = 0.01  # relative tolerance on the root of delta chi2
 _MAX_REFIT_ITERATIONS, _MAX_REJECTED_STEPS, _MAX_PROFILE_POINTS = 30, 8, 12
@@ -42,19 +42,19 @@ _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 @dataclass(frozen=True)
 class ParameterProfileLikelihood:
-    """The rise of chi2 at fixed values of one unknown, with all other unknowns refitted, and the 95 % interval."""
+    """Profile likelihood of one unknown: rise of chi2 at fixed values, with the others refitted, and 95 % interval."""
 
     name: str
     value: float
     lower: float | None  # lower end of the 95 % interval; None if open
-    upper: float | None
+    upper: float | None  # upper end, likewise
     values: Array  # values at which the other unknowns were refitted, ascending, shape (k,)
     delta_chi2: Array  # (chi2 - best chi2) / max(1, chi2 per dof), shape (k,)
-    notes: tuple[str, ...] = ()  # other reasons for an open end; a better fit found
+    notes: tuple[str, ...] = ()  # sentences, for example on a better fit that was found
 
     @property
     def interval(self) -> uncertainty.ConfidenceInterval:
-        """The lower and upper end of the 95 % interval. None is an open end."""
+        """The lower and upper end of the 95 % interval. An open end is None."""
         return self.lower, self.upper
 
 
@@ -65,8 +65,8 @@ def compute_profile_likelihood_interval(
 
     At each value of the unknown, all other unknowns are refitted by Gauss-Newton, from a prediction along the tangent.
     Chi2 does not include the weak prior. An end of the interval is open if chi2 does not rise by 3.84 before the
-    unknown reaches its bound or 1000 times (or 1/1000 of) its estimate. Positive unknowns are represented by their
-    logarithm (Venzon and Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496).
+    unknown reaches its bound or, if it is positive, 1000 times or 1/1000 of its estimate. Positive unknowns are
+    represented by their logarithm (Venzon and Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496).
 
     `index` selects the unknown, `x` (nx,) is the best fit, and `evaluation` the evaluation at `x` with Jacobian. `std`,
     the standard deviation of the unknown, sets the first step and may be infinite.
@@ -77,7 +77,7 @@ def compute_profile_likelihood_interval(
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
     if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
-        walk.notes.append(f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one")
+        walk.notes.append(f"a better fit was found: chi2 is lower by {-walk.base:.2g} than at the estimate")
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
 
@@ -87,9 +87,9 @@ def solution_with_profile_intervals(
 ) -> Solution:
     """Return the solution with profile-likelihood intervals and matching verdicts for weakly determined parameters.
 
-    The cost of such a parameter is not quadratic, so that a standard deviation does not describe it. The same holds for
-    a stiffness that is small compared with its typical size (`mark_near_zero_estimate_unidentifiable`). The solution is
-    returned unchanged if the problem is too large for profiles.
+    The cost as a function of such a parameter is not quadratic, so a standard deviation does not describe it. The same
+    holds for a stiffness that is small compared with its typical size (`mark_near_zero_estimate_unidentifiable`). If
+    the problem is too large for profiles, the solution is returned unchanged.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
@@ -125,7 +125,7 @@ def evaluate_for_each_parameter_at_optimum(
     names: Sequence[str],
     progress: Progress,
 ) -> dict[str, _Found]:
-    """Find the optimum from `x`, then apply `judged`(name, optimum, evaluation) to all parameter names in parallel."""
+    """Find the optimum from `x` (nx,), and return judged(name, optimum, evaluation) by name, computed in parallel."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 
@@ -147,8 +147,8 @@ def mark_near_zero_estimate_unidentifiable(
 ) -> uncertainty.ParameterEstimate:
     """Mark a stiffness estimate near zero as `not_identifiable` if the data also allow a stiffness of typical size.
 
-    An unobserved twist of a branch can move, and thus fit the noise, only if its stiffness is near zero. The cost
-    therefore has a narrow, spurious minimum there. `x` (nx,) is the best fit, `evaluation` its evaluation, `index`
+    Near zero, the cost of a stiffness that no sensor observes can have a narrow, spurious minimum: only a branch with
+    almost no stiffness moves enough to fit the noise. `x` (nx,) is the best fit, `evaluation` its evaluation, `index`
     selects the unknown, and `size` is its entry of `typical_parameter_magnitudes`. The test has the level 99.9 %.
     """
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
@@ -161,13 +161,13 @@ def mark_near_zero_estimate_unidentifiable(
 
 
 def is_small_enough_for_profiles(problem: EstimationProblem) -> bool:
-    """Check whether a problem is small enough to compute profile-likelihood intervals by default."""
+    """Check whether a problem is small enough for intervals by default: at most 12 parameters and 300 unknowns."""
     few = len(uncertainty.parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
     return few and len(problem.unknown_names) <= _MAX_UNKNOWNS
 
 
 class _Point(NamedTuple):
-    """A refit at one value: coordinates, chi2 above the first point, residual rows and their Jacobian."""
+    """A refit at one fixed `value`: coordinates, chi2 minus that of the first point, residual and its Jacobian."""
 
     value: float
     x: Array
@@ -177,7 +177,7 @@ class _Point(NamedTuple):
 
 
 class _Walk:
-    """Follows the profile of one unknown in both directions; coordinates of positive unknowns are logarithms."""
+    """Follows the profile of one unknown in both directions. The coordinate of a positive unknown is its logarithm."""
 
     def __init__(self, problem: EstimationProblem, x: Array, index: int, best: Evaluation) -> None:
         self.problem, self.index = problem, index
@@ -201,7 +201,7 @@ class _Walk:
         return np.where(self.positive, np.exp(np.where(self.positive, s, 0.0)), s)
 
     def end(self, sign: int, size: float) -> float | None:
-        """Value at which the profile crosses the level on one side, or None."""
+        """Return the value on the side `sign` at which chi2 has risen by 3.84, or None. `size` sets the first step."""
         inside, s, centre = self.points[0], self.centre[self.index], self.centre[self.index]
         reach = _MAX_LOG_DISTANCE if self.logarithmic else 1e3 * float(self.problem.unknown_scales[self.index])
         bound = float((self.upper if sign > 0 else self.lower)[self.index])
@@ -231,13 +231,13 @@ class _Walk:
             ahead = math.inf if near else gone * (_TARGET_HEIGHT / height - 1.0) * _STEP_OVERSHOOT
             step = min(max(ahead, 0.2 * gone), _MAX_STEP_GROWTH * gone) if barrier is None else 0.5 * abs(barrier - s)
         if barrier is None:
-            self.notes.append(f"no end was met {side} in {_MAX_PROFILE_POINTS} refits")
+            self.notes.append(f"the interval is open {side}: {_MAX_PROFILE_POINTS} refits did not reach its end")
         else:
             self.notes.append(f"the model cannot be rolled out {side} {self._value(barrier):.4g}")
         return None
 
     def rise(self, value: float) -> float:
-        """Chi2 at a value with the other unknowns refitted, above the first point; NaN if no rollout succeeds."""
+        """Return the rise of chi2 at a value, with the other unknowns refitted, or NaN if no rollout succeeds."""
         point = self._refit(self.points[0], math.log(value) if self.logarithmic else value)
         return math.nan if point is None else point.chi2
 
@@ -245,7 +245,7 @@ class _Walk:
         return float(np.exp(s)) if self.logarithmic else s
 
     def _added(self, point: _Point) -> float:
-        """Root of delta chi2 at a point, which is stored."""
+        """Store a point and return the square root of its delta chi2."""
         self.points.append(point)
         self.base = min(self.base, point.chi2)
         return self._height(point)
@@ -254,7 +254,7 @@ class _Walk:
         return math.sqrt(max(point.chi2 - self.base, 0.0))
 
     def _root(self, inside: _Point, outside: _Point) -> float:
-        """Regula falsi (Illinois) on the root of delta chi2, which is nearly linear; bisection at a discontinuity."""
+        """Return the interval's end between two points: regula falsi on the root of delta chi2, bisection at a jump."""
         a, b, target = inside, outside, _TARGET_HEIGHT
         heights = [self._height(a) - target, self._height(b) - target]
         share = 1.0  # weight of the older side's height, halved each time it is kept
@@ -326,7 +326,7 @@ class _Walk:
         return _Point(float(x[self.index]), s.copy(), chi2, *self._rows(evaluation, s))
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
-        """Residual and Jacobian by the coordinates, with logarithmic priors instead of the weak priors."""
+        """Return residual and Jacobian by the coordinates `s`, with logarithmic priors instead of the weak priors."""
         residual, jacobian = residual_and_jacobian_without_weak_priors(self.problem, evaluation)
         slope = np.where(self.positive, self._unknowns(s), 1.0)
         anchors = np.eye(len(s))[self.anchored] / _LOG_PRIOR_STD

@@ -1,4 +1,4 @@
-"""Mean estimates of one model over several runs, drifting parameters and outlier runs.
+"""Mean of the estimates of one model over several runs, and tests for drifting parameters and outlier runs.
 
 The mean of estimates x_i of the same n parameters with covariances C_i is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. If the
 parameters are constant over k runs, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. If chi2 is
@@ -22,9 +22,9 @@ _MIN_CORRELATION_EIGENVALUE = 1e-12  # smaller eigenvalues result from rounding
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunEstimates(ReprMixin):
-    """The estimates (n,) of n parameters from one run, with covariance (n, n), in the units given by `units`.
+    """The estimates (n,) of n parameters from one run, with covariance (n, n). `units` holds the units by parameter.
 
-    If `is_fit_adequate` is False (the model does not explain the recordings), the covariance includes the misfit.
+    `is_fit_adequate` is False if the model does not explain the recordings; the covariance then includes the misfit.
     """
 
     run_name: str
@@ -33,7 +33,7 @@ class RunEstimates(ReprMixin):
     covariance: Array  # shape (n, n)
     units: Mapping[str, str] = field(default_factory=dict)
     is_fit_adequate: bool = True
-    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # parameters by label `kind@location`
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # values by `kind@location` and name
 
     def _summary(self) -> ReprTexts:
         rows = [("parameter", "value", "unit")]
@@ -55,7 +55,7 @@ class RunEstimates(ReprMixin):
 
 @dataclass(frozen=True)
 class _ParameterDriftTest:
-    """Test whether one parameter has the same value in all its runs: pooled mean, chi2 of the differences."""
+    """Test whether a parameter is the same in all runs that have it: weighted mean, chi2 of differences from it."""
 
     name: str
     unit: str
@@ -71,20 +71,20 @@ class _ParameterDriftTest:
 
 @dataclass(frozen=True)
 class _RunOutlierTest:
-    """Test of one run against the pooled estimates of all other runs."""
+    """Test of one run against the weighted mean of all other runs. `chi2` is of the difference from this mean."""
 
     run_name: str
     chi2: float
     degrees_of_freedom: int
     p_value: float
-    most_deviating_parameter: str  # parameter that differs most
+    most_deviating_parameter: str  # parameter with the largest difference in standard deviations
     is_fit_adequate: bool
     is_outlier: bool  # the other runs agree with each other, but not with this run
 
 
 @dataclass(frozen=True)
 class DriftAndOutlierTests:
-    """Tests of several runs for drifting parameters and deviating runs. `chi2` is of all differences between runs."""
+    """Tests of several runs for drifting parameters and outlier runs. `chi2` tests all parameters and runs at once."""
 
     run_names: tuple[str, ...]
     parameter_drift_tests: tuple[_ParameterDriftTest, ...]
@@ -96,7 +96,7 @@ class DriftAndOutlierTests:
 
 
 def nearby_positive_definite_covariance(covariance: Array) -> Array:
-    """Raise small eigenvalues of the correlations to make a covariance invertible. Standard deviations remain."""
+    """Return an invertible covariance with the same standard deviations: small correlation eigenvalues are raised."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     clipped = (vectors * np.maximum(values, _MIN_CORRELATION_EIGENVALUE)) @ vectors.T
@@ -105,11 +105,11 @@ def nearby_positive_definite_covariance(covariance: Array) -> Array:
 
 
 def pool_estimates_and_chi2(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
-    """Compute the weighted mean of the estimates of several runs, and chi2 of the differences between the runs.
+    """Compute the weighted mean of the estimates of several runs, and chi2 of the runs' differences from it.
 
-    Returns the mean, chi2 of the differences between runs, and the degrees of freedom of chi2. Parameters that only
-    some runs contain are included. If the runs differ by more than their standard deviations explain, the standard
-    deviations of the mean are multiplied by Birge's ratio, sqrt(chi2 / degrees of freedom).
+    Returns the mean, chi2 and its degrees of freedom. Parameters that only some runs contain are included. If the runs
+    differ by more than their standard deviations explain, the standard deviations of the mean are multiplied by Birge's
+    ratio, sqrt(chi2 / degrees of freedom).
     """
     names = tuple(dict.fromkeys(name for run in runs for name in run.parameter_names))
     information, sums = np.zeros((len(names), len(names))), np.zeros(len(names))
@@ -138,10 +138,10 @@ def pool_estimates_and_chi2(runs: Sequence[RunEstimates]) -> tuple[RunEstimates,
 def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
     """Test which parameters changed from run to run (in order of time), and which run is an outlier.
 
-    A run is an outlier if it disagrees with the other runs and the other runs are consistent, or clearly more
-    consistent without it than without any other run. With two runs no outlier is reported. A parameter is tested with
-    its marginal variances, a run with its whole covariance. The significance `level` is divided by the number of
-    parameters or of runs.
+    A run is an outlier if it differs significantly from the mean of the others, and the others agree: their own chi2 is
+    not significant, or less than half of what it is without any other run. With two runs no outlier is reported. A
+    parameter is tested with its variances, a run with its whole covariance. The significance `level` is divided by the
+    number of parameters or of runs.
     """
     mean, chi2, degrees = pool_estimates_and_chi2(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
@@ -160,7 +160,7 @@ def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterD
 
 
 def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierTest:
-    """One run against the mean of all other runs; an outlier if these agree without it."""
+    """Test run `i` against the mean of all other runs. It is an outlier if the others agree without it."""
     chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
     p = chi2_p_value(chi2, degrees)
     without = [pool_estimates_and_chi2([*runs[:k], *runs[k + 1 :]])[1:] for k in range(len(runs))]

@@ -1,4 +1,4 @@
-"""Diagnostics of a compiled step: sizes, sparsity and observability of parameters."""
+"""Diagnostics of a compiled step: number of operations, sparsity patterns, and parameters that sensors observe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from yid_ocp.sensors import sensor_function_with_jacobians
 
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
-    """Count the variables, unknowns, Jacobian nonzeros and arithmetic operations of a step and its functions."""
+    """Return the number of variables, unknowns, Jacobian nonzeros and operations of a step and of its functions."""
     e, found = step.equations, []
     for f in step.functions.all_functions:
         nonzeros = sum(f.nnz_out(i) for i in range(f.n_out()))
@@ -33,7 +33,7 @@ def step_complexity_summary(step: Step) -> dict[str, Any]:
 def step_equation_jacobians_at_state(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepResidualsAndJacobians:
-    """Compute Jacobians of the step equations at a state (nx,), torque (nu,) [N m] and prescribed coordinates (nc,)."""
+    """Compute the step's Jacobians at `state` (nx,), `torque` (nu,) [N m] and prescribed coordinates `path` (nc,)."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
@@ -42,8 +42,8 @@ def step_equation_jacobians_at_state(
     )
 
 
-# A row counts as observed if a reading changes by more than this fraction of the largest such change over all rows:
-# smaller changes are rounding of the equilibrium (1e-12 rad) and of a hundred steps.
+# A row is observed if a reading changes by more than this fraction of the largest change over all rows: smaller changes
+# are rounding errors of the equilibrium (1e-12 rad) and of a hundred steps.
 _MIN_RELATIVE_RESPONSE = 1e-7
 # Number of steps in which readings are examined; slower responses take longer than most motions.
 _RESPONSE_STEPS = 100
@@ -56,12 +56,12 @@ class ParameterEquationsAndResponses:
     parameter: str
     unit: str
     rows: tuple[str, ...]  # names of rows that contain the parameter in any state
-    observable_rows: tuple[str, ...] | None  # of `rows`, those with a first-order sensor response; None: no sensors
-    most_sensitive_sensor: str  # empty where no sensor responds
+    observable_rows: tuple[str, ...] | None  # those of `rows` that change a reading to first order; None: no sensors
+    most_sensitive_sensor: str  # with the largest response to the rows; empty if no sensor responds
     directly_dependent_sensors: tuple[str, ...]  # sensors whose readings contain the parameter
-    max_change_from_rest: float | None  # largest of a reading for one unit of the parameter [standard deviations]
-    seconds: float  # time within which that change is reached
-    change_along_recordings: float | None = None  # root sum of squares over all readings, likewise
+    max_change_from_rest: float | None  # largest change of a reading per unit of the parameter [standard deviations]
+    seconds: float  # length of the simulated response [s]
+    change_along_recordings: float | None = None  # root of the sum of squared changes of all readings, likewise
 
 
 def parameter_equations_and_responses(
@@ -74,10 +74,10 @@ def parameter_equations_and_responses(
 ) -> tuple[ParameterEquationsAndResponses, ...]:
     """Find for each parameter the step equations that contain it, and the sensors that respond to it.
 
-    For the response, one unit is added to one equation of a step that starts at `state`. The later steps are linear, x'
-    = (A - B_u K) x, where K is the first gain of the tracking filter. The equation is observed to first order if a
-    reading changes within `_RESPONSE_STEPS` steps. `symbols` are the named equations and `stages` their linearisation
-    at `state`. `episode` provides the sensors and the tracking filter; without it only equations are listed.
+    The equilibrium `state` is disturbed by adding one unit to one equation of one step. The later states follow the
+    linear model x_next = (A - B_u K) x, where K is the first gain of the tracking filter. The equation is observed to
+    first order if a reading changes within `_RESPONSE_STEPS` steps. `stages` is the linearisation of the equations
+    `symbols` at `state`. `episode` provides sensors and tracking filter; without it only equations are listed.
     """
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.row_or_column_block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
@@ -107,7 +107,7 @@ def parameter_equations_and_responses(
 
 
 class _WhitenedSensor(NamedTuple):
-    """One whitened sensor at equilibrium: derivatives of its readings by state, effort and parameters."""
+    """Derivatives of one sensor's whitened readings at an equilibrium by state, effort and parameters."""
 
     name: str
     by_state: Array
@@ -139,7 +139,7 @@ def _answers(
     steps: int,
     held: bool,
 ) -> Array:
-    """Largest whitened response (len(sensors), c) of every sensor to inputs on rows, in one step or (`held`) in all."""
+    """Return each sensor's largest whitened response (sensors, c) to c inputs `push` in one step or, if `held`, all."""
     sizes, h = step.sizes, step.time_step
     n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
     nt = n + nz + sizes["m"]
@@ -168,7 +168,7 @@ _ZERO_RTOL = 1e-14  # entries below this fraction of the largest one are roundin
 
 
 class NamedIndexRange(NamedTuple):
-    """A named block of matrix rows or columns, with its first index and its end."""
+    """A named block of matrix rows or columns, from index `start` to `stop` (exclusive)."""
 
     name: str
     start: int
@@ -187,10 +187,10 @@ class SparsityPattern:
     row_labels: tuple[str, ...]
     column_labels: tuple[str, ...]
     marked_mask: BoolArray | None = None  # entries that are highlighted, shape (r, c)
-    mark_label: str = ""  # what that means
+    mark_label: str = ""  # meaning of the highlight
 
     def with_numerical_nonzeros_marked(self, values: Array, where: str) -> SparsityPattern:
-        """Return a copy of the pattern that marks the entries at which the matrix `values` is not zero."""
+        """Return the pattern with those entries highlighted at which `values` (r, c), taken at `where`, are nonzero."""
         marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
         return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
 
@@ -240,7 +240,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
         return whole[symbols.row_or_column_block_slice(row), symbols.row_or_column_block_slice(column)]
 
     def by(*columns: str) -> BoolArray:
-        """Residual's rows by columns."""
+        """Return the sparsity of the residual's Jacobian with respect to the named columns."""
         parts = [np.hstack([block(row, column) for column in columns]) for row in ("del", "internal", "constraint")]
         return np.vstack([parts[0][free], *parts[1:]])
 
@@ -251,7 +251,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
     inverse = _inverse_sparsity(by_unknown)
 
     def response(*columns: str) -> BoolArray:
-        """The state after the step by columns."""
+        """Return the sparsity of the next state's Jacobian with respect to the named columns."""
         y = _times(inverse, by(*columns))
         full = np.zeros((by_new.shape[1], y.shape[1]), bool)
         full[known] = y
@@ -276,7 +276,7 @@ def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPat
 
 
 def _inverse_sparsity(mask: BoolArray) -> BoolArray:
-    """Structural nonzeros of a matrix's inverse: paths in its graph after permutation to a zero-free diagonal."""
+    """Return where a matrix's inverse can be nonzero: paths in its graph, permuted to a diagonal without zeros."""
     count = len(mask)
     matched = maximum_bipartite_matching(scipy.sparse.csr_matrix(mask), perm_type="row")
     if count == 0 or np.any(matched < 0):

@@ -1,4 +1,4 @@
-"""The equations of one step with named rows and columns, and their entries as text."""
+"""The equations of one time step with named rows and columns, and their formulas as text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from yid_ocp.integrator.discrete import DiscreteEquations
 _COMPARISON, _SUM, _PRODUCT, _POWER, _ATOM = range(5)
 _LEAF_OPERATIONS = (ca.OP_INPUT, ca.OP_CONST)
 
-# operation: template, binding strength, required strength of its operands
+# by operation: template, binding strength of the result, required binding strength of each operand
 _TEXT_TEMPLATES: dict[int, tuple[str, int, tuple[int, ...]]] = {
     ca.OP_ADD: ("{0} + {1}", _SUM, (_SUM, _SUM)),
     ca.OP_SUB: ("{0} - {1}", _SUM, (_SUM, _PRODUCT)),
@@ -48,9 +48,9 @@ _FUNCTION_NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name 
 class _FormulaText:
     """Expressions written as text, with their shared subexpressions."""
 
-    shared_subexpressions: tuple[tuple[str, str], ...]  # name and expression, which may use those before it
+    shared_subexpressions: tuple[tuple[str, str], ...]  # names and texts; each may use earlier names
     expression_texts: tuple[str, ...]
-    n_operations: int  # each shared one counted once
+    n_operations: int  # operations of shared subexpressions count once
     variable_indices: tuple[int, ...]  # indices of the variables that occur
 
 
@@ -62,7 +62,7 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 
 
 def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[str]) -> _FormulaText:
-    """Convert scalar symbolic expressions to text. `names` are the names of the variables (k, 1), the only symbols."""
+    """Convert scalar symbolic expressions to text. They contain no symbols but `variables` (k, 1), named by `names`."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
     for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
@@ -96,7 +96,7 @@ _Node = tuple[int, tuple[int, ...], float]
 
 
 def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
-    """Instructions of the function as nodes that are written once, and the indices of the output nodes."""
+    """Return the function's instructions as nodes, each result in a node of its own, and the indices of the outputs."""
     nodes: list[_Node] = []
     at: dict[int, int] = {}
     results = [0] * count
@@ -124,8 +124,8 @@ def _written(op: int, parts: list[tuple[str, int]]) -> tuple[str, int]:
     return template.format(*texts), tightness
 
 
-_MAX_PRINTED_OPERATIONS = 80  # operations up to which an equation is written out without being asked for
-_MAX_LISTED_SYMBOLS = 6  # names of one block that are still listed one by one
+_MAX_PRINTED_OPERATIONS = 80  # longer equations are printed only on request
+_MAX_LISTED_SYMBOLS = 6  # names of one block up to which each is listed
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class _SymbolBlock:
 
 @dataclass(frozen=True)
 class EquationOrDerivativeFormula:
-    """The formula of one step equation or, if a column is named, of its derivative with respect to that variable."""
+    """The formula of one step equation or, if `column_name` is set, of its derivative with respect to that variable."""
 
     row_name: str
     column_name: str
@@ -163,18 +163,18 @@ class EquationOrDerivativeFormula:
 
     @property
     def is_identically_zero(self) -> bool:
-        """True if the expression is zero for every state."""
+        """True if the expression is zero for all values of the variables."""
         return bool(self.expression.is_zero())
 
     def numeric_value(self, variables: ca.SX, at: Array) -> float:
-        """Compute the value of the expression for the values `at` (k,) of the variables (k, 1)."""
+        """Compute the expression for the values `at` (k,) of the symbols `variables` (k, 1)."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
     @property
     def text_lines(self) -> list[str]:
         """The lines of text that show the whole formula, with shared subexpressions first."""
         if self.is_identically_zero:
-            return [f"{self.title} = 0 whatever the state"]
+            return [f"{self.title} = 0 for every state"]
         said = [_headline(self.title, self.formula.n_operations, self.variable_names)]
         said += [f"  {name} = {text}" for name, text in self.formula.shared_subexpressions]
         return [*said, f"  {self.title} = {self.formula.expression_texts[0]}"]
@@ -185,8 +185,8 @@ class NamedStepEquations(ReprMixin):
     """The symbolic equations of one time step, with a name for each row (equation) and column (variable).
 
     The row blocks are `del` (discrete Euler-Lagrange equations; at a prescribed coordinate the residual is -h times its
-    effort, with the time step h), `internal`, `constraint`, and `p1`, the momentum after the step. The column blocks
-    are `q0`, `p0`, `z0`, `u`, `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`.
+    effort, with the time step h), `internal`, `constraint`, and `p1` (momentum after the step). The column blocks are
+    `q0`, `p0`, `z0`, `u`, `theta`, `time_step` and the unknowns `q1`, `z1`, `lam`. Each has a `meaning`.
     """
 
     equations: DiscreteEquations
@@ -201,7 +201,7 @@ class NamedStepEquations(ReprMixin):
 
     @staticmethod
     def from_equations(equations: DiscreteEquations) -> NamedStepEquations:
-        """Give names to the rows and columns of the discrete equations of a step."""
+        """Name the rows and columns of the discrete equations of a step after joints, grasps and parameters."""
         e, system = equations, equations.system
         joints, internal = system.mechanism.joint_names, tuple(system.effect_internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
@@ -264,9 +264,9 @@ class NamedStepEquations(ReprMixin):
         """
         said = [part.strip() for part in text.split(",")]
         if len(said) > 2 or not all(said):
-            allowed = "the name of a row, or of a row and a column with a comma between them"
+            allowed = "ROW (an equation), or ROW, COLUMN (its derivative by a variable)"
             hint = "write for example --entry 'del[T1_0_x], q1[T1_0_x]'"
-            raise ConfigError(f"'{text}' is not an entry", where="--entry", allowed=allowed, hint=hint)
+            raise ConfigError(f"'{text}' is not an entry of the equations", where="--entry", allowed=allowed, hint=hint)
         row, column = _place(said[0], self.row_names, "row", self.row_blocks), ""
         expression = self._row_expressions[row]
         if len(said) == 2:
@@ -277,7 +277,7 @@ class NamedStepEquations(ReprMixin):
         return EquationOrDerivativeFormula(self.row_names[row], column, made, used, expression)
 
     def _summarize_columns(self, places: Iterable[int]) -> tuple[str, ...]:
-        """Names of columns by index. A block with many of them is abbreviated, such as `24 of q0`."""
+        """Return the names of columns by index. Many names of one block are abbreviated, such as `24 of q0`."""
         chosen, names, words = set(places), self.all_variable_names, []
         for block in self.column_blocks:
             span = self.row_or_column_block_slice(block.name)
@@ -286,7 +286,7 @@ class NamedStepEquations(ReprMixin):
         return tuple(words)
 
     def text_lines(self) -> list[str]:
-        """Return all equations and then all variable names as lines of text. Only short equations are shown in full."""
+        """Return all equations, then all variable names, as lines of text. Long equations are only summarised."""
         said = []
         place = {self.all_variable_symbols[i].element_hash(): i for i in range(self.all_variable_symbols.numel())}
         for at, name in enumerate(self.row_names):
@@ -297,7 +297,7 @@ class NamedStepEquations(ReprMixin):
             else:
                 used = self._summarize_columns(place[symbol.element_hash()] for symbol in ca.symvar(row))
                 said.append(_headline(name, count, used))
-        whole = "`inspect --entry 'NAME'` prints any of them whole, with ', COLUMN' its derivative"
+        whole = "`inspect --entry 'ROW'` prints an equation in full, `--entry 'ROW, COLUMN'` its derivative"
         blocks = [block for block in self.column_blocks if block.labels]
         names = (f"{b.name} ({b.meaning}): {', '.join(b.full_names)}" for b in blocks)
         return [f"equations of one step; {whole}", "", *said, "", *names]
@@ -308,7 +308,7 @@ def _headline(title: str, count: int, variables: Sequence[str]) -> str:
 
 
 def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[_SymbolBlock, ...]) -> int:
-    """Index of a row or column by its full name. Raises `ConfigError`, with the nearest name, if there is none."""
+    """Return the index of a row or column by its full name. Raises `ConfigError`, with the nearest name, if unknown."""
     if name in known:
         return known.index(name)
     shapes = [f"{b.name}[{b.labels[0]}]" if b.full_names[0] != b.labels[0] else b.labels[0] for b in blocks if b.labels]
@@ -316,5 +316,5 @@ def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[_SymbolBl
     same = tuple(n for b in blocks if b.name == name.partition("[")[0] for n in b.full_names)
     hint = nearest_name_question(name, known if len(known) < 12 else same or known)
     hint = hint or "see all names in equations.txt of `yid-ocp inspect`"
-    allowed = f"{kind}s of these kinds: {', '.join(shapes)}"
+    allowed = f"{kind}s such as {', '.join(shapes)}"
     raise ConfigError(f"the equations of a step have no {kind} '{name}'", where="--entry", allowed=allowed, hint=hint)

@@ -1,9 +1,9 @@
 """Low-rank model of how torque and encoder errors change all readings of a motion.
 
-Torques have an error in every recorded sample and a constant one; angles that a tracking filter follows have an error
-in every step. A recording has some thousands of these unknowns, but sensors only observe smooth motions. The matrix G
-maps them to all readings, in units of the smallest noise. Its left singular vectors with large singular values
-represent it; they are computed from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2,
+Torques have an error in every recorded sample and a constant error; angles that a tracking filter follows have an error
+in every step. A recording has some thousands of these unknown errors, but they change its readings only smoothly. The
+matrix G maps the errors to all readings, in units of the smallest noise. Its left singular vectors with large singular
+values represent G; they are computed from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2,
 doi:10.1137/090771806). The neglected rest adds less than `_NEGLIGIBLE_STD` squared to the variance of any reading.
 """
 
@@ -24,7 +24,7 @@ from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors.joints import PositionSensor
 
-_NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a reading's noise
+_NEGLIGIBLE_STD = 0.1  # standard deviation of a reading that may be neglected, in units of its noise
 # Initial number of random samples of all errors, doubled while too small, and its maximum.
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
@@ -37,18 +37,18 @@ def sensitivities_and_information(
     finest: Mapping[str, float],
     encoders: EstimationProblem | None = None,
 ) -> tuple[dict[tuple[str, str], Array], Array]:
-    """Compute how point positions depend on unknowns and input errors, and the information from joint sensors.
+    """Compute how point positions in recording `i` depend on unknowns and input errors, and what joint sensors inform.
 
     In `problem` every point is seen at every node with unit standard deviation. `evaluation` is the evaluation at the
     unknowns `x` (nx,). `finest` is the smallest standard deviation of each group [m]. `encoders` is the problem with
-    encoders of driven joints as measurements. The errors of torques and encoders are approximated by q unknowns.
+    encoders of driven joints as measurements. The errors of torques and encoders are represented by q unknowns.
 
     Returns
     -------
     slopes : dict of (group, frame) to ndarray, shape (N + 1, 3, nx + q)
-        Derivatives with respect to the unknowns, then to the q errors.
+        Derivatives of positions at N + 1 nodes by the nx unknowns, then by the q unknowns of the errors.
     information : ndarray, shape (nx + q, nx + q)
-        Information of joint measurements, and of the prior of the errors.
+        Fisher information of joint measurements, and of the unit prior of the q unknowns.
     """
     assert evaluation.jacobian is not None
     episode, result = problem.episodes[i], evaluation.episode_predictions[i]
@@ -96,7 +96,7 @@ def sensitivities_and_information(
 
 
 def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> Array:
-    """Derivatives (r, nx + q) of encoder readings, in units of their noise, by the unknowns and the errors."""
+    """Return derivatives (r, nx + q) of encoder readings, in units of their noise, by the unknowns and the errors."""
     evaluation = encoders.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
         raise failed_rollout_error(evaluation.message)
@@ -110,7 +110,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
 
 
 def _low_rank_error_sensitivity(course: NominalTrajectory, errors: TorqueAndAngleErrorModel, slopes: Array) -> Array:
-    """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors."""
+    """Return sensitivities (N + 1, k, q) of k readings to q unit-variance unknowns that represent all input errors."""
     motion = _Motion(course, errors)
     rng = np.random.default_rng(0)
     shape, most = slopes.shape[:2], min(_MAX_RANDOM_SAMPLES, motion.size, slopes.shape[0] * slopes.shape[1])
@@ -132,7 +132,7 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: TorqueAndAngl
 
 
 class _Motion:
-    """Changes of the state by errors of unit standard deviation: initial, per sample, per step, and constant."""
+    """The linear map G from errors of unit standard deviation (initial, constant, by sample, by step) to readings."""
 
     def __init__(self, course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
@@ -157,12 +157,12 @@ class _Motion:
         self.size = len(self.torque_std) * (2 + self.samples + len(self.by_torque))
 
     def _parts(self, errors: Array) -> tuple[Array, Array, Array, Array]:
-        """Errors of the initial angles, constant errors, errors of samples and of steps, each (..., nu, c)."""
+        """Split errors into those of initial angles, constants, errors of samples and of steps, each (..., nu, c)."""
         parts = errors.reshape(-1, len(self.torque_std), errors.shape[1])
         return parts[0], parts[1], parts[2 : 2 + self.samples], parts[2 + self.samples :]
 
     def moved(self, errors: Array, slopes: Array) -> Array:
-        """Readings G e of errors e: (size, c) to (N + 1, k, c)."""
+        """Compute the readings G e (N + 1, k, c) of errors e (size, c). `slopes` (N + 1, k, nx): readings by state."""
         angles, constant, white, followed = self._parts(errors)
         constant, white = self.bias_std * constant, self.torque_std * white
         state = self.start_by_angles @ angles + self.start_by_torque @ (constant + white[0])
@@ -175,7 +175,7 @@ class _Motion:
         return found
 
     def pulled(self, readings: Array, slopes: Array) -> Array:
-        """The transposed map G' y: (N + 1, k, c) to (size, c)."""
+        """Compute the transposed map G' y (size, c) of readings y (N + 1, k, c)."""
         result = np.zeros((self.size, readings.shape[2]))
         angles, constant, white, followed = self._parts(result)
         costate = slopes[-1].T @ readings[-1]

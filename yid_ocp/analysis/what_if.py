@@ -1,4 +1,4 @@
-"""Ranking of possible changes of an experiment by the parameters that they make identifiable."""
+"""Ranking of possible changes of an experiment by the number of parameters that they make identifiable."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ExperimentChange:
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
-    """The predicted identifiability after changes of an experiment. `verdicts` is empty if the prediction failed.
+    """The predicted identifiability if an experiment is changed. `verdicts` is empty if the prediction failed.
 
     `gain` [nat] is the information gain 1/2 log det(1 + 16 I), where I is the Fisher information of relative changes
     and the prior standard deviation of each parameter is 400 %.
@@ -63,9 +63,9 @@ class ChangedExperimentResult:
     description: str
     std_relative: Mapping[str, float]
     verdicts: Mapping[str, str]
-    identifiable: int  # number of parameters
+    identifiable: int  # number of identifiable parameters
     gain: float
-    message: str = ""  # why it could not be evaluated, or obstacles on a real robot
+    message: str = ""  # reason for a failure, or obstacles on a real robot
 
     @property
     def _is_complete(self) -> bool:
@@ -77,8 +77,8 @@ class ExperimentChangesByIdentifiableCount(ReprMixin):
     """The possible changes of an experiment, ranked by the number of parameters that they make identifiable.
 
     `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
-    last. `smallest_sufficient_sets` are all sets of fewest changes (at most three) that make every parameter
-    identifiable, largest gain first.
+    last. `smallest_sufficient_sets` are all sets of as few changes as possible (at most three) with which every
+    parameter is identifiable, largest gain first.
     """
 
     unchanged_experiment: ChangedExperimentResult
@@ -94,7 +94,7 @@ class ExperimentChangesByIdentifiableCount(ReprMixin):
         return ReprTexts(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 
 
-# From sets of changes and a factor on the stated variances to the predicted results, one for each set.
+# Function from sets of changes and a factor on the stated variances to the predicted result of each set.
 ChangeSetsEvaluationFunction = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
 
 
@@ -111,9 +111,9 @@ def what_if(
 ) -> ExperimentChangesByIdentifiableCount:
     """Rank changes of an experiment by how many parameters they make identifiable, without new measurements.
 
-    A new sensor observes the simulation of the recorded motion, in which the tracking filter keeps the arms on that
-    motion. New motions and a second arm are simulated in MuJoCo; without MuJoCo, the motion of a held-out recording is
-    used.
+    The readings of a new sensor are simulated along the recorded motion, on which the tracking filter keeps the arms.
+    New motions and a second arm are simulated in MuJoCo; without it, the new motion is that of a held-out recording.
+    Raises `SolverError` if the unchanged experiment cannot be simulated.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def what_if(
     considered_changes : collection of str, optional
         Names of changes to consider; default: all.
     evaluate_changes : callable, optional
-        Replacement for `evaluate_experiment_change_sets`, for example in other processes.
+        Replacement for the evaluation in this process, for example one that uses other processes.
     """
     x, inflation = unknown_vector_from_solution(problem, solution), 1.0
     if solution is not None:
@@ -145,7 +145,7 @@ def what_if(
 def evaluate_experiment_change_sets(
     setting: UnchangedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
-    """Predict the result of each set of experiment changes in `sets`. `inflation` multiplies the stated variances."""
+    """Predict the result of each set of names of changes in `sets`. `inflation` multiplies the stated variances."""
     outcomes = _Outcomes(setting, inflation)
     known = {change.name: change for change in outcomes.possible}
     return outcomes.of_all([[known[name] for name in names] for names in sets])
@@ -164,13 +164,13 @@ def _smallest(
 
 
 def _are_compatible(changes: Sequence[ExperimentChange]) -> bool:
-    """Whether changes can be combined: at most one camera rate and one motion."""
+    """Check whether changes can be combined: at most one camera rate and one other motion."""
     rates = sum(change.camera_rate is not None for change in changes)
     return rates <= 1 and sum(change.setup_change in ("motion", "travel") for change in changes) <= 1
 
 
 def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedExperimentResult]:
-    """Results sorted by identifiable parameters, then by gain; results that could not be evaluated come last."""
+    """Sort results by their number of identifiable parameters, then by gain; failed ones come last."""
     return sorted(outcomes, key=lambda entry: (not entry.verdicts, -entry.identifiable, -entry.gain))
 
 
@@ -216,7 +216,7 @@ class _Outcomes:
         return changes
 
     def of_all(self, sets: Sequence[Sequence[ExperimentChange]]) -> list[ChangedExperimentResult]:
-        """Outcomes of several sets of changes."""
+        """Return the results of several sets of changes, each computed only once."""
         keys = [frozenset(change.name for change in changes) for changes in sets]
         new = {key: changes for key, changes in zip(keys, sets, strict=True) if key not in self.known}
         if new:
@@ -271,7 +271,7 @@ class _Outcomes:
 
 
 def _relative_stds_and_gain(layout: VariantPositionSensitivities, information: Array) -> tuple[dict[str, float], float]:
-    """Relative standard deviation of every free parameter, and the gain, from the information of all unknowns."""
+    """Return the relative std of every free parameter, and the gain [nat], from the information of all unknowns."""
     problem, x = layout.problem, layout.x
     chosen = np.array([problem.unknown_names.index(name) for name in layout.free_parameters])
     others = np.setdiff1d(np.arange(len(x)), chosen)
