@@ -32,8 +32,8 @@ SHIPPED_DEFAULT_CONFIG_FILE_NAME = "dual_arm_vision.yaml"
 SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
-_ALIAS_COST = 40  # in entries: merging an alias compares its mapping with all others
-_ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
+_ALIAS_COST = 40  # of an alias in entries, because merging one compares its mapping with all others
+_ALLOWED_YAML = "keys whose values are numbers, text, true or false, [lists] or sections"
 
 
 def load_config(
@@ -41,11 +41,10 @@ def load_config(
 ) -> RunSettings:
     """Read and check the settings of a configuration file. Without `path`, the embedded file `default` is read.
 
-    Each override is `a.b=c`, a key and a value in YAML, which replaces the file's value or is added. A section in an
-    override is merged key by key with the section of the file, unless the override selects another kind or method, or
-    is empty. Raises `ConfigError` if the file is missing or is not YAML, a key is unknown or missing, or a value has
-    the wrong type or is outside its range. The error states file, line and key, what is allowed and the nearest known
-    key.
+    Each override is text such as `problem.time_step=0.005`, a key and a YAML value; it replaces the file's value or is
+    added. A section in an override is merged key by key with the section of the file, unless it selects another kind or
+    method, or is empty. Raises `ConfigError` if the file is missing or is not YAML, a key is unknown or missing, or a
+    value has the wrong type or is outside its range. The error states file, line, key, and what is allowed.
     """
     embedded = Path(str(resources.files("yid_ocp.data").joinpath("defaults", default)))
     file, origin = (embedded, "embedded default") if path is None else (Path(path), str(path))
@@ -57,7 +56,7 @@ def load_config(
 
 
 def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
-    """List the dotted setting keys that begin with `prefix`. Raises `ConfigError` if the file `path` is unreadable."""
+    """List the dotted setting keys that begin with `prefix`. Raises `ConfigError` if the file `path` cannot be read."""
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
     return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
 
@@ -80,13 +79,13 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
         data = CommentedMap()
     if not isinstance(data, CommentedMap):
         hint, allowed = "start with the file that `yid-ocp init` writes", "a mapping with sections such as `model:`"
-        raise ConfigError("the file does not hold keys and values", where=origin, allowed=allowed, hint=hint)
+        raise ConfigError("the file contains no keys with values", where=origin, allowed=allowed, hint=hint)
     places: dict[_KeyPath, str] = {}
     return _unwrap(data, (), places, origin), places
 
 
 class _CheckedParser(Parser):
-    """YAML's events, none of which asks for a type, in a text that is neither too deep nor too long."""
+    """A YAML parser that raises `ConfigError` for tags (`!name`), too many entries, or entries nested too deeply."""
 
     def __init__(self, origin: str, loader: YAML) -> None:
         super().__init__(loader)
@@ -99,7 +98,7 @@ class _CheckedParser(Parser):
         self._count += _ALIAS_COST + self._sizes.get(event.anchor, 0) if isinstance(event, AliasEvent) else 1
         if self._count > _MAX_ENTRIES:
             what = f"there are more than {_MAX_ENTRIES} entries, with aliases expanded"
-            raise self._odd(what, event, "leave entries or aliases out")
+            raise self._odd(what, event, "remove entries or aliases")
         if isinstance(event, CollectionStartEvent):
             self._begun.append((event.anchor, self._count))
         elif isinstance(event, CollectionEndEvent):
@@ -126,7 +125,7 @@ def _loaded(text: str, origin: str) -> Any:
         problem = str(error.problem or error.context).split("\n")[0]
         twice = re.match(r'found duplicate key "(.*?)"', problem)
         what = f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}"
-        hint = "remove one of the two" if twice else "check indentation, brackets and colons"
+        hint = "remove one of the two" if twice else "check indentation, brackets and colons near this line"
         raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED_YAML, hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         # errors of the YAML library on unusual text: numbers of thousands of digits, keys that are lists
@@ -135,7 +134,7 @@ def _loaded(text: str, origin: str) -> Any:
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
-    """Plain Python values instead of the YAML reader's types. Their lines are stored in `places`."""
+    """Convert the YAML reader's values to plain Python values, and store their lines in `places`."""
     if len(path) > _MAX_DEPTH:
         allowed, hint = "aliases of other entries", "replace the aliases by their content"
         raise ConfigError("an alias refers to itself", where=origin, allowed=allowed, hint=hint)
@@ -151,7 +150,7 @@ def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str)
             places[(*path, i)] = f"{origin}, line {_line(node, i)}"
         return [_unwrap(value, (*path, i), places, origin) for i, value in enumerate(node)]
     if isinstance(node, str) and "\0" in node:
-        what, allowed = "the text has a null character", "text without null characters"
+        what, allowed = "the text contains a null character", "text without null characters"
         raise ConfigError(what, where=places.get(path, origin), allowed=allowed, hint="remove the character")
     if isinstance(node, int) and node.bit_length() > 1023:
         raise ConfigError("the number is too large", where=places.get(path, origin), allowed="numbers below 1e308")
@@ -172,8 +171,8 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     key, equals, value_text = text.partition("=")
     origin = f"--set {key.strip()}"
     if not equals or not key.strip():
-        allowed, hint = "KEY=VALUE", "write for example --set problem.time_step=0.005"
-        raise ConfigError(f"'{text}' does not set anything", where="--set", allowed=allowed, hint=hint)
+        allowed, hint = "KEY=VALUE", "write, for example, --set problem.time_step=0.005"
+        raise ConfigError(f"'{text}' is not of the form KEY=VALUE", where="--set", allowed=allowed, hint=hint)
     path, hint = _key_path(RunSettings, key.strip().split("."), origin, data)
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
@@ -193,7 +192,7 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
 
 
 def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
-    """Value of a key after an override: sections of one kind are merged, other values are replaced."""
+    """Return a key's value after an override: sections of one kind are merged, other values are replaced."""
     sections = schema.section_variants_from_annotation(hint)
     merges = bool(value) and isinstance(before, dict) and isinstance(value, dict)
     if merges and sections is not None and sections.selector_key in value:
@@ -238,7 +237,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
 
 @dataclass(frozen=True)
 class _Reader:
-    """Builds settings from plain data, with the location of each value for errors."""
+    """Builds settings objects from plain data. `places` holds the location of each value for error messages."""
 
     places: Mapping[_KeyPath, str]
     origin: str
@@ -321,7 +320,7 @@ class _Reader:
 
 
 def _key_meant(name: str, keys: Sequence[str]) -> str:
-    """Suggested key for a name whose last part is missing or misspelt. Names chosen by users may contain dots."""
+    """Return a suggested key if the last part of `name` is missing or misspelt. Names of users may contain dots."""
     within, _, last = name.rpartition(".")
     close = difflib.get_close_matches(last, keys, n=1, cutoff=0.65)
     return f"did you mean '{within}.{close[0]}'?" if close else f"add a key, as in {name}.{keys[0]}"

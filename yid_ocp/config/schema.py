@@ -1,4 +1,4 @@
-"""Allowed keys of each configuration section, for the reader, for `--set` and for the JSON Schema."""
+"""Allowed keys of each configuration section, used by the reader, by `--set` and by the JSON Schema."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_erro
 class SectionVariants:
     """The alternative settings classes of a configuration section, and the key that selects one of them."""
 
-    classes: Mapping[str, type]  # by the value of the selector key; a single class under the empty name
-    selector_key: str = ""  # key that selects a class, empty without a choice
-    default_variant: str = ""  # value if the key is absent, empty if it is required
-    variant_noun: str = ""
-    is_nullable: bool = False
+    classes: Mapping[str, type]  # by value of the selector key; a single class has the empty name
+    selector_key: str = ""  # key whose value selects a class; empty if there is one class
+    default_variant: str = ""  # value of the selector key if it is absent; empty if it is required
+    variant_noun: str = ""  # word for a class in messages, such as "solver"
+    is_nullable: bool = False  # whether null is allowed instead of a section
 
     def selected_variant_name(self, raw: Any) -> Any:
-        """Return the selector key's value in the unchecked section `raw`, or `default_variant` if the key is absent."""
+        """Return the value of the selector key in the unchecked section `raw`, or `default_variant` if it is absent."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
@@ -39,7 +39,7 @@ class SectionVariants:
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
     def variants_for_entry(self, name: str, where: str) -> SectionVariants:
-        """Return the class of the entry `name` in a mapping, or all classes if another key selects the class."""
+        """Return the class for the entry `name` of a mapping if names select classes; otherwise return all classes."""
         if self.selector_key != "name":
             return self
         if name not in self.classes:
@@ -47,7 +47,7 @@ class SectionVariants:
         return SectionVariants({"": self.classes[name]})
 
     def unknown_variant_error(self, word: object, where: str) -> ConfigError:
-        """Make the error for a missing or unknown value of the key that selects a settings class."""
+        """Make the error for a missing or unknown value `word` of the selector key."""
         if not word:
             what = f"the key '{self.selector_key}' is missing"
             hint = f"add {self.selector_key}: {next(iter(self.classes))}"
@@ -57,7 +57,7 @@ class SectionVariants:
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
-    """Return the settings classes that the type annotation `hint` allows, or None if there are none."""
+    """Return the settings classes that the type annotation `hint` allows, or None if it allows no section."""
     bare, markers = options.split_annotated(hint)
     nullable = type(None) in get_args(bare)
     among = next((marker for marker in markers if isinstance(marker, options.RegistryChoice)), None)
@@ -72,7 +72,7 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
 
 
 def unknown_key_error(name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
-    """Make the error for an unknown key. It suggests the nearest `known` key and the sections that have this key."""
+    """Make the error for an unknown key `name`. It suggests the nearest `known` key, and sections that have the key."""
     known = list(known)
     homes, near = list(dict.fromkeys(_sections_with_key(RunSettings, name))), nearest_name_question(name, known)
     hints = [near] if near else []
@@ -86,7 +86,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
 
 
 def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
-    """Yield the ways to complete a partly typed settings key, up to the next dot or the `=` before a value.
+    """Yield the completions of a partly typed settings key, up to the next dot or to the `=` before a value.
 
     `prefix` is the typed key. `hint` is the type of the value at the key `at`, which ends with a dot. `raw` is the
     file's value at `at`; it supplies names that users choose.
@@ -112,7 +112,7 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
 
 
 def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
-    """Yield descriptions of the sections that have a key. NAME represents a name chosen by the user."""
+    """Yield descriptions of the sections that have the key `name`. NAME represents a name that users choose."""
     for inner, step in ((options.mapping_value_type(hint), ".NAME"), (options.variadic_tuple_entry_type(hint), "")):
         if inner is not None:
             yield from _sections_with_key(inner, name, at + step)
@@ -129,7 +129,7 @@ def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
 
 
 def config_json_schema() -> dict[str, Any]:
-    """Build the JSON Schema of a configuration file as plain data."""
+    """Return the JSON Schema of configuration files as plain data."""
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "yid-ocp configuration"}
     return head | _described_schema(RunSettings)
 

@@ -1,7 +1,7 @@
 """Settings of a run, with one frozen dataclass for each section of a configuration file.
 
-Options of solvers, problem, sensors, cables, tracking and diagnosis are defined in their own modules (see
-`yid_ocp.options`). The sections here contain these classes.
+Options of solvers, problem, sensors, cables, tracking and diagnosis are classes in other modules; the sections here
+contain them. `yid_ocp.options` describes how an option is declared.
 """
 
 from __future__ import annotations
@@ -283,7 +283,7 @@ class ProblemSettings(ProblemOptions):
 
     @property
     def time_step_or_10_ms(self) -> float:
-        """The configured time step [s], or 10 ms for `auto`, which needs a recording to choose the step."""
+        """The configured time step [s]; 0.01 if it is `auto`, which needs a recording to choose the step."""
         return 0.01 if self.time_step == "auto" else self.time_step
 
 
@@ -308,7 +308,7 @@ class DiagnosisSettings(Thresholds):
 
     @property
     def fit_excess_residual_criteria(self) -> ExcessResidualCriteria:
-        """The limits of the null test on the residual after a fit, in units of the stated standard deviations."""
+        """The criteria by which the residual after a fit exceeds noise, with `noise_fraction_of_stated_std` applied."""
         return replace(self.null_test_excess_criteria, noise_fraction_of_stated_std=self.noise_fraction_of_stated_std)
 
 
@@ -441,12 +441,12 @@ class RunSettings:
     )
     output: Annotated[OutputSettings, OptionInfo("run folders and reports")] = OutputSettings()
     name: str = "run"  # stem of the configuration file
-    config_file: str = field(default="", compare=False)  # its path, empty for none
+    config_file: str = field(default="", compare=False)  # path of the configuration file, empty without one
     # file and line of every key, for error messages
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def setting_location(self, *path: str | int) -> str:
-        """Return the place of a setting (file, line and key), for the `where` of an error message."""
+        """Return the place of a setting (file, line and key) as text, for the `where` of an error message."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
             if path[:count] in self.key_locations:

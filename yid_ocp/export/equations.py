@@ -1,4 +1,4 @@
-"""Export of a step's equations as CasADi functions with C code."""
+"""Export of the equations of a time step as CasADi functions and as C code."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from yid_ocp.files import atomic_write, make_folder, write_strict_json, write_te
 from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 
-_MAX_JACOBIAN_OPERATIONS = 60_000  # operations; longer C keeps a compiler busy for minutes
+_MAX_JACOBIAN_OPERATIONS = 60_000  # operations; longer C code takes minutes to compile
 _ARGUMENT_NAMES = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
 
 
 def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, ...]:
-    """The CasADi functions that `export_step_functions` writes.
+    """Return the CasADi functions that `export_step_functions` writes.
 
-    `rows` (del, internal, constraint, p1), `rows_by_theta` and, if not too large, `rows_by_unknowns` (q1, z1, lam) take
-    `_ARGUMENT_NAMES`. `points` maps (q, theta) to positions of points [m], `mechanics` (q, v, theta) to mass matrix,
-    dL/dq and dL/dv. The last two set internal coordinates to zero.
+    The functions `rows` (del, internal, constraint, p1), its Jacobian `rows_by_theta` and, if not too large, its
+    Jacobian `rows_by_unknowns` (by q1, z1, lam) have the arguments `_ARGUMENT_NAMES`. `points` maps (q, theta) to
+    positions of points [m], `mechanics` (q, v, theta) to mass matrix, dL/dq, dL/dv. Both set internal coordinates to 0.
     """
     e, system = symbols.equations, symbols.equations.system
     names, blocks = zip(*((block.name, block.expressions) for block in symbols.row_blocks), strict=True)
@@ -52,8 +52,8 @@ def export_step_functions(
 ) -> tuple[Path, ...]:
     """Write a step's CasADi functions as `NAME.casadi` files and as `equations.c`, and return the written files.
 
-    `names.json` contains the parameters' names and values `theta`, and the time step [s]. `folder` is created if
-    absent. Raises `OutputError` if the folder or a file cannot be written.
+    `names.json` contains all names, the values `theta` (ntheta,) of the parameters, and the time step [s]. `folder` is
+    created if absent. Raises `OutputError` if the folder or a file cannot be written.
     """
     folder, functions, written = make_folder(folder), _exported_step_functions(symbols), []
     for function in functions:

@@ -1,4 +1,4 @@
-"""Export of a system as URDF or SDF, with a list of the parameters and effects that a format can express."""
+"""Export of a system as URDF or SDF, and how well a format supports its parameters and effects."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
 
 
 def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
-    """Convert a system to URDF text with damping, friction and inertias. Springs and grasps are omitted.
+    """Convert a system with parameter `values` by name to URDF text. Springs and grasps are omitted.
 
-    A `mujoco` element sets the minimum masses that MuJoCo requires. Other readers ignore it.
+    A `mujoco` element sets the minimum masses that MuJoCo requires. Other readers of URDF ignore it.
     """
     tree, terms = _tree(system, values)
     root = ElementTree.fromstring(mechanism_to_urdf(tree))
@@ -67,7 +67,7 @@ def _xml_text(root: Element) -> str:
 
 
 def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, mjcf.JointDynamicsTerms]]:
-    """The tree with numbers and without separate weights of bodies, and the dynamics of its joints."""
+    """Return the mechanism with numbers and without separate weights of bodies, and the dynamics of its joints."""
     tree = system.numeric_mechanism(values).with_gravity_fraction(None)
     return tree, mjcf.system_joint_dynamics_terms(system, mjcf.ExpressionEvaluator(system, values))
 
@@ -115,19 +115,19 @@ def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class FeatureExportSupport:
-    """The support of an export format for a parameter or effect: the element that holds it, or the obstacle."""
+    """How a format supports a parameter or effect: the status, and the element that holds it or the reason."""
 
     status: _SupportStatus
     how: str
 
     @property
     def loses_motion_or_force(self) -> bool:
-        """True if the format omits a feature that changes motion or forces. Effects on sensors alone do not count."""
+        """True if the format omits a feature that changes motion or forces. Effects on sensor readings do not count."""
         return self.status == "not representable" and self != _READING
 
 
 def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
-    """The worst status of several parts, with the explanations of the parts that have it."""
+    """Return the worst status of several parts, with the explanations of the parts that have it."""
     status = max((part.status for part in parts), key=get_args(_SupportStatus).index)
     return FeatureExportSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
 
@@ -137,19 +137,19 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
     if aspect == "reading":
         return _READING
     if form not in known:
-        return FeatureExportSupport("not representable", f"{form.upper()} has nothing for {known['is']}")
+        return FeatureExportSupport("not representable", f"{form.upper()} has no element for {known['is']}")
     return FeatureExportSupport("emulated" if aspect in mjcf.MUJOCO_APPROXIMATED_ASPECTS else "native", known[form])
 
 
 _READING = FeatureExportSupport(
     "not representable", f"{mjcf.format_elements_by_model_aspect()['reading']['is']}: correct the readings instead"
 )
-_NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is left out")
-_UNUSED = FeatureExportSupport("native", "it enters nothing in this model")
+_NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is omitted")
+_UNUSED = FeatureExportSupport("native", "it has no influence on this model")
 
 
 def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
-    """Return how well the export format `form` (`mjcf`, `urdf` or `sdf`) supports each effect of a system."""
+    """Return by label `kind@location` how well the format `form` (`mjcf`, `urdf` or `sdf`) supports each effect."""
     value, found = mjcf.ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:

@@ -30,10 +30,10 @@ _WORLD_FRAME = "world"
 
 @dataclass(frozen=True)
 class RosTopicTimeSeries:
-    """The time series of one ROS topic at the times t (M,) [s]. A time without any finite value gets no message.
+    """The time series of one ROS topic at the times t (M,) [s]. A time without finite values gets no message.
 
-    `values` holds `position`, `velocity` and `effort` of joints, each (M, len(names)), or, for any other kind, `xyz`
-    (M, 3), which are the forces of a wrench.
+    For the kind `joints`, `values` holds `position`, `velocity` and `effort`, each (M, len(names)). For other kinds it
+    holds `xyz` (M, 3): position, vector, or force of a wrench.
     """
 
     topic: str
@@ -47,8 +47,8 @@ class RosTopicTimeSeries:
 def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[str]) -> float:
     """Write the ROS time series `signals` to one MCAP file with message definitions, sorted by time.
 
-    Returns a shift [s] of whole seconds that was added to all times, because stamps cannot be negative; it is usually
-    zero. Raises `OutputError` if `rosbags` is not installed, there is nothing to write, or the file cannot be written.
+    Returns the shift [s] that was added to all times: whole seconds that make them non-negative, usually zero. Raises
+    `OutputError` if `rosbags` is not installed, if there are no samples, or if the file cannot be written.
     """
     path = Path(path)
     try:
@@ -58,7 +58,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
         raise missing_package_error(OutputError, "writing MCAP needs the package rosbags", "bags") from None
     if not any(len(signal.t) for signal in signals):
         what, hint = "the signals have no samples", "export a recording or run that has samples"
-        raise OutputError(what, where=str(path), allowed="one sample or more", hint=hint)
+        raise OutputError(what, where=str(path), allowed="signals with one sample or more", hint=hint)
     store = get_typestore(Stores.ROS2_HUMBLE)
     first = min(float(np.min(signal.t)) for signal in signals if len(signal.t))
     shift = float(max(0.0, -np.floor(first)))
@@ -77,7 +77,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
             with atomic_write(path) as temporary:
                 os.replace(file, temporary)
     except OSError as error:
-        what, hint = f"the file cannot be written: {os_error_reason(error)}", "choose another folder, or free space"
+        what, hint = f"the file cannot be written: {os_error_reason(error)}", "choose another folder or free space"
         raise OutputError(what, where=str(path), hint=hint) from error
     return shift
 
@@ -127,16 +127,16 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
 
 
 def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write each group of a recording as a table `<group>.csv` with all digits, which `read_csv` can read.
+    """Write each group of a recording as a table `GROUP.csv` with all digits, which `read_csv` can read.
 
     The tables omit standard deviations, the kind of effort, sensor, frame, pose and clock. The cells of an unseen point
-    are empty. Returns the files, joints first. Raises `OutputError` if a file exists or cannot be written.
+    are empty. Returns the written files, joints first. Raises `OutputError` if a file exists or cannot be written.
     """
     folder, groups = make_folder(folder), recording.joint_and_point_groups
     written = [folder / f"{'joints' if isinstance(group, JointGroup) else group.name}.csv" for group in groups]
     for target in written:
         if target.exists():
-            what, allowed = f"{target.name} exists and is not overwritten", "a folder without the files to be written"
+            what, allowed = f"{target.name} exists and is not overwritten", f"a folder without {target.name}"
             raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another --out, or remove the file")
     for group, target in zip(groups, written, strict=True):
         if isinstance(group, JointGroup):
@@ -155,9 +155,9 @@ def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[s
 def joint_trajectory_message(
     names: Sequence[str], t: Array, position: Array, velocity: Array, acceleration: Array, effort: Array
 ) -> dict[str, Any]:
-    """Build a ROS trajectory_msgs/JointTrajectory message for nj joints, as a dictionary.
+    """Return a ROS trajectory_msgs/JointTrajectory message for nj joints as a dictionary.
 
-    Times t (N,) [s] count from the start; the other arrays are (N, nj). See
+    Times t (N,) [s] count from the start of the motion; the other arrays are (N, nj) in SI units. See
     https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html
     """
     points = []
