@@ -240,7 +240,7 @@ def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tm
     prior = np.sqrt([smoothed.group_variance[source] for source in trace.unknown_groups])
     vague = replace(trace, posterior_std=np.broadcast_to(0.9 * prior, trace.posterior_std.shape))
     page = page_of(replace(finding, smoother_result=replace(smoothed, smoothed_unknowns=(vague,))), tmp_path)
-    assert "value in standard deviations expected beforehand" in page
+    assert "value in standard deviations of its prior" in page
     assert "The picture is only a hint." in text_of(page)
 
 

@@ -142,7 +142,7 @@ def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(
     entry = {"recording": "r", "rmse": {channel: error}, "baselines": {"stays": {channel: 0.03}}}
     residuals = {channel: {"rmse": 0.0018, "unit": "m", "n": 9}}
     lines = told("yid-solve/1", solved(fit=fit, residuals=residuals, held_out=[entry | {"expected": {channel: noise}}]))
-    head = f"held-out errors of points are {1e3 * error:.3g} mm (rms), beside 1.8 mm on the fitted recordings, and 30"
+    head = f"held-out errors of points are {1e3 * error:.3g} mm (rms), 1.8 mm on the fitted recordings, and 30"
     text = " ".join(line.strip() for line in lines[:5])
     assert (head in text) == (said is not None)
     assert said is None or said in text
@@ -161,9 +161,9 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
-    said = "these move by more than the data's standard deviation"
+    said = "these estimates change by more than their standard deviation"
     at = lines.index(f"with twice the links {said}: p.a by -5.5 (± 0.073 from the data)")
-    same = "with half the time step no estimate moves by more than its standard deviation"
+    same = "with half the time step no estimate changes by more than its standard deviation"
     assert lines[at + 1 : at + 3] == [same, "it snaps"]
     moved = {name: own | {"links": None} for name, own in moved.items()}
     assert not any("twice the links" in line for line in told("yid-solve/1", solved(discretisation=moved)))
@@ -187,7 +187,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
     lines = told("yid-compare/1", compared(methods={"single_shooting": doubtful}, judged=sure, disturbed=True))
-    assert lines[0].startswith("the noise that drives the motion is ignored by single_shooting: no value of theirs is")
+    assert lines[0].startswith("values by single_shooting are not trusted, as they ignore the noise that drives the")
     assert lines[1] == "a is 9 ± 0.1 N m/rad, not 7 (single_shooting)"
     assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "solve", "verdict"]
     assert "a          7                9 ± 0.1  found" in lines
@@ -199,7 +199,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
-    assert "with no set of up to three changes can all of them be found" in lines
+    assert "no set of up to three changes makes it possible to find all parameters" in lines
     assert lines[-1] == "none of 1 parameters can be found from these recordings"
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     assert "fewest changes with which all of them can be found: a weld" in told("yid-identifiability/1", result)

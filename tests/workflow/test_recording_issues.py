@@ -45,7 +45,7 @@ def noisy(recording):
 
 def test_a_run_on_good_recordings_says_nothing(damaged, carried_out):
     done = carried_out("solve", damaged(), "--strict", settings=["output.write_report=false"])
-    assert "in doubt" not in done.out
+    assert "times its limit" not in done.out
     assert (done.result["doubts"], done.result["fit"]["believed"]) == ([], True)
     assert done.result["parameters"]["shoulder.stiffness"]["verdict"] == "identifiable"
 
@@ -57,11 +57,11 @@ def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, carried_out
     assert not result["fit"]["believed"]
     free = [entry for entry in result["parameters"].values() if entry["free"]]
     assert {entry["verdict"] for entry in free} <= {"not_trusted", "not_identifiable"}
-    assert any(line.split("  ")[0] == "in doubt" for line in done.out.splitlines()[:6])
-    for words in ("no value counts as found while a recording", "sensors.joints.effort.std: 0.1"):
+    assert any(line.split("  ")[0] == "issue" for line in done.out.splitlines()[:6])
+    for words in ("no value counts as found, because a recording", "sensors.joints.effort.std: 0.1"):
         assert words in done.out
     page = (done.folder / "report.html").read_text()
-    assert "<h3>In doubt</h3>" in page
+    assert "<h3>Issues of the recordings</h3>" in page
     assert "more noise than stated" in page
 
 

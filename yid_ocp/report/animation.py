@@ -23,10 +23,10 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes_by_joint, mesh_sources_sha256
 
-_MAX_FRAMES = 150  # largest number of frames on a page, interpolated linearly
+_MAX_FRAMES = 150  # largest number of frames of an animation; the page interpolates linearly between them
 _PUSHED_POINT = "75%"  # location on a segment at which an unknown push is drawn
-_ARM_RADIUS = 0.03  # how thick an arm is drawn [m]
-_POSITION_SCALE = 1e4  # positions are integers in 0.1 mm
+_ARM_RADIUS = 0.03  # radius with which an arm is drawn [m]
+_POSITION_SCALE = 1e4  # from [m] to integers in 0.1 mm
 _MAX_MESH_FACES = {True: 6000, False: 4000}  # largest number of triangles on a page, for moving and fixed links
 _FIRST_MESH_CELL, _CELL_GROWTH = 0.004, 1.3  # edge of the cubes in which vertices are merged [m], and its growth factor
 _QUATERNION_SCALE = 1e4
@@ -43,12 +43,11 @@ class _Stick:
 
 @dataclass(frozen=True)
 class _AnimatedMotion:
-    """Motion of one stick figure, measured or predicted.
+    """Motion of one stick figure over F frames, measured or predicted.
 
-    `positions` (F, K, 3) [m] are NaN where unknown. `point_indices` are the points that a sensor measures;
-    `is_new_measurement` (F, number of points) separates new measurements from held ones. `acting` lists applied forces
-    as (label, point index or -1, unit, values (F, k)). `arm` holds system, parameters and configurations (F, n) for
-    meshes.
+    `positions` (F, K, 3) [m] are NaN where unknown. `point_indices` are the points that a sensor measures by name;
+    `is_new_measurement` (F, points) is False where an earlier measurement is still shown. `acting` lists applied forces
+    as (label, point index or -1, unit, values (F, k)). `arm` is (system, parameters, configurations (F, n)) for meshes.
     """
 
     name: str
@@ -74,7 +73,7 @@ class _AnimatedMotion:
 
 @dataclass(frozen=True)
 class AnimationData:
-    """The data of one animation: several motions on a common time axis t (F,) [s]."""
+    """The data of one animation: several motions at common times t (F,) [s]."""
 
     title: str
     t: Array
@@ -82,10 +81,10 @@ class AnimationData:
 
 
 def animations_to_dict(scenes: Sequence[AnimationData], robot: str | None = None) -> dict[str, Any]:
-    """Convert scenes to JSON-ready data, with meshes by joint. Positions are integers in 0.1 mm, null if unknown.
+    """Convert scenes to data for JSON, with meshes by joint. Positions are integers in 0.1 mm, null if unknown.
 
-    The meshes of the robot's URDF are drawn on the arm of a scene's last model or, in a scene without a model, on the
-    arm's measured motion. If no mesh can be read, the arm is drawn as sticks.
+    The meshes of the URDF `robot` follow the arm of a scene's last model or, in a scene without a model, the measured
+    motion of the arm. If no mesh can be read, the arm is drawn as sticks.
     """
     meshes: dict[str, list[list[int]]] | None = None
     made = []
@@ -102,9 +101,9 @@ def animations_to_dict(scenes: Sequence[AnimationData], robot: str | None = None
 
 
 def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[list[int]]]:
-    """Vertices and faces of a robot's thinned meshes by the joint that carries them, "" for what does not move.
+    """Return vertices and faces of a robot's thinned meshes by the joint that carries them ("": fixed parts).
 
-    Reading and thinning takes a second: the user's cache keeps them for the same files, mounted in the same way.
+    Reading and thinning takes a second, so the user's cache keeps them for the same files and mounting.
     """
     with contextlib.suppress(OSError, YidError, SyntaxError):  # the last of a damaged URDF
         if robot is None or "<visual" not in read_input_text(urdf_path_from_robot_name(robot)):
@@ -129,7 +128,7 @@ def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[l
 
 
 def _thinned(found: dict[int, TriangleMesh]) -> dict[int, TriangleMesh]:
-    """Meshes by joint with merged vertices, so that those that move and those that do not have few enough faces."""
+    """Return meshes by joint with merged vertices, so that moving and fixed meshes have few enough faces each."""
     for moving, most in _MAX_MESH_FACES.items():
         own, cell = {j: mesh for j, mesh in found.items() if (j >= 0) == moving}, _FIRST_MESH_CELL
         while sum(len(mesh.faces) for mesh in own.values()) > most:
@@ -140,7 +139,7 @@ def _thinned(found: dict[int, TriangleMesh]) -> dict[int, TriangleMesh]:
 
 
 def _with_merged_vertices(mesh: TriangleMesh, cell: float) -> TriangleMesh:
-    """A mesh whose vertices in each cube of edge `cell` [m] are merged to their mean, without degenerate faces."""
+    """Return a mesh whose vertices in each cube of edge `cell` [m] become their mean, without degenerate faces."""
     cubes = np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64)
     _, index = np.unique(cubes @ np.cumprod([1, *(cubes.max(0)[:2] + 1)]), return_inverse=True)
     means = np.column_stack([np.bincount(index, x) for x in mesh.vertices.T]) / np.bincount(index)[:, None]
@@ -151,7 +150,7 @@ def _with_merged_vertices(mesh: TriangleMesh, cell: float) -> TriangleMesh:
 
 
 def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -> list[list[int]]:
-    """Position and quaternion (x, y, z, w) of joints at configurations (F, n), as integers, one row per frame."""
+    """Return scaled integer positions and quaternions (x, y, z, w) of joints at configurations q (F, n), by frame."""
     if not names:
         return []
     (symbols, moved), index = system.symbols_and_kinematics, system.mechanism.joint_index
@@ -166,10 +165,10 @@ def _joint_poses(system: System, theta: Array, q: Array, names: Sequence[str]) -
 
 @dataclass(frozen=True)
 class ConfigurationTrajectory:
-    """A trajectory of a model, with configurations q (N, n) at times t (N,) [s].
+    """A trajectory of a model: parameters theta, configurations q (N, n) at times t (N,) [s].
 
     `acting` lists the applied forces and effects to draw: label, location (joint, segment, grasp or frame), unit and
-    values (N, k). Values are vectors in world axes (k = 3) or scalars (k = 1). Effects have no values.
+    values (N, k). Values are vectors in world axes (k = 3) or scalars (k = 1). For an effect k is 0.
     """
 
     name: str
@@ -180,12 +179,12 @@ class ConfigurationTrajectory:
     acting: Sequence[tuple[str, str, str, Array]] = ()
 
     def _q_at(self, t: Array) -> Array:
-        """Configurations (F, n) at other times, by linear interpolation."""
+        """Return configurations (F, n) at other times t (F,), interpolated linearly."""
         return np.stack([np.interp(t, self.t, column) for column in self.q.T], axis=1)
 
 
 def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _AnimatedMotion:
-    """Joints, tips and points of a system at configurations q (F, n), and the lines between them."""
+    """Return joints, tips and points of a system at configurations q (F, n), and the sticks between them."""
     system, tree = told.system, told.system.mechanism
     (symbols, kinematics), names = system.symbols_and_kinematics, tree.joint_names
     owned = _link_radii(system, told.theta)
@@ -233,7 +232,7 @@ def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _Animate
 
 
 def _acting_place(system: System, location: str) -> str | int | None:
-    """Index of the joint, or name of the frame, at which a location is drawn; None if it has no position."""
+    """Return the joint's index or the frame's name at which a location is drawn, or None if it has no position."""
     if location in system.mechanism.joint_names:
         return system.mechanism.joint_index(location)
     held = {grasp.name: grasp.held_frame for grasp in system.grasps}
@@ -247,7 +246,7 @@ def _acting_place(system: System, location: str) -> str | int | None:
 
 
 def _link_radii(system: System, theta: Array) -> dict[str, float]:
-    """Radius of the links carried by each joint of the object [m]."""
+    """Return the radius [m] of the links that each joint of the object carries."""
     tree, layouts = system.mechanism, system.segment_layouts
     evaluate = ca.Function("radii", [system.parameters.symbols], [ca.vertcat(*(layout.radius for layout in layouts))])
     radii = np.array(evaluate(theta)).ravel().tolist() if layouts else []
@@ -262,7 +261,7 @@ def _link_radii(system: System, theta: Array) -> dict[str, float]:
 
 
 def _shown_frames(system: System) -> list[str]:
-    """Tips of links, points of sensors, both sides of grasps, and the arms' end frames."""
+    """Return the frames to draw: tips of links, points of sensors, both sides of grasps, and end frames of arms."""
     tree = system.mechanism
     tips = [f"{layout.name}_{i}_tip" for layout in system.segment_layouts for i in range(len(layout.link_joints))]
     sides = [frame for grasp in system.grasps for frame in (grasp.holder_frame, grasp.held_frame)]
@@ -278,9 +277,9 @@ def animation_of_trajectories(
     recording: Recording | None = None,
     goal: Array | None = None,
 ) -> AnimationData:
-    """Animate model trajectories, the recorded motion and a `goal` (3,). The first trajectory sets times and joints.
+    """Return the animation of model trajectories, of a recording and of a `goal` position (3,) [m], if given.
 
-    The recorded points are drawn, and the recorded arms if joint angles were recorded. At most `_MAX_FRAMES` frames.
+    The first trajectory sets the times (at most `_MAX_FRAMES`). Recorded points and arms are drawn, too.
     """
     t = _frame_times(trajectories[0].t)
     motions = [_model_motion(entry, t, entry._q_at(t)) for entry in trajectories]
@@ -294,9 +293,9 @@ def animation_of_trajectories(
 def recording_animation(
     title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
 ) -> AnimationData | None:
-    """Animate a recording alone, without predictions. None if the recording holds no positions.
+    """Return the animation of a recording without predictions, or None if the recording holds no positions.
 
-    With `has_straight_object`, the model at the recorded angles is drawn too, with an undeformed object.
+    With `has_straight_object`, the model at the recorded angles is drawn, too, with an undeformed object.
     """
     clock = max((group.t for group in recording.joint_and_point_groups), key=len)
     told = ConfigurationTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
@@ -310,7 +309,7 @@ def recording_animation(
 
 
 def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t: Array) -> Array:
-    """Configurations (F, n) at times t, with the recorded joint angles."""
+    """Return configurations (F, n) at times t (F,), with the recorded joint angles."""
     q, joints = told._q_at(t), recording.joints
     for name, column in () if joints is None else zip(joints.names, joints.position.T, strict=True):
         if name in told.system.mechanism.joint_names:
@@ -320,7 +319,7 @@ def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t
 
 
 def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Array) -> _AnimatedMotion:
-    """Recorded arms and points at times t; a point is shown for half a sample period after its measurement."""
+    """Return recorded arms and points at times t (F,). A point is shown up to half a sample period from its sample."""
     system, joints = told.system, recording.joints
     moved = {*system.driven, *system.prescribed}
     sticks: list[_Stick] = []

@@ -1,4 +1,4 @@
-"""Summaries of a diagnosis, of a blind validation, and of several methods or runs side by side."""
+"""Summaries of a diagnosis, of a blind test, of a batch, and of comparisons of methods or runs."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from yid_ocp.report.terminal import (
     torque_offset_table_rows,
 )
 
-_MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # smallest share of the gap, and largest number of windows, that are listed
-_MAX_CANDIDATES = 15  # candidates that are listed; result.json has them all
-_MAX_TERMINAL_PARAMETERS = 6  # parameters that have a column of their own on a terminal; result.json has all
+_MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # smallest listed share of the gap, and largest number of listed time windows
+_MAX_CANDIDATES = 15  # largest number of listed candidates; result.json has all
+_MAX_TERMINAL_PARAMETERS = 6  # largest number of parameters with a column on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak", None)
-"""Verdicts of parameters whose values count; None for the parameters of a diagnosis."""
-_MAX_RUN_DIFFERENCE = 2  # between two runs, from which on a parameter is named [std]
+"""Verdicts of parameters whose values are shown. A parameter of a diagnosis has the verdict None."""
+_MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
 @register_summary("yid-diagnosis/2")
@@ -66,25 +66,25 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    yield "refitted candidates come first; closure alone is the part of the held-out gap that a refit with one closes"
-    yield "the others follow by score: their significance before a refit; p is the probability of it by noise alone"
+    yield "refitted candidates come first; closure alone: part of the held-out gap that a refit with this one closes"
+    yield "the others are ordered by score (significance before a refit); p: probability of such a score by noise alone"
     left = len(result["which"]) - _MAX_CANDIDATES
     yield f"{left} more candidates are in result.json" if left > 0 else ""
     yield f"not detectable in these recordings: {', '.join(result['unseen'])}" if result.get("unseen") else ""
     for signals, kinds in result.get("not_candidates", {}).items():
-        yield f"no candidates, as nothing was recorded of {signals}: {', '.join(kinds)}"
+        yield f"no candidates, because no recording has {signals}: {', '.join(kinds)}"
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
         moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
         rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
     yield SummaryTable(rows, "Since the baseline")
-    rows = [("channel", "made", "without a diagnosis", "effects removed or added", "unit")]
+    rows = [("channel", "recorded", "without a diagnosis", "effects removed or added", "unit")]
     for key, made in (("removed", "without the effects"), ("added", "with the effects")):
         for channel, entry in (result.get("counterfactual") or {}).get(key, {"rmse": {}})["rmse"].items():
             sizes = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
             rows.append((channel, made, *sizes, entry["unit"]))
-    yield SummaryTable(rows, "Without the effects, and with them")
+    yield SummaryTable(rows, "Errors on recordings made without and with the effects")
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     if any(own["weight"] != "warning" for own in result.get("doubts", ())):
         yield "issues of the recordings may have caused this verdict"
@@ -126,16 +126,16 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
     said = [f"{count} {'case' if count == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
     if right["of"]:
-        said.append(f"of {right['of']} gaps found, {right['count']} were named right: kind and place first")
+        said.append(f"of {right['of']} gaps found, {right['count']} had the true kind and place as first answer")
     if result.get("not_judged"):
-        said.append(f"{result['not_judged']} not judged: these thresholds ask for refits that were not made")
+        said.append(f"{result['not_judged']} not judged: these thresholds require refits that were not made")
     if alarms["of"]:
         said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
 def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
-    """Write the tables of a `yid-blind/1` result as Markdown, separated by empty lines."""
+    """Return the tables of a `yid-blind/1` result as lines of Markdown, separated by empty lines."""
     lines: list[str] = []
     for head, *rows in (table.rows for table in _blind_tables(result)):
         lines += ["", *(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))]
@@ -143,7 +143,7 @@ def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
 
 
 def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
-    """Score, detection by size, experiments, cases, and thresholds if they were calibrated."""
+    """Return the tables of the score, detection by size, experiments, cases and, if calibrated, thresholds."""
     sure = {name: _rate(own) for name, own in result["intervals"].items()}
     marks: TableRows = [
         ("what", "value, and its binomial 95 % interval"),
@@ -249,7 +249,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable([*_consistency_rows(alike)], "Each run against the others")
         drifted, wrong = _drifted_and_distrusted(alike)
         changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
-        said.append(changed if drifted else "No parameter differs among the runs by more than they state.")
+        said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
         said += [f"Distrust {', '.join(wrong)}: without it the others agree (far) better."] if wrong else []
     yield from (SummaryStatement(text, "verdict") for text in said)
 
@@ -293,8 +293,8 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (SummaryStatement(text, "conclusion") for text in _objections_to_agreement(result))
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
-    yield SummaryTable([*_effort_rows(methods)], "What it took")
-    yield "cost compares methods; chi2 compares each with noise, by the degrees of freedom at its own estimate"
+    yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
+    yield "cost compares the methods with each other; chi2 per degree of freedom compares each with noise (1: noise)"
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
@@ -304,13 +304,13 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
-    """Sentences on errors of the methods' answers; empty if the answers agree and the agreement is meaningful."""
+    """Yield sentences on why the methods' estimates cannot be trusted; none if they agree and this is meaningful."""
     methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
     free = {name: entry for name, entry in own.items() if entry["free"]}
     found = {name: entry for name, entry in free.items() if entry["verdict"] == "identifiable"}
     if result["disturbed"]:
-        words = f"the noise that drives the motion is ignored by {', '.join(methods)}: no value of theirs is trusted"
-        yield f"{words}; `solve` counts it, and verdict and ± are those of its column"
+        words = f"values by {', '.join(methods)} are not trusted, as they ignore the noise that drives the motion"
+        yield f"{words}; `solve` includes it, and verdict and ± are those of its column"
         for name, entry in found.items():
             values = {method: one["parameters"][name]["value"] for method, one in methods.items()}
             off = {m: v for m, v in values.items() if abs(v - entry["value"]) > 2 * (entry["std"] or 0.0)}
@@ -383,10 +383,10 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
     if not drifted and result["p_value"] >= result["level"]:
         p = _relation(result["p_value"])
-        yield f"No parameter changed: all {len(runs)} runs agree within what they state (p {p})."
+        yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
     elif not drifted:
-        differ = f"Together the runs differ (p {_relation(result['p_value'])}), though no parameter alone does"
-        yield f"{differ}: look at what they have in common."
+        differ = f"The runs differ over all parameters together (p {_relation(result['p_value'])})"
+        yield f"{differ}, although no single parameter does significantly."
     for name in drifted:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
@@ -401,7 +401,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     poor = [entry["name"] for entry in runs if not entry["explains"]]
     if poor:
         text = f"The model did not explain the recordings of {', '.join(poor)}"
-        yield f"{text}: the ± there counts the misfit and may still be too small."
+        yield f"{text}: their ± includes the misfit and may still be too small."
 
 
 def _relation(p_value: float) -> str:

@@ -1,7 +1,7 @@
 """Plotly figures of the report: plots over time, curves, and plots with one row for each name.
 
-A figure is plain data, the traces `data` and the `layout`, as plotly's script reads it; plotly's Python objects take
-longer to make than all else of a page.
+A figure is a dictionary with the traces `data` and the `layout`, as Plotly's script reads it. Plotly's Python objects
+are not used, because making them takes longer than the rest of a page.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _LINE_DASHES, _SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "diamon
 BEFORE_COLOR, AFTER_COLOR, MEASURED_COLOR = LINE_PALETTE[1], LINE_PALETTE[0], "#8d99a4"
 _DIVERGING_COLORS = ("#2166ac", "#92c5de", _BACKGROUND_COLOR, "#f4a582", "#b2182b")
 _SEQUENTIAL_COLORSCALE = ((0.0, _BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
-_MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
-_MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
+_MAX_CURVE_POINTS = 1200  # largest number of points of a curve; more are not visible and enlarge the page
+_MAX_SINGLE_PRECISION_TIME = 1e4  # at larger times single precision is too coarse for milliseconds [s]
 _ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # of a figure with rows [px]
 _TOP_MARGIN, _BOTTOM_MARGIN = 70, 44  # [px]
 _SHADE = {"fillcolor": _GRID_COLOR, "opacity": 0.7, "line": {"width": 0}, "layer": "below"}
@@ -52,7 +52,7 @@ def _line_color(i: int) -> str:
 
 
 def figure_html(figure: _Figure) -> str:
-    """Convert a figure to an HTML element. The page's script draws it in light or dark colors."""
+    """Convert a figure to an HTML element, which the page's script draws in light or dark colors."""
     told = json.dumps(_plotly_json(figure), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     told = told.replace("^2", "²").replace("^3", "³")
     script = f'<script type="application/json">{told}</script>'
@@ -60,7 +60,7 @@ def figure_html(figure: _Figure) -> str:
 
 
 def _plotly_json(value: Any) -> Any:
-    """JSON data of a figure, with arrays as plotly's script reads them: base64, with their type."""
+    """Return a figure as data for JSON, with arrays as Plotly's script reads them: base64 text and number type."""
     if isinstance(value, Mapping):
         return {key: _plotly_json(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
@@ -69,7 +69,7 @@ def _plotly_json(value: Any) -> Any:
 
 
 def _styled_figure(height: int, x: str, y: str) -> _Figure:
-    """A figure with height [px], axis titles, and the report's colors and fonts."""
+    """Return an empty figure with a height [px], titles `x` and `y` of its axes, and the report's colors and fonts."""
     titles = {"x": {"text": x, "standoff": 6}, "y": {"text": y, "standoff": 6}}
     axes = {f"{name}axis": {"title": title, **_AXIS_STYLE} for name, title in titles.items()}
     return {"data": [], "layout": {**_LAYOUT, "height": height, **axes, "shapes": [], "annotations": []}}
@@ -81,20 +81,20 @@ def _add_trace(figure: _Figure, kind: str = "scatter", /, **trace: Any) -> _Figu
 
 
 def _set_axis(figure: _Figure, name: str, /, **settings: Any) -> _Figure:
-    """Change settings of the axis `name`, such as `xaxis`."""
+    """Change settings of the axis `name` (such as `xaxis`) in place, and return the figure."""
     figure["layout"][name].update(settings)
     return figure
 
 
 def _add_line(figure: _Figure, axis: str, value: float, **line: Any) -> None:
-    """Add a line over the whole width or height at a value of `axis`, x or y."""
+    """Add a line across the whole plot at a value of `axis`, x or y."""
     other = "x" if axis == "y" else "y"
     at = {f"{axis}0": value, f"{axis}1": value, f"{axis}ref": axis, f"{other}0": 0, f"{other}1": 1}
     figure["layout"]["shapes"].append({"type": "line", **at, f"{other}ref": f"{other} domain", "line": line})
 
 
 def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]]) -> _Figure:
-    """Add one line with markers per name and (x, y), each in its own color, dashed once colors repeat."""
+    """Add a line with markers for each name and curve (x, y), in its own color; dashed if the colors repeat."""
     for i, (name, (x, y)) in enumerate(curves):
         line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_PALETTE) else "dash"}
         if len(x):
@@ -103,7 +103,7 @@ def _add_curves(figure: _Figure, curves: Iterable[tuple[str, _Curve]]) -> _Figur
 
 
 def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> _Figure:
-    """Plot the cost of every accepted iterate, with one curve for each intermediate horizon."""
+    """Plot the cost of every accepted iterate, with one curve for each horizon that the solver fitted."""
     figure = _styled_figure(340, "accepted point", "cost")
     _set_axis(figure, "yaxis", type="log")
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
@@ -113,7 +113,7 @@ def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -
 
 @dataclass(frozen=True)
 class TimePlotData:
-    """The data of one plot over time: measured values (M,) at t (M,), predicted lines (t, value), shaded intervals."""
+    """The data of one plot over time: measured values (M,) at t (M,) [s], lines (t, value) by name, marked periods."""
 
     axis_title: str
     lines: Mapping[str, tuple[Array, Array]]
@@ -121,8 +121,8 @@ class TimePlotData:
     measured: Array = field(default_factory=lambda: np.zeros(0))
     band_half_height: float | None = None  # half the height of a shaded band about zero; None: no band
     marked_intervals: Sequence[tuple[float, float]] = ()
-    is_low_row: bool = False
-    dots_name: str = "measured"
+    is_low_row: bool = False  # whether the plot has a smaller height, as for residuals
+    dots_name: str = "measured"  # legend of the measured values
 
 
 def channel_prediction_and_residual_plot_data(
@@ -134,9 +134,9 @@ def channel_prediction_and_residual_plot_data(
     lines: Mapping[str, Array],
     dense_line: tuple[Array, Array] | None = None,
 ) -> tuple[TimePlotData, TimePlotData]:
-    """Prepare plot data of measured and predicted values, and of their residual with a band of two noise stds.
+    """Return plot data of measured and predicted values, and of their residual with a band of two noise stds.
 
-    All arrays have shape (M,). For sparse measurements, `dense_line` (t (K,), value (K,)) draws the first line densely.
+    Arrays have shape (M,). `lines` holds predictions by name; `dense_line` (t, value) (K,) draws the first densely.
     """
     seen = np.isfinite(measured) & np.isfinite(std)
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
@@ -156,9 +156,9 @@ def channel_prediction_and_residual_plot_data(
 def time_plots_figure(
     curves: Sequence[TimePlotData], dots: str = LINE_PALETTE[1], lines: Mapping[str, str] | None = None
 ) -> _Figure:
-    """Plot measured points and lines over time, one row for each plot.
+    """Plot measured values and lines over time, with one row for each entry of `curves`.
 
-    `dots` is the color of measured points. `lines` maps line names to colors (default: the palette, in order).
+    `dots` is the color of measured values. `lines` maps line names to colors (default: the palette, in order).
     """
     names = dict.fromkeys(name for curve in curves for name in curve.lines)
     colors = lines or {name: _line_color(i) for i, name in enumerate(names)}
@@ -205,7 +205,7 @@ def time_plots_figure(
 
 
 def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along_time: bool = False) -> dict[str, Any]:
-    """A shaded rectangle of a row: over its whole height for a time interval, else over its whole width."""
+    """Return a shaded rectangle in a row, of full height over a time interval (`along_time`) or else of full width."""
     domain = (f"x{number}", f"y{number} domain") if along_time else (f"x{number} domain", f"y{number}")
     corners = {"x0": x[0], "x1": x[1], "y0": y[0], "y1": y[1]}
     return {"type": "rect", "xref": domain[0], "yref": domain[1], **corners, **_SHADE}
@@ -217,7 +217,7 @@ def _axis_title(text: str, y: float) -> dict[str, Any]:
 
 
 def lines_over_time_figure(curve: TimePlotData) -> _Figure:
-    """Plot the lines of one plot, each in its own color."""
+    """Plot the lines of `curve` over time, each in its own color. Measured values are not drawn."""
     figure = _styled_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
         dash = _LINE_DASHES[i // len(LINE_PALETTE) % len(_LINE_DASHES)]
@@ -248,7 +248,7 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> _Figur
 
 
 def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
-    """Plot each method's relative excess cost over wall time, from pairs (seconds, cost)."""
+    """Plot each method's cost over its lowest one, minus 1, against wall time. `costs`: (seconds, costs) by method."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     _set_axis(figure, "yaxis", type="log")
     least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}
@@ -257,13 +257,13 @@ def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
 
 
 def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
-    """Make plotly's settings for error bars from lower ends `low` to upper ends `high`."""
+    """Return Plotly's settings for error bars about `values` from the lower ends `low` to the upper ends `high`."""
     above, below = np.maximum(np.subtract(high, values), 0.0), np.maximum(np.subtract(values, low), 0.0)
     return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
 
 
 def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Figure:
-    """Plot how much chi2 rises as the parameter moves away from the estimate (profile likelihood)."""
+    """Plot profile likelihoods: rise of chi2 over parameter / estimate, by name. `level` is the rise at 95 %."""
     figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items())
     _add_line(figure, "y", level, color=_TEXT_COLOR, dash="dot")
     at = {"x": 1, "xref": "x domain", "xanchor": "right", "y": level, "yref": "y", "yanchor": "bottom"}
@@ -275,7 +275,7 @@ def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Fi
 
 
 def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> _Figure:
-    """Plot named points at the positions (x, y)."""
+    """Plot clouds of points (x, y) by name. `x` and `y` are the titles of the axes."""
     figure = _styled_figure(340, x, y)
     for i, (name, (across, up)) in enumerate(clouds.items()):
         points = {"x": np.asarray(across, np.float32), "y": np.asarray(up, np.float32)}
@@ -286,7 +286,7 @@ def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) ->
 def estimated_curve_figure(
     curve: tuple[Array, Array, Array], others: Mapping[str, Array], visited: tuple[float, float], x: str, y: str
 ) -> _Figure:
-    """Plot a curve (x, y, std) with a band of two stds, `others` as dashed lines, and lines at the `visited` x."""
+    """Plot a curve (x, y, std) with a band of two stds, `others` (y) dashed, and lines at the ends of `visited` x."""
     figure, (at, middle, std) = _styled_figure(340, x, y), curve
     edges = np.concatenate([middle + 2 * std, (middle - 2 * std)[::-1]])
     band = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False, "opacity": 0.25}
@@ -301,7 +301,7 @@ def estimated_curve_figure(
 
 
 def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
-    """At most `_MAX_CURVE_POINTS` points of a curve, in single precision to halve the size in a page."""
+    """Return at most `_MAX_CURVE_POINTS` points of a curve, in single precision to halve their size in a page."""
     count = len(t)
     keep = np.unique(np.linspace(0, count - 1, min(count, _MAX_CURVE_POINTS)).astype(np.int64))
     is_late = count and np.nanmax(np.abs(t[keep])) > _MAX_SINGLE_PRECISION_TIME
@@ -311,7 +311,7 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
 def parameter_values_by_source_figure(
     rows: Mapping[str, Mapping[str, tuple[float, float | None]]], axis: str, colors: Mapping[str, str] | None = None
 ) -> _Figure:
-    """Plot values ± 2 std from several sources: a row for each name, a color for each source (default: palette)."""
+    """Plot (value, std) as value ± 2 std, from `rows` by name and source: a row for each name, a color per source."""
     sources = list(dict.fromkeys([*(colors or ()), *(source for row in rows.values() for source in row)]))
     names = list(rows)
     figure = _styled_figure(136 + max(36, 14 * len(sources)) * len(names), axis, "")
@@ -338,7 +338,7 @@ def parameter_values_by_source_figure(
 
 
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
-    """Plot a heat map (n, n) in per cent that shows how much of each row's effect the column's effect explains."""
+    """Plot a heat map of `values` (n, n), the fraction of the row's signature that the column's effect can explain."""
     figure = _styled_figure(130 + 27 * len(names), "explained by [%]", "signature of")
     _add_trace(
         figure, "heatmap", x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False,
@@ -355,16 +355,16 @@ def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:
 
 @dataclass(frozen=True)
 class TimeHeatMapRow:
-    """A row of a heat map over time. Rows of one group are adjacent."""
+    """A row of a heat map over J time intervals. Rows of one group are adjacent."""
 
     name: str
     group: str
     values: Array  # (J,), NaN if there is nothing to show
-    hover_texts: Sequence[str]  # J
+    hover_texts: Sequence[str]  # J texts, shown when the pointer is on an interval
 
 
 def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> _Figure:
-    """Plot a heat map over intervals with edges (J + 1,) [s], one row for each quantity. Grey: no information.
+    """Plot a heat map over J intervals with `edges` (J + 1,) [s]. Grey marks values without information.
 
     `axis` is the title of the color scale.
     """
@@ -405,10 +405,10 @@ def _even(value: Any) -> Any:
 def gap_closure_and_screening_figure(
     entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, predicted: str
 ) -> _Figure:
-    """Plot how much of the gap [%] each candidate closes after a refit, with interval, and how much screening predicts.
+    """Plot how much of the gap each candidate closes after a refit [%], and the decrease that screening predicts.
 
-    `entries` maps each label to (closure, low, high), or None without a refit, and the decrease. `closed` and
-    `predicted` are the titles of the two axes.
+    `entries` maps a label to ((closure, lower end, upper end), or None without a refit, and predicted decrease).
+    `closed` and `predicted` are the titles of the two axes.
     """
     done = {name: closure for name, (closure, _) in entries.items() if closure}
     last, names = "2" if done else "", list(entries)[::-1]

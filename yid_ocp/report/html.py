@@ -1,4 +1,4 @@
-"""The HTML report, a self-contained page that consists of the registered sections."""
+"""The HTML report: one self-contained page with all registered sections that have content."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from yid_ocp.solvers.base import Status
 
 log = logging.getLogger(__name__)
 _SHARED_SCRIPT_LEVELS = 2
-"""Levels above a page that are searched for a shared script: a batch is two levels above the pages of its runs."""
+"""Number of folders above a page that are searched for a shared script. A batch is two above its runs' pages."""
 _WRAP_LENGTH = 24  # characters from which the cells of a column are wrapped
 _STATE_WORDS = {*VERDICT_TABLE_TEXTS.values(), *(status.value for status in Status)}  # in a column of numbers
 _NUMBER = re.compile(
@@ -35,8 +35,8 @@ _NUMBER = re.compile(
 def write_report(path: Path, findings: ReportData) -> bool:
     """Write the HTML report, and return whether it was written. Raises `OutputError` if writing fails.
 
-    The page works offline: Plotly's script is embedded, unless `write_shared_plotly_script` left a copy in the page's
-    folder or up to two levels above. Without the extra `report`, a warning is logged and no page written.
+    The page works offline: it contains Plotly's script, unless `write_shared_plotly_script` has written one to the
+    page's folder or up to two levels above. Without the extra `report`, a warning is logged and no page is written.
     """
     if not _installed():
         log.warning("no report is written, because plotly is not installed: pip install 'yid-ocp[report]'")
@@ -61,7 +61,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 
 def write_shared_plotly_script(folder: Path) -> None:
-    """Write plotly's script to a folder, for pages there and up to two levels below. Raises `OutputError`."""
+    """Write Plotly's script to a folder, for pages in it and up to two levels below. Raises `OutputError`."""
     if _installed():
         name, text = _plotly_script()
         if not _is_plotly_script(folder / name):
@@ -87,14 +87,14 @@ def _shared_script(path: Path) -> str:
 
 
 def _is_plotly_script(path: Path) -> bool:
-    """Whether a file is byte for byte plotly's script, since any file can have this name."""
+    """Check whether a file is byte for byte Plotly's script, because any file can have its name."""
     own = _plotly_script()[1].encode()
     return path.is_file() and path.stat().st_size == len(own) and path.read_bytes() == own
 
 
 @functools.cache
 def _packed_script() -> str:
-    """Plotly's script, compressed to a third of its size, which the user's cache keeps; the page decompresses it."""
+    """Return Plotly's script as compressed base64 text, which the page unpacks. The user's cache keeps it."""
     file: Path | None = None
     with contextlib.suppress(YidError):  # a page has its script without a cache, too
         file = private_cache_folder() / f"plotly-{metadata.version('plotly')}.base64"

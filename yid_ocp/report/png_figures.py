@@ -1,4 +1,4 @@
-"""Figures that are written as PNG: sparsity patterns and blind validation."""
+"""Figures that are written as PNG files: sparsity patterns and the results of a blind test."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> list[Path]:
     """Draw `detection.png`, `confusion.png` and `calibration.png` from a `yid-blind/1` result, and return their paths.
 
-    The figures show the detection rate over effect size with binomial 95 % intervals, the first answers against the
-    truth, and observed against nominal rates of intervals and p-values. Raises `OutputError` if writing fails.
+    The figures show the detection rate over the effect size with binomial 95 % intervals, the first answer against the
+    true effect, and observed against nominal rates of intervals and p-values. Raises `OutputError` if writing fails.
     """
     from matplotlib.figure import Figure
 
@@ -90,18 +90,18 @@ def _save(figure: Figure, path: Path, dpi: int = 120) -> None:
     try:
         figure.savefig(path, dpi=dpi, format="png")
     except OSError as error:
-        what, hint = f"the picture cannot be written: {error.strerror}", "choose another folder, or free disk space"
+        what, hint = f"the figure cannot be written: {error.strerror}", "choose another folder, or free disk space"
         raise OutputError(what, where=str(path), hint=hint) from error
 
 
 _STRUCTURAL_COLOR, _NONZERO_COLOR, _BLOCK_EDGE_COLOR = "#a9cfe0", LINE_PALETTE[0], LINE_PALETTE[1]
-_MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; beyond, one label per owner
+_MAX_SINGLE_LABELS = 64  # with more rows or columns, one label per owner (tube, arm) instead of one each
 
 
 def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern]]) -> None:
-    """Draw rows of sparsity patterns as PNG, with separated and named blocks. Raises `OutputError` if writing fails.
+    """Write the sparsity patterns of `layout` (rows of patterns) to one PNG file, with separated and named blocks.
 
-    Patterns without rows or columns are omitted.
+    Patterns without rows or columns are omitted. Raises `OutputError` if writing fails.
     """
     from matplotlib.figure import Figure
 
@@ -152,7 +152,7 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
 
 
 def _ticks(labels: Sequence[str], spans: Sequence[NamedIndexRange]) -> tuple[list[float], list[str]]:
-    """Positions of labels: all labels, or one per owner (a tube, an arm) in a block."""
+    """Return positions and texts of labels: all labels or, if they are many, one per owner (tube, arm) in a block."""
     if len(labels) <= _MAX_SINGLE_LABELS:
         return [float(i) for i in range(len(labels))], list(labels)
     places, names = [], []

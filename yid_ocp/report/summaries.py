@@ -40,9 +40,9 @@ _BASELINE_DESCRIPTIONS = {
     "linear_carry": "the cable carries the clamps' motion linearly",
 }
 _MAX_DIRECTIONS = 8
-_MAX_NOISE_RATIO = 2.0  # of an error over noise, or over the fit's error, above which a sentence explains it
+_MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
-_MAX_ROW_NAMES_LENGTH = 40  # characters of a cell
+_MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
@@ -66,7 +66,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [("channel", "error (rms)", "unit", "samples")]
     for name, entry in result["residuals"].items():
         rows.append((name, *format_error_value_and_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
-    yield SummaryTable(rows, "Errors where it was fitted")
+    yield SummaryTable(rows, "Errors on the fitted recordings")
     yield from _held_out_blocks(result)
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     yield from discretisation_shift_sentences(result)
@@ -88,7 +88,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
-    """The 95 % interval of an estimate, else value ± 1.96 std within its bounds; empty if unknown."""
+    """Return the 95 % interval of an estimate as text, else value ± 1.96 std within its bounds, empty if unknown."""
     if entry["interval"] is not None:
         return interval_text(*entry["interval"])
     if std is None or entry["verdict"] == "not_identifiable":
@@ -99,9 +99,9 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
 
 
 def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    """Prediction error per group of held-out channels, compared with the best baseline without a model and the noise.
+    """Yield sentences that compare the held-out error of a group of channels with noise and with the best baseline.
 
-    A sentence is given if the model does not explain the fitted data, or noise the prediction error.
+    A group gets one if the model does not explain the fitted data, or its error is over twice that of noise or fit.
     """
     for group in dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"]):
         channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]
@@ -120,7 +120,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         errors = (error, fitted, noise, guesses.get(best or ""))
         sizes = [" ".join(format_error_value_and_unit(x, unit)).rstrip() for x in errors]
         guess = f", and {sizes[3]} without a model, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
-        text = f"held-out errors of {group} are {sizes[0]} (rms), beside {sizes[1]} on the fitted recordings{guess}"
+        text = f"held-out errors of {group} are {sizes[0]} (rms), {sizes[1]} on the fitted recordings{guess}"
         if noise is None or error is None or fitted is None:
             continue
         if not result["fit"]["explains"]:
@@ -136,7 +136,7 @@ def _rms(values: Sequence[float]) -> float | None:
 
 
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Errors of each shown channel per recording and over three or more recordings, with those of baselines."""
+    """Yield held-out errors of each shown channel and recording, their median over three or more, and of baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     found: dict[str, list[tuple[str, str, float, float | None, dict[str, float]]]] = {}
     errors = []
@@ -164,12 +164,12 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for entry in result["held_out"]:
         if "message" in entry:
             yield f"held-out recording {entry['recording']} could not be predicted: {entry['message']}"
-    yield SummaryTable(rows, "Errors on held-out recordings, never touched by the fit")
+    yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
     yield f"guesses without a model: {legend}" if legend else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
-    """Large groups as one entry, small groups as their members."""
+    """Return the channels to show: a large group as one entry, the members of a small group one by one."""
     hidden: set[str] = set()
     for group in errors:
         members = {channel for channel in errors if channel.startswith(f"{group}.")}
@@ -191,7 +191,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     if weak:
         yield f"only {VERDICT_TABLE_TEXTS['weak']}: {abbreviated_names_text(weak)}"
         if any(free[name]["interval"] is None for name in weak):
-            yield "`yid-ocp identifiability` gives intervals that need not be symmetric"
+            yield "`yid-ocp identifiability` computes intervals for them, which may be asymmetric"
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
@@ -232,9 +232,9 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
             rows.append((entry["words"], f"{entry['identifiable']} of {len(parameters)}", gain, entry["message"]))
         yield SummaryTable(rows, "What another experiment would identify")
-        said = "with no set of up to three changes can all of them be found"
+        said = "no set of up to three changes makes it possible to find all parameters"
         if asked["smallest"]:
-            said = f"fewest changes with which all of them can be found: {asked['smallest'][0]['words']}"
+            said = f"fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}"
         yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
     text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
@@ -250,24 +250,24 @@ def _relative(value: float | None) -> str:
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "note")]
+    rows: TableRows = [("law", "held-out error", "± standard error", f"minus that of {best}", "±", "unit", "note")]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
-        note = ("warranted" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
+        note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
         rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     fitted = result["laws"][best]["parameters"].items()
     own = [(name, value_and_uncertainty_text(e["value"], e["std"], None), e["unit"]) for name, e in fitted]
     yield SummaryTable([("parameter", "value", "unit"), *own], f"Fit with the law '{best}'")
-    text = f"the law '{best}' is chosen: it is the simplest whose error is within one standard error of the least "
-    text += f"({', '.join(result['kinds'])} left out in turn)"
+    text = f"the law '{best}' is chosen: it is the simplest whose error is within one standard error of the least; "
+    text += f"each kind of motion was held out in turn: {', '.join(result['kinds'])}"
     yield SummaryStatement(text, "conclusion")
     yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
 
 
 @register_summary("yid-plan/1")
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    rows: TableRows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
+    rows: TableRows = [("joint", "travel [rad or m]", "velocity / limit", "effort / limit")]
     for name, own in result["joints"].items():
         travel = own["travel"] if own["travel"] > 1e-9 else 0.0
         shares = ("" if own[key] is None else f"{100 * own[key]:.0f} %" for key in ("velocity", "effort"))
@@ -284,19 +284,19 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         return
     place = ", ".join(f"{x:.4g}" for x in result["place"])
     yield (
-        f"in {result['duration']:g} s '{result['point']}' goes to ({place}) m; in the {result['settle']:g} s after "
-        f"that it is at most {1e3 * result['error']:.3g} mm from there, and no point of the object is faster than "
-        f"{1e3 * result['swing']:.3g} mm/s, by the model"
+        f"in {result['duration']:g} s '{result['point']}' goes to ({place}) m. By the model, it is at most "
+        f"{1e3 * result['error']:.3g} mm from there in the {result['settle']:g} s after that, and then no point of the "
+        f"object is faster than {1e3 * result['swing']:.3g} mm/s"
     )
     if result["off_path"] is not None:
-        yield f"on the way it is at most {1e3 * result['off_path']:.3g} mm from its path"
+        yield f"during the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints"
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
-        yield f"the uncertainty of the parameters adds ({std}) mm, one standard deviation"
+        yield f"the uncertainty of the parameters adds ({std}) mm in x, y, z (one standard deviation)"
         if lost := result["from"]["uncertainty_unknown"]:
-            yield f"not counted, as their uncertainty is not known: {', '.join(lost)}"
+            yield f"not included, because their uncertainty is unknown: {', '.join(lost)}"
     elif result["from"]["run"] is None:
-        yield "the parameters are those of the configuration, so the uncertainty of the place is unknown"
+        yield "the parameters are those of the configuration, so the uncertainty of the position is unknown"
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -306,7 +306,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield SummaryTable(rows, "Expected precision")
-    rows = [("effect", "compared with", "apart in the recordings", "apart in this motion")]
+    rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
     for own in result["distances"]:
         rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g} std" for when in ("before", "after"))))
     yield SummaryTable(rows, "Effects")
@@ -316,10 +316,10 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     more = f"{best['value'] - best['first']:.3g} nat more than the random motion from which it came{others}"
     yield f"start {result['best'] + 1} of {len(starts)} is the most informative: {more}"
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
-    yield f"what limits it: {'; '.join(reached)}" if reached else "it reaches no limit"
-    yield from (f"{n}: no motion, no sensor sees it to first order; {what}" for n, what in result["unseen"].items())
+    yield f"limits that the motion reaches: {'; '.join(reached)}" if reached else "the motion reaches no limit"
+    yield from (f"{n}: with any motion, no sensor observes it to first order; {w}" for n, w in result["unseen"].items())
     unseen = tuple(f"{name} is" for name in result["unseen"])
-    yield from (f"left open by this motion: {words}" for words in result["open"] if not words.startswith(unseen))
+    yield from (f"not determined by this motion: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
         yield "the parameters are those of the configuration; with other true values the information differs"
 
@@ -365,7 +365,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _noise_words(noise: Mapping[str, Any], name: str) -> str:
-    """Noise of a recorded group, or of each of its channels, with the expected offset and whether it was estimated."""
+    """Return the noise of a recorded group, or of each of its channels, with the expected offset, as text."""
     said = []
     for part in ("", ".effort", ".position"):
         known = noise.get(f"{name}{part}")
@@ -386,14 +386,14 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
-        "rows: equations of a step that contain the parameter; observed: rows that influence a sensor. Sensitivity to "
-        f"one unit more: of one sensor from equilibrium (within {seconds:.2g} s), of all recorded readings"
+        "rows: equations of a step that contain the parameter; observed: rows that influence a sensor. [std]: change "
+        f"per unit of the parameter, of one sensor from equilibrium (in {seconds:.2g} s) and of all recorded readings"
     )
     yield SummaryTable([*_dependence_rows(result)], "Rows and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"and {left} more free parameters, in result.json" if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "observed rows are computed about an equilibrium only"
+        yield "observed rows are not listed, because they are computed about an equilibrium only"
     said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
     yield SummaryStatement(said, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
@@ -412,20 +412,20 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
-        yield CodeBlock("" if entry["zero"] else f"which is {value} at {linear['at']}")
+        yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
     yield SummaryTable([*_INSPECTION_FILES, *((path, "") for path in result["exported"])], "Files")
 
 
 _INSPECTION_FILES = (
     ("file", "holds"),
     ("linearisation.h5", "the matrices"),
-    ("result.json", "where every parameter enters"),
+    ("result.json", "the equations that contain each parameter"),
     ("equations.txt", "all equations and names"),
 )
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Equation rows that contain each free or named parameter, and changes of the readings by one unit of it."""
+    """Yield the rows that contain each free or named parameter, and the change of readings by one unit of it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
     head = "parameter", "unit", "rows", "which", "observed", "best sensor", "read by"
@@ -446,14 +446,14 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 
 
 def _row_names_text(names: Sequence[str]) -> str:
-    """Names of rows in one line, or counts by kind if the line would be too long."""
+    """Return names of rows in one line, or their counts by kind if that line would be too long."""
     text, kinds = abbreviated_names_text(names), [name.partition("[")[0] for name in names]
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else counts
 
 
 def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    rows: TableRows = [("matrix", "size", "can differ from zero", "do at this point", "picture")]
+    rows: TableRows = [("matrix", "size", "possible nonzeros", "nonzeros at this point", "picture")]
     for name, entry in result["patterns"].items():
         height, width = entry["shape"]
         if height and width:
@@ -494,7 +494,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-export/1")
 def export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise an export: how the format expresses effects and estimates, and the errors of the replay in MuJoCo."""
+    """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     listed = {
         name: entry

@@ -1,4 +1,4 @@
-"""The blocks of a summary (statements, tables, code), shared texts, and the lines that a terminal shows."""
+"""The blocks of a result's summary (statements, tables, code), shared texts, and their form on a terminal."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 
 TableRows = list[Sequence[str]]
 _MAX_ISSUES_PER_CAUSE = 3
-_MAX_OFFSET_RECORDINGS = 4  # recordings side by side
-_MAX_NUMBERS_BEYOND_MODEL = 6  # numbers that a sentence lists; the table has all
+_MAX_OFFSET_RECORDINGS = 4  # recordings that a table of torque offsets shows side by side
+_MAX_NUMBERS_BEYOND_MODEL = 6  # parameters that a sentence on a poor fit lists; the table has all
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
-"""Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
+"""Widths to which sentences and notes are wrapped, and largest length of a note that stays on one line."""
 
 
 @dataclass(frozen=True)
 class SummaryStatement:
     """A sentence of a summary, with its importance.
 
-    The kind is `verdict` (answers the question of the command), `conclusion` (summarises several verdicts) or `note`. A
-    report shows conclusions first.
+    The kind is `verdict` (answers the question of the command), `conclusion` (summarises several verdicts) or `note`
+    (further information). A report shows conclusions first, then verdicts.
     """
 
     text: str
@@ -48,9 +48,9 @@ class SummaryTable:
 
     rows: TableRows
     title: str = ""
-    is_key_table: bool = False  # shown next to the verdict on a page
-    is_page_only: bool = False  # is left out on a terminal
-    links: Mapping[str, str] = field(default_factory=dict)  # pages that cells of the first column lead to
+    is_key_table: bool = False  # whether a page shows it next to the verdict
+    is_page_only: bool = False  # whether a terminal omits it
+    links: Mapping[str, str] = field(default_factory=dict)  # linked page by the text of a cell in the first column
 
 
 @dataclass(frozen=True)
@@ -64,18 +64,18 @@ StatementTableOrCode = SummaryStatement | SummaryTable | CodeBlock
 
 
 SummaryBlockOrTextIterator = Iterator[StatementTableOrCode | str]
-"""Blocks of a summary as they are made: a string is a note, and some may be empty."""
+"""Blocks of a summary in their order. A string is a note; an empty string is omitted."""
 _Summary = Callable[[Mapping[str, Any]], list[StatementTableOrCode]]
 SUMMARY_BY_RESULT_FORMAT: dict[str, _Summary] = {}
-"""The summary of every result, by its format."""
+"""Functions that return the summary of a result, by result format such as `yid-solve/1`."""
 
 
 def register_summary(
     result_format: str,
 ) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]], _Summary]:
-    """Return a decorator that registers the summary of a result format. The summary returns a list of blocks.
+    """Return a decorator that registers a generator as the summary of a result format, such as `yid-solve/1`.
 
-    Empty texts, and tables with only a header, are omitted.
+    The decorated function returns a list of blocks, without empty texts and tables that have only a header.
     """
 
     def enter(make: Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]) -> _Summary:
@@ -91,12 +91,12 @@ def register_summary(
 
 
 def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:
-    """Return the factor and unit with which a quantity is shown: metres become millimetres, other units stay."""
+    """Return factor and unit for the display of a quantity: metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, str]:
-    """Format an error's value and its display unit. None gives a dash."""
+    """Return the value of an error as text (a dash for None), and the unit in which it is displayed."""
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     return ("–" if value is None else f"{factor * value:.3g}"), shown
 
@@ -107,9 +107,9 @@ def p_value_text(p_value: float) -> str:
 
 
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise the issues of the recordings as a table and advice."""
+    """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
     doubts = result.get("doubts", ())
-    rows: TableRows = [("in doubt", "where", "certainty", "times its limit")]
+    rows: TableRows = [("issue", "where", "certainty", "times its limit")]
     advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in doubts):
         alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
@@ -118,18 +118,18 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
             where = entry["where"] + (f" and {left} more" if left else "")
             rows.append((words, where, entry["sure"], f"{entry['evidence']:.3g}"))
             advice += [f"{words}: {entry['what']}; {entry['advice']}", CodeBlock(entry["setting"])]
-    yield SummaryTable(rows, "In doubt")
+    yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
     if any(entry["weight"] != "warning" for entry in doubts):
-        yield SummaryStatement("no value counts as found while a recording of the run has issues", "verdict")
+        yield SummaryStatement("no value counts as found, because a recording has a severe issue", "verdict")
 
 
 def misfit_summary_blocks(
     fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
 ) -> SummaryBlockOrTextIterator:
-    """Summarise a poor fit: channels worse than a naive baseline, misfit, and parameters that are still meaningful.
+    """Yield statements on a poor fit: misfit, parameters that are still meaningful, channels worse than a baseline.
 
-    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 %.
+    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 % of the value.
     """
     if not fit["explains"]:
         yield SummaryStatement(goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
@@ -155,21 +155,21 @@ def misfit_summary_blocks(
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
-    """Write a sentence for each finer discretisation that shifts estimates by more than their std."""
+    """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
     said = []
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         changes = ", ".join(f"{n} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for n, own in moved.items())
         if moved:
-            said.append(f"with {words} these move by more than the data's standard deviation: {changes}")
+            said.append(f"with {words} these estimates change by more than their standard deviation: {changes}")
         elif tried:
-            said.append(f"with {words} no estimate moves by more than its standard deviation")
+            said.append(f"with {words} no estimate changes by more than its standard deviation")
     return said
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
-    """Make table rows of a result's torque offsets, one for each joint; only the header if there are none."""
+    """Return table rows of a result's torque offsets, one for each joint; only the header if there are none."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
     rows: TableRows = [("torque offset [N m]", *shown, "expected")]
@@ -191,7 +191,7 @@ def bound_range_text(entry: Mapping[str, Any], digits: int) -> str:
 
 
 def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
-    """Format summary blocks as text lines, with aligned tables and wrapped sentences and notes."""
+    """Format the blocks of a summary as lines of text, with aligned tables and wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:
         if isinstance(block, SummaryTable):
@@ -209,7 +209,7 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 
 def recording_summary_lines(recording: Recording) -> list[str]:
-    """Describe the contents of a recording in text lines."""
+    """Return lines of text that describe a recording: a table of its groups, the duration and notes."""
     rows: TableRows = [("group", "samples", "Hz", "s", "channels", "names")]
     for group in recording.all_groups:
         rate, span = mean_sample_rate(group.t), f"{group.t[-1] - group.t[0]:.4g}"
@@ -228,7 +228,7 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
 
 
 def importable_file_summary_lines(contents: FilePreview) -> list[str]:
-    """Describe the contents of another tool's file in text lines."""
+    """Return lines of text that describe a file of another tool: a table of what `import` finds, and notes."""
     rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
     for source in contents.sources:
         rate = f"{source.mean_rate:.4g}" if math.isfinite(source.mean_rate) else ""
@@ -241,7 +241,7 @@ def _note_lines(notes: Sequence[str]) -> list[str]:
 
 
 def aligned_table_lines(rows: TableRows) -> list[str]:
-    """Format a table with aligned columns. The first row is the header; columns without other entries are omitted."""
+    """Return a table as lines with aligned columns. The first row is the header. Empty columns are omitted."""
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in columns]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]

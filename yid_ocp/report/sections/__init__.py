@@ -1,6 +1,6 @@
 """Input data, registration and rendering of report sections. Each file of this folder registers some sections.
 
-A plug-in can register sections too; its template `NAME.html` is next to its file.
+A plug-in can register sections, too. It keeps the template `NAME.html` of a section next to its own file.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportData:
-    """The input data of a report: `result` (content of result.json) and, if available, problem, solution and others.
+    """The input data of a report: `result` (content of result.json) and, if available, problem, solution and more.
 
     `animations` replaces the animations made from `problem`, `solution` and `held_out`. `section_data` holds other data
-    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn. `noise_fraction` is
-    the part of the stated standard deviations of `problem` that is noise.
+    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn. The actual noise is
+    `noise_fraction` times the stated standard deviations of `problem`.
     """
 
     name: str
@@ -73,7 +73,7 @@ def register_report_section(name: str, order: int, title: str) -> Callable[[_Pre
 def draw_figure_per_unit(
     rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any]
 ) -> list[tuple[str, Any]]:
-    """Draw one figure for each unit, from rows (name, unit, row). Returns pairs (empty title, figure)."""
+    """Draw one figure for all `rows` (name, unit, data) of the same unit. Returns pairs (empty title, figure)."""
     grouped: dict[str, dict[str, _Row]] = {}
     for name, unit, row in rows:
         grouped.setdefault(unit, {})[name] = row
@@ -81,7 +81,7 @@ def draw_figure_per_unit(
 
 
 def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
-    """Render all sections with content, in order. Each has a name, a title and HTML."""
+    """Return all sections that have content, in order, each with the keys `name`, `title` and `html`."""
     result = []
     sections = {name: REPORT_SECTIONS[name] for name in REPORT_SECTIONS}
     for name, section in sorted(sections.items(), key=lambda entry: entry[1].order):

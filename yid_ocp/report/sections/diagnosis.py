@@ -1,4 +1,4 @@
-"""Report sections of a diagnosis: gap, locations, candidates and predictions."""
+"""The report section of a diagnosis: gap, events, locations, candidates, law and predictions."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from yid_ocp.report.terminal import format_error_value_and_unit, scale_and_unit_
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 
-_MAX_CANDIDATES = 15  # candidates; the rest is in result.json
-_MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
-_MAX_CHANNELS = 3  # held-out channels
+_MAX_CANDIDATES = 15  # largest number of shown candidates; result.json has all
+_MAX_MAPS = 3  # largest number of recordings with a heat map; trajectories.h5 has all
+_MAX_CHANNELS = 3  # largest number of held-out channels that are drawn
 _NOMINAL_LABEL, _EXTENDED_LABEL = "nominal model", "with the effects"
 _MODEL_COLORS = {_NOMINAL_LABEL: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
 _EVENT_COLORS = {"event": figures.AFTER_COLOR} | dict.fromkeys(
@@ -33,7 +33,7 @@ _EVENT_COLORS = {"event": figures.AFTER_COLOR} | dict.fromkeys(
 )
 _TitledFigures = list[tuple[str, Any]]
 _Chapter = tuple[str, Sequence[str], _TitledFigures]
-"""Title, sentences, of which empty ones are not shown, and figures with their titles."""
+"""Title, sentences (empty ones are not shown), and figures with their titles."""
 
 
 @register_report_section("diagnosis", 5, "The gap and what makes it")
@@ -141,7 +141,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
 
 
 def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int, kept: list[int]) -> tuple[Any, str]:
-    """Heat map of the unknowns `kept` over recording i, and a sentence on the most significant value."""
+    """Return the heat map of the unknowns `kept` over recording i, and a sentence on the most significant value."""
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
@@ -163,10 +163,10 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     else:
         prior = np.sqrt([smoothed.group_variance[source] for source in groups])
         values = trace.posterior_mean / np.where(prior > 0, prior, np.nan)
-        axis = "value in standard deviations expected beforehand"
+        axis = "value in standard deviations of its prior"
         sentence = (
-            "The data inform no single value by more than half, so values are shown in units of the standard "
-            "deviation expected beforehand. The picture is only a hint."
+            "The data reduce the variance of no single value by more than half, so values are shown in units of the "
+            "standard deviation of their prior. The picture is only a hint."
         )
     rows = []
     for k in kept:
@@ -274,7 +274,7 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
 
 
 def _library_curves(table: TorqueLawTable, at: Array) -> dict[str, Array]:
-    """The curve of the library's laws that best fits a table, by weighted least squares of its amplitudes."""
+    """Return the curve of the library's law that fits a table best, by weighted least squares of its amplitudes."""
     shapes: dict[str, Callable[[Array], Sequence[Array]]] = {}
     if table.quantity == "speed":
         shapes = {"viscous": lambda v: [v], "viscous and Coulomb": lambda v: [v, np.tanh(v / SIGN_SMOOTHING_SPEED)]}
@@ -366,7 +366,7 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
-        "Free parameters absorb a missing effect: this is their change when it is added. Bars: two standard "
+        "Without the effects, free parameters change to imitate them. The figure shows this change. Bars: two standard "
         "deviations, cut at the edge of the figure.",
         f"{said}." if said else "No parameter changes by more than 10 %.",
     ]

@@ -27,8 +27,8 @@ from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_r
 
 _MAX_ANIMATIONS = 4  # a page with more is slow to open
 _MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
-_MAX_LISTED_RECORDINGS = 3  # recordings that are drawn
-_MAX_POINTS = 6  # points of a group; more are in the recording
+_MAX_LISTED_RECORDINGS = 3  # largest number of recordings that are drawn
+_MAX_POINTS = 6  # largest number of points of a group that are drawn
 _ESTIMATE_COLORS = {
     "start": figures.MEASURED_COLOR,
     "estimate": figures.LINE_PALETTE[0],
@@ -54,7 +54,7 @@ def _remaining_tables(findings: ReportData) -> Mapping[str, Any] | None:
 def _result_blocks(
     findings: ReportData,
 ) -> tuple[list[str], list[terminal.StatementTableOrCode], list[terminal.StatementTableOrCode]]:
-    """Conclusions and verdicts of a result, then the other blocks, split at the end of its key table."""
+    """Return conclusions and verdicts of a result, and its other blocks up to the key table and after it."""
     known = terminal.SUMMARY_BY_RESULT_FORMAT.get(str(findings.result.get("format")))
     blocks = [] if known is None else known(findings.result)
     ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, terminal.SummaryTable) and block.is_key_table)
@@ -166,7 +166,7 @@ def _friction_torque(findings: ReportData) -> Iterator[tuple[str, Any]]:
 
 @register_report_section("plan", 10, "The planned motion")
 def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    """Distance of a plan's point from its target; joint positions, velocities and efforts over time."""
+    """Yield plots over time: distance of a plan's point from its target; joint positions, velocities and efforts."""
     found = findings.section_data.get("plan")
     if found is None:
         return
@@ -189,7 +189,7 @@ def _lines(t: Array, names: Sequence[str], values: Array) -> dict[str, tuple[Arr
 
 
 def _joint_channel_unit(system: System | None, names: Sequence[str], channel: str) -> str:
-    """Unit of a joint channel, or both; joints unknown to the system count as revolute."""
+    """Return the unit of a joint channel (two for mixed kinds). Joints unknown to the system count as revolute."""
     kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
     is_prismatic = {kinds.get(name) == "prismatic" for name in names} or {False}
     unit = JOINT_CHANNEL_UNITS[channel]
@@ -197,7 +197,7 @@ def _joint_channel_unit(system: System | None, names: Sequence[str], channel: st
 
 
 class _PredictedEpisode(NamedTuple):
-    """A recording and its prediction with the parameters (ntheta,) found for it."""
+    """A recording and its prediction with the parameters theta (ntheta,) that were estimated for it."""
 
     role: str
     problem: EstimationProblem
@@ -207,7 +207,7 @@ class _PredictedEpisode(NamedTuple):
 
 
 def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
-    """Every recording with a prediction, those fitted first."""
+    """Yield every recording that could be predicted, fitted ones first, then held-out ones."""
     problem, solution = findings.problem, findings.solution
     if problem is None or solution is None:
         return
@@ -222,7 +222,7 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
 
 @register_report_section("scene", 3, "In motion")
 def _animation(findings: ReportData) -> Mapping[str, Any] | None:
-    """The command's animations, else the predicted motion of each recording, held-out first."""
+    """Return the command's animations or, without any, the predicted motion of recordings, held-out ones first."""
     scenes = [*findings.animations]
     if not scenes:
         for own in sorted(_predicted_episodes(findings), key=lambda own: own.role != _HELD_OUT)[:_MAX_ANIMATIONS]:
@@ -278,7 +278,7 @@ def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
 
 
 def _fitted_curves(own: _PredictedEpisode, noise_fraction: float) -> Iterator[tuple[str, list[TimePlotData]]]:
-    """Title and curves of each point, or of all joints of a group together."""
+    """Yield title and curves of each point, or of all joints of a group together."""
     grid = own.episode.grid
     for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
         sensor, course = samples.sensor, None
