@@ -411,7 +411,7 @@ def test_a_single_recording_in_motion_bears_nothing_out(solved):
     safe = choose_cable_memory_fit(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
     assert safe.problem is solved.problems[0]
     assert (safe.problem.unknown_names, safe.solution.x.tolist()) == (("k",), [2.0])
-    assert "too few recordings start in motion" in safe.message
+    assert "fewer than two recordings start in motion" in safe.message
 
 
 @pytest.mark.parametrize(
@@ -436,13 +436,13 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (safe.problem is problem) is kept
     assert f"memory is {'' if kept else 'not '}kept" in safe.message
-    assert f"{with_it:.3g} with it and {without:.3g} without" in safe.message
+    assert f"{with_it:.3g} with memory and {without:.3g} without" in safe.message
 
 
 def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
     problem.predictor.predict_episode = lambda *_: "it snaps"
-    assert "inf with it and" in choose_cable_memory_fit(problem, None, found).message
+    assert "inf with memory and" in choose_cable_memory_fit(problem, None, found).message
     solved.ok = False
     assert choose_cable_memory_fit(problem, None, found).solution is found
 

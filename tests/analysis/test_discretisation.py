@@ -89,7 +89,7 @@ def test_a_move_ends_at_the_bound_and_what_cannot_be_compared_says_why():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     assert shifts(coarse, problem(lambda x: [x["a"]], {"a": 1.0}, fails=lambda values: True)) == "it snaps"
     longer = problem(lambda x: [x["a"], x["a"]], {"a": 1.0})
-    assert "other samples" in shifts(coarse, longer, model_difference_only=True)
+    assert "the same samples" in shifts(coarse, longer, model_difference_only=True)
 
 
 def chain(links):
@@ -362,7 +362,7 @@ def test_a_rollout_that_failed_counts_as_far_as_it_got_without_prescribed_coordi
 def test_what_is_said(decades, stable):
     said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
     assert said.keeps_errors_below_resolution is stable
-    told = "grows by 29 % in a step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
+    told = "grows by 29 % per step at 0.35 s; set a shorter problem.time_step, such as 0.0025 s"
     assert said.stability_message.startswith(f"run: the time step of 0.005 s is {'' if stable else 'not '}stable")
     assert said.stability_message.endswith("along the motion" if stable else told)
 

@@ -323,7 +323,7 @@ def test_inspect_without_recordings(carried_out, written, urdf_folder):
         ("dle[elbow]", "did you mean 'del[elbow]'?"),
         ("del[elbow], q1[elbo]", "did you mean 'q1[elbow]'?"),
         ("elbow.mas", "did you mean 'elbow.mass'?"),
-        ("del[elbow], h, h", "the name of a row, or of a row and a column"),
+        ("del[elbow], h, h", "ROW (an equation), or ROW, COLUMN (its derivative"),
     ],
 )
 def test_a_wrong_entry_leaves_nothing_behind(cli, pendulum, tmp_path, entry, said):

@@ -202,7 +202,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     assert "no set of up to three changes makes it possible to find all parameters" in lines
     assert lines[-1] == "none of 1 parameters can be found from these recordings"
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
-    assert "fewest changes with which all of them can be found: a weld" in told("yid-identifiability/1", result)
+    assert "fewest changes with which all parameters can be found: a weld" in told("yid-identifiability/1", result)
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():
