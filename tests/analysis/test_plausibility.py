@@ -512,7 +512,7 @@ ROLLED = {
     "as predicted": (lambda p: p + 0.1, True, None, ""),
     "in the camera's frame": (applied(BACK), True, "point_frame", "with the camera's pose applied"),
     "pose inverted": (applied(BACK @ BACK), True, "point_frame", "with the camera's pose inverted"),
-    "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis turned"),
+    "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis reversed"),
     "no pose is known": (applied(BACK), False, None, ""),
     "in millimetres": (lambda p: 1e3 * p, False, "point_scale", "divided by 1000"),
     "exchanged": (lambda p: p[:, [1, 0, 2]], False, "point_swapped", "with a and b exchanged"),
@@ -562,7 +562,7 @@ def hanging(seed: int = 0) -> Recording:
     ("change", "cause", "words", "ratio"),
     [
         (lambda p: p, None, "", 0.0),
-        (lambda p: 10 * p, "point_scale", "9.98 times as long", math.log(9.98) / math.log(1.2)),
+        (lambda p: 10 * p, "point_scale", "9.98 times their undeformed length", math.log(9.98) / math.log(1.2)),
         (lambda p: 0.5 * p, "point_scale", "0.499 times their undeformed length", math.log(2.0) / math.log(1.2)),
         (lambda p: p * [1, 1, -1], "point_mirrored", "on average 0.192 m above its clamps", 3.798),
         (
