@@ -1,5 +1,8 @@
 """A law where names end: a torque that no effect of the library makes is found with its place, quantity and curve."""
 
+from pathlib import Path
+
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -109,6 +112,26 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
     np.testing.assert_allclose((efforts[0] - efforts[1])[1:, 1], (expected[1:] + expected[:-1]) / 2, atol=1e-9)
     np.testing.assert_allclose(table.interpolated_torque(middle), expected, atol=1e-12)
     assert np.ptp(middle) > 2 * np.ptp(table.knots)
+
+
+def test_a_linear_law_of_a_segment_is_another_stiffness_of_all_its_joints():
+    beam = build_system(
+        load_config(Path(__file__).parents[2] / "configs" / "soft_beam.yaml", ["model.effects=[]", "parameters={}"])
+    )
+    values = ca.vertcat(*(spring.stiffness for spring in beam.elastic_joints))
+    stiffness = ca.Function("k", [beam.parameters.symbols], [values])(beam.parameters.vector()).full()[:, 0]
+    assert stiffness[0] == pytest.approx(2 * stiffness[1])  # half a link
+    knots = np.linspace(-2.0, 2.0, 9)
+    law = torque_law_from_tables("beam", beam, [TorqueLawTable("angle", knots, -0.1 * stiffness[1] * knots, knots)])
+    stiffer = beam.parameters.vector({"beam.bend": 1.1 * beam.parameters["beam.bend"].value})
+    bent = beam.with_effects([law])
+    start, steps = np.concatenate([np.linspace(0.05, 0.2, 10), np.zeros(10)]), 20
+    moved = simulate(compile_step(bent, H), bent.parameters.vector(), start, steps).state
+    np.testing.assert_allclose(moved, simulate(compile_step(beam, H), stiffer, start, steps).state, atol=1e-9)
+    nodes = {"state": moved, "time_step": np.array(H)}
+    for quantity, path in (("angle", (moved[1:] + moved[:-1]) / 2), ("speed", np.diff(moved, axis=0) / H)):
+        seen = torque_law_argument_along_rollout(beam, "beam", quantity, stiffer, nodes)
+        np.testing.assert_allclose(seen, path[:, :10] * stiffness / stiffness[1], rtol=1e-12)
 
 
 def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):

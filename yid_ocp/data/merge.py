@@ -58,7 +58,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
                 points = tuple(replace(group, clock_offset_std=_ALIGNED_CLOCK_STD) for group in recording.points)
                 recording = replace(recording, points=points)
         if said:
-            notes.append(f"times of {recording.name} were shifted by {shift:+.10g} s: {said}" if shift else said)
+            notes.append(f"times of {recording.name} were shifted by {shift:+.4f} s: {said}" if shift else said)
         shifted.append(_with_times_shifted(recording, shift))
     begin = min(float(group.t[0]) for recording in shifted for group in recording.all_groups)
     if abs(begin) > _LARGEST_START:
@@ -110,7 +110,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     if best is None or best.explained < _MIN_EXPLAINED:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"
         what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
-        hint = f"--clock-offset {other.name}=SECONDS shifts its times ({begin - start:.10g}: both begin together)"
+        hint = f"--clock-offset {other.name}=SECONDS shifts its times ({begin - start:.4f}: both begin together)"
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
     why = "the recording times do not overlap; with this offset the points follow the joint angles best "
     why += f"({best.explained:.1%} of the motion), to ± {_ALIGNED_CLOCK_STD:g} s, which a fit of the model corrects"

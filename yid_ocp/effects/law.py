@@ -59,9 +59,10 @@ class TorqueLaw(base.EffectBase):
 
     x is the joint's own angle, speed, load or command, or the time since the start of the recording (an internal
     coordinate s with ds/dt = 1). f is a natural cubic spline whose parameters are its values at equally spaced knots,
-    and constant beyond the knots; for two quantities it is a sum of two splines. The command is the torque that the
-    servo requests, after saturation; for a DC motor it is the torque of the duty cycle without back-EMF. A law of the
-    command is zero while the motor is off. Load and command exist at arm joints only.
+    and constant beyond the knots; for two quantities it is a sum of two splines. In a segment, angle and speed are
+    those of its typical joint at the same curvature, so that a linear law acts like another stiffness or damping. The
+    command is the torque that the servo requests, after saturation; for a DC motor it is the torque of the duty cycle
+    without back-EMF. A law of the command is zero while the motor is off. Load and command exist at arm joints only.
     """
 
     knots: Mapping[str, Array] | None = None  # knots of every quantity
@@ -87,9 +88,10 @@ class TorqueLaw(base.EffectBase):
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         force = ca.SX(state.system.n_coordinates, 1)
-        for index in _coordinate_indices(state.system, self.location):
+        for index, factor in _coordinate_indices_and_factors(state.system, self.location).items():
             for quantity in self.quantities:
-                torque = self._torque(quantity, _quantity(quantity, state, self.label, index))
+                scale = 1.0 if quantity == "time" else factor
+                torque = self._torque(quantity, scale * _quantity(quantity, state, self.label, index))
                 if quantity == "command":
                     torque = ca.if_else(_servo_input(state, index) < MOTOR_OFF_COMMAND / 2, torque, 0)
                 force[index] += torque
@@ -122,14 +124,20 @@ def _spline_weights(count: int) -> Array:
     return np.asarray(np.linalg.inv(inner)[:, :count], float)
 
 
-def _coordinate_indices(system: System, location: str) -> list[int]:
-    """Indices of the coordinates on which a law at a location acts."""
+def _coordinate_indices_and_factors(system: System, location: str) -> dict[int, float]:
+    """The coordinates on which a law at a location acts, each with its stiffness over that of the typical joint.
+
+    A joint of half a link's length is twice as stiff, and bends half as far at the same curvature.
+    """
     index = system.mechanism.joint_index
-    if location in base.flexible_segment_names(system):
-        springs = base.elastic_joints_of_segment(system, location)
-        bends = [spring for spring in springs if spring.deformation == "bend"]
-        return [index(spring.joint_name) for spring in bends or springs]
-    return [index(location)]
+    if location not in base.flexible_segment_names(system):
+        return {index(location): 1.0}
+    springs = base.elastic_joints_of_segment(system, location)
+    bends = [spring for spring in springs if spring.deformation == "bend"] or [*springs]
+    values = ca.vertcat(*(spring.stiffness for spring in bends))
+    stiffness = ca.Function("stiffness", [system.parameters.symbols], [values])(system.parameters.vector()).full()[:, 0]
+    factors = stiffness / np.median(stiffness) if np.median(stiffness) > 0 else np.ones(len(bends))
+    return {index(spring.joint_name): float(own) for spring, own in zip(bends, factors, strict=True)}
 
 
 def _servo_input(state: MidpointStateSymbols, index: int) -> ca.SX:
@@ -175,11 +183,12 @@ def torque_law_argument_along_rollout(
     n, h = system.n_coordinates, float(nodes["time_step"])
     if quantity == "time":
         return np.asarray((np.arange(len(nodes["state"]) - 1) + 0.5)[:, None] * h, float)
-    at, q = _coordinate_indices(system, location), nodes["state"][:, :n]
+    factors, q = _coordinate_indices_and_factors(system, location), nodes["state"][:, :n]
+    at, scale = [*factors], np.array([*factors.values()])
     if quantity == "speed":
-        return np.asarray(np.diff(q[:, at], axis=0) / h, float)
+        return np.asarray(scale * np.diff(q[:, at], axis=0) / h, float)
     if quantity == "angle":
-        return np.asarray((q[1:, at] + q[:-1, at]) / 2, float)
+        return np.asarray(scale * (q[1:, at] + q[:-1, at]) / 2, float)
     internal = system.effect_internal_coordinate_symbols
     sizes = {"q": n, "v": n, "z": len(internal), "u": len(system.driven), "lam": system.n_constraints}
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}

@@ -220,10 +220,10 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
     notes += [f"{quantity} is in {unit}, by the header" for quantity, unit in stated]
-    units = {quantity: unit for quantity, unit in units.items() if quantity not in dict(stated)}
-    if units:
-        options["units"] = units
-    return base.FilePreview(tuple(sources), options, (*notes, *why))
+    guessed = [own for own in zip(units.items(), why, strict=True) if own[0][0] not in dict(stated)]
+    if guessed:
+        options["units"] = dict(own for own, _ in guessed)
+    return base.FilePreview(tuple(sources), options, (*notes, *(reason for _, reason in guessed)))
 
 
 for _suffix in (".csv", ".tsv", ".txt"):
