@@ -186,8 +186,16 @@ def test_damping_is_right_where_markers_are_late(tmp_path):
     ]
     problem = EstimationProblem(step, far[:2], tuple(truth), told, held_out=far[2:])
     problems["fitted"], doubts = problem_with_fitted_point_clocks(problem)
-    said = [float(doubt.what.split(") are ")[1].split()[0]) for doubt in doubts]
-    assert said == pytest.approx([30.5, 19.5, 25.5], abs=0.5), "of held-out recordings too"
+    fitted = [episode.recording for episode in (*problems["fitted"].episodes, *problems["fitted"].held_out)]
+    shifts = [1e3 * (own.points[0].t - made.points[0].t)[0] for own, made in zip(far, fitted, strict=True)]
+    assert shifts == pytest.approx([30.5, -19.5, 25.5], abs=0.5), "of held-out recordings too"
+    assert doubts == [], "within what is stated"
+    sure = [replace(own, points=(replace(own.points[0], clock_offset_std=0.01),)) for own in far]
+    _, doubts = problem_with_fitted_point_clocks(
+        EstimationProblem(step, sure[:2], tuple(truth), told, held_out=sure[2:])
+    )
+    assert [doubt.recording for doubt in doubts] == [sure[0].name, sure[2].name]
+    assert " ms late by a fit" in doubts[0].what
     before, after = (solve(own, GaussNewton()).goodness_of_fit.chi2_per_dof for own in (problem, problems["fitted"]))
     assert before > 1.5
     assert after == pytest.approx(1.0, abs=0.15)

@@ -46,6 +46,7 @@ _N_TIME_BLOCKS = 10  # blocks of time whose errors count as independent of each 
 _MAX_DRIFT = 0.05  # largest relative drift of clocks that should agree
 _DRIFT_SEARCH_STEP = 0.2  # difference of the total drift between two trials [s]
 _N_RELINEARIZATIONS = 3  # repetitions of a fit at the corrected times
+_MAX_CLOCK_SHIFT_Z = 2.0  # stated standard deviations by which a clock may be off without an issue
 _MIN_EXPLAINED_FRACTION = 0.5  # fraction of the residual beyond noise that a drift must explain
 # Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not be attributed to a clock.
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
@@ -249,7 +250,9 @@ def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[Estima
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
         words = f"time stamps of {name} of {own} (stated: ± {1e3 * std:.3g} ms) are {said} by a fit; they are corrected"
-        issues.append(Issue("clock_offset", words, "warning", abs(shift) / std, advice, own, name, "t"))
+        if abs(shift) > _MAX_CLOCK_SHIFT_Z * std:
+            ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
+            issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
     return problem, issues
 
 

@@ -38,6 +38,7 @@ _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MAX_FINER_FIT_ITERATIONS, _MAX_LINEAR_CHANGE = 3, 10.0  # of r'r, below which a linear step decides
 _MIN_STEPS_TO_COMPILE, _DERIVATIVE_COST = 2000, 0.25  # of a finer model; time of a step by one unknown over a step's
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
+_SETTINGS = {"links": "`links` of the segments in model.object", "time_step": "problem.time_step"}
 
 
 @dataclass(frozen=True)
@@ -277,7 +278,7 @@ def estimate_shifts_by_discretisation(
 
     `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. If `x`
     is not a minimum of the cost, set `model_difference_only`. Returns the shifts by shared free parameter (empty if no
-    refinement succeeded), and a note on each refinement that failed.
+    refinement succeeded), and a note on each refinement that failed, or that would remove a quarter of the misfit.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
@@ -296,7 +297,11 @@ def estimate_shifts_by_discretisation(
         if isinstance(own, str):
             notes.append(f"the effect of {words} on the estimates is unknown: {own}")
         else:
-            found[key], _ = own
+            found[key], left = own
+            before, after, noise = at_x.residual @ at_x.residual, left @ left, len(left)
+            if not model_difference_only and before - max(after, noise) > max((before - noise) / 4, 0.05 * noise):
+                share = 100 * (before - max(after, noise)) / (before - noise)
+                notes.append(f"{words} would remove {share:.0f} % of the misfit beyond noise: change {_SETTINGS[key]}")
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
     return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes

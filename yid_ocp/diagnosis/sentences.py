@@ -21,7 +21,7 @@ from yid_ocp.inference.uncertainty import priors_that_determine_unknown, value_a
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
-_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that cannot be moved by themselves
+_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 _GAP_ORIGIN_PHRASES = {
     "plant": ", in the mechanics rather than in what sensors read",
     "sensor": ", in what sensors read",
@@ -43,12 +43,12 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         if told := [text for several, text in advice if len(several) > 1]:
             return told[0]
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
-    alone = _listed("Move ", place, " alone, slowly and fast, and hold it still in several configurations.")
+    mostly = _listed("Record motions in which ", place, " moves most: slow, fast, with pauses in several postures.")
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
     texts = {
         "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
-        "unknown": alone or "Record other motions, faster and larger.",
-        "no_gap": f"None needed: no relevant gap was found.{_listed(' These motions cannot reveal ', unseen)}",
+        "unknown": mostly or "Record other motions, faster and larger.",
+        "no_gap": f"None needed: no relevant gap was found.{_listed(' The data that are used cannot reveal ', unseen)}",
         "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
     }
     return texts[result.verdict]

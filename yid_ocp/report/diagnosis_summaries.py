@@ -70,7 +70,9 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield "the others are ordered by score (significance before a refit); p: probability of such a score by noise alone"
     left = len(result["which"]) - _MAX_CANDIDATES
     yield f"{left} more candidates are in result.json" if left > 0 else ""
-    yield f"not detectable in these recordings: {', '.join(result['unseen'])}" if result.get("unseen") else ""
+    yield f"not detectable in the data that are used: {', '.join(result['unseen'])}" if result.get("unseen") else ""
+    unused = "recorded torques are not used: to find friction and loads of the arm, set sensors.joints.effort.use: true"
+    yield unused if result.get("unused_efforts") else ""
     for signals, kinds in result.get("not_candidates", {}).items():
         yield f"no candidates, because no recording has {signals}: {', '.join(kinds)}"
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]

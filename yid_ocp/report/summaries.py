@@ -52,6 +52,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     failed = result["status"] == "failed"
     if not failed:
         yield from misfit_summary_blocks(result["fit"], free)
+        yield from (SummaryStatement(text, "conclusion") for text in result.get("discretisation_notes", ()))
         yield from (SummaryStatement(text, "conclusion") for text in _prediction_sentences(result))
     yield from issue_summary_blocks(result)
     rows: TableRows = [("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds")]
@@ -70,7 +71,6 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from _held_out_blocks(result)
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     yield from discretisation_shift_sentences(result)
-    yield from result.get("discretisation_notes", ())
     if failed:
         said = "the values are the best point that was reached; their uncertainty is unknown"
         yield SummaryStatement(said, "verdict")

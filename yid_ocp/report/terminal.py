@@ -144,7 +144,7 @@ def misfit_summary_blocks(
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
             none = "no value is known to within 10 % with the misfit in its ±"
-            said = f"values known to within 10 % with the misfit in their ±, if no missing effect biases them: {shown}"
+            said = f"if no effect is missing (`yid-ocp diagnose`), these are known to 10 %, misfit in the ±: {shown}"
             yield SummaryStatement(said if known else none, "conclusion")
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
