@@ -179,11 +179,11 @@ def test_an_amplitude_far_out_of_its_range_comes_last():
     "of, values, plain, expected",
     {
         "an unlikely shape, another does as well": (WIDE, {"s": 9.0}, 1.01, "small@x"),
-        "an unlikely shape, others do worse": (WIDE, {"s": 9.0}, 1.06, "wide@x"),
+        "an unlikely shape, others do worse": (WIDE, {"s": 9.0}, 1.09, "wide@x"),
     },
 )
 def test_what_is_not_plausible_comes_after_what_does_as_well(of, values, plain, expected):
-    fits = [there(of, 1.0, 1.0, **values), there(effect("small@x", *map(amplitude, "abc")), plain, plain)]
+    fits = [there(of, *[1.0] * 3, **values), there(effect("small@x", *map(amplitude, "abc")), *[plain] * 3)]
     assert nearest(fits)[0] == expected
 
 
@@ -479,13 +479,13 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     updated = replace(spring, held_out_loss=replace(spring.held_out_loss, updated_chi2=150.0))
     assert bic_difference(updated, spring) == pytest.approx(150.0 - spring.held_out_loss.total_chi2)
     assert near(spring, replace(offset, cost=101.5)) == ["spring@elbow", "offset@elbow"]
-    # up to odds of 150 to 1
-    assert near(spring, replace(offset, cost=106.2)) == ["spring@elbow", "offset@elbow"]
-    assert near(spring, replace(offset, cost=106.4)) == ["spring@elbow"]
+    # up to odds of 150 to 1, half as sure as the difference
+    assert near(spring, replace(offset, cost=111.2)) == ["spring@elbow", "offset@elbow"]
+    assert near(spring, replace(offset, cost=111.4)) == ["spring@elbow"]
     # a model's response to an effect is known to a twentieth, so a 400th of what is explained proves nothing
-    for cost, found in ((2775.0, ["spring@elbow"]), (2790.0, ["spring@elbow", "offset@elbow"])):
+    for cost, found in ((4775.0, ["spring@elbow"]), (4790.0, ["spring@elbow", "offset@elbow"])):
         whole = replace(fit((), loss(1.0, 1.0), cost=cost), residual_count=100)
-        assert nearest([spring, replace(offset, cost=108.0)], nominal=whole) == found
+        assert nearest([spring, replace(offset, cost=113.0)], nominal=whole) == found
     # the likeliest of all recordings counts, whatever is ahead on those held out
     ahead, true = fit([effect("ahead@elbow")], loss(0.9, 1.0), cost=130.0), fit([effect("true@elbow")], loss(1.0, 0.95))
     assert near(ahead, replace(true, cost=100.0)) == ["true@elbow"]

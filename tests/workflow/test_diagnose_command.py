@@ -20,7 +20,13 @@ from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
+from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.workflow.diagnose import (
+    _has_unused_efforts,
+    _SingleJsonFileRefitStore,
+    _with_noise_only_stds,
+    run_diagnose,
+)
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
@@ -254,6 +260,15 @@ def test_no_weak_prior_stays_none_and_encoders_without_noise_need_none(problem_o
     shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_geometric_std=0.0), SETTINGS)
     assert shrunk.options.weak_prior_geometric_std == 0.0
     assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)
+
+
+def test_recorded_torques_that_nothing_uses_are_told(problem_of):
+    unused = {**STATED, "joints.effort": replace(STATED["joints.effort"], use=False)}
+    cases = [("prescribed", unused), ("prescribed", STATED), ("driven", unused)]
+    assert [_has_unused_efforts(problem_of(role, sensors)) for role, sensors in cases] == [True, False, False]
+    result = {"summary": "", "verdict": "no_gap", "next_plan": None, "seconds": {}, "which": [], "unused_efforts": True}
+    blocks = SUMMARY_BY_RESULT_FORMAT["yid-diagnosis/2"](result | {"gap": {"before": {"rmse": {}, "unit": {}}}})
+    assert any("set sensors.joints.effort.use: true" in line for line in summary_terminal_lines(blocks))
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' 
 # of what effects explain: a model's response to them errs by 5 %, as links and time step are finite, and leaves this
 _MIN_CHI2_FRACTION = 0.05**2
 _MIN_REST_FRACTION = 4e-4  # of the whole gap: so little can be an error of the response to the effects found
+_LOG_ODDS_FACTOR = 2.0  # by which half a difference of BIC exceeds the log odds that simulated cases show
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
 _SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
@@ -101,8 +102,7 @@ def bic_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
     """Compute the BIC (Bayesian information criterion) of `fit` minus that of `other`; negative if `fit` is better.
 
     The BIC is the smallest r'r of a fit to estimation and held-out recordings (r: whitened residual) plus log(n) per
-    effect parameter, with n residuals (Schwarz 1978, doi:10.1214/aos/1176344136). Half the difference is the log odds
-    of `other` against `fit`.
+    effect parameter, with n residuals (Schwarz 1978, doi:10.1214/aos/1176344136).
     """
     held = fit.held_out_loss.joint_fit_chi2 - other.held_out_loss.joint_fit_chi2
     more = fit.total_effect_parameter_count - other.total_effect_parameter_count
@@ -125,7 +125,7 @@ def _near_best_models(
         # chi2 would be found by a test
         samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
         errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
-        decisive = max(2 * limits.min_log_bayes_factor, errors)
+        decisive = max(2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor, errors)
         distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:

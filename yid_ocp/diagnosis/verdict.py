@@ -19,8 +19,7 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
 
-_LOGISTIC_OFFSET, _LOGISTIC_SLOPE = 0.24, 1.05  # of the log odds over the logarithm of what is unexplained
-_LOG_ODDS_PER_DOUBT = 1.2  # by which implausible amplitudes, or a gap along one effect alone, lower the probability
+_LOGISTIC_OFFSET, _LOGISTIC_SLOPE = -0.2, 0.8  # of the log odds over the logarithm of what is unexplained
 _MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
@@ -200,7 +199,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
         verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
-        return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, exceeds, limits))
+        return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
     said = judged(added)
     if said.verdict == "unknown" and len(added) > 1:
@@ -211,7 +210,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     return said
 
 
-def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> float:
+def _probability(said: Judgement, limits: Thresholds) -> float:
     """Probability that the selected effects are the cause, from how much they explain of what is required.
 
     A logistic curve fitted to a calibration ensemble; see `docs/design/verdicts.md`.
@@ -221,10 +220,7 @@ def _probability(said: Judgement, exceeds_noise: bool, limits: Thresholds) -> fl
     explained = 0.0 if said.failed_transfer_checks else said._largest_explained_fraction
     unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
     margin = math.log((1.0 - said.required_total_explained_fraction(limits)) / unexplained)
-    fit = said.selected_effects[-1].refitted_model
-    is_substitute = any(fit.implausible_parameters(effect, limits) for effect in fit.effects)
-    log_odds = _LOGISTIC_OFFSET + _LOGISTIC_SLOPE * margin - _LOG_ODDS_PER_DOUBT * (is_substitute + (not exceeds_noise))
-    return 1.0 / (1.0 + math.exp(-log_odds))
+    return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
 
 
 def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits: Thresholds) -> float:
