@@ -47,17 +47,15 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         folder.record_run_start(run, "check")
         warnings: list[str] = []
         progress.begin_stage("building the model")
-        # compiled equations are the same, and a check needs only a few steps
-        plain = replace(run, problem=replace(run.problem, use_compiler=False))
-        step = build_step(plain)
+        step = build_step(run)
         recordings, problem = [], None
         if run.recordings.estimate:
             progress.begin_stage("placing the recordings on the model")
-            problem = build_problem(plain, step)
+            problem = build_problem(run, step)
             for role, episodes in (("estimate", problem.episodes), ("held_out", problem.held_out)):
                 recordings += [_recording(problem, role, episode, warnings) for episode in episodes]
         progress.begin_stage("comparing the bodies with another library")
-        mechanics = _mechanics(plain, step, problem, warnings)
+        mechanics = _mechanics(run, step, problem, warnings)
         progress.begin_stage("refining links and time step")
         convergence = _frequency_convergence(run, problem, warnings)
         moved, shown = {}, {}
