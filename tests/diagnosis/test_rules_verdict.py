@@ -20,7 +20,7 @@ from yid_ocp.diagnosis.verdict import (
     _explained_fraction,
     _inflate_fit_stds_by_disagreement,
     _probability,
-    _verdict_and_reason,
+    _verdict,
     judge,
 )
 from yid_ocp.display import NULL_PROGRESS
@@ -121,7 +121,7 @@ def judged(changed):
     checks = () if said["carried"] else (carried(),)
     effects = tuple(replace(entry, cumulative_closure=said["total"]) for entry in said["added"])
     found = Judgement("", "", (), effects, said["explained"], checks, 0.0)
-    return _verdict_and_reason(found, said["gap"], said["enough"], LIMITS)
+    return _verdict(found, said["gap"], said["enough"], LIMITS)
 
 
 @pytest.mark.parametrize(("alone", "verdict"), [(0.6, "effect"), (0.4, "unknown")])

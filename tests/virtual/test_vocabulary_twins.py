@@ -172,7 +172,7 @@ def test_what_lies_uphill_is_found_by_a_refit_from_where_its_screening_leads(kin
     start = fit_nominal_model(nominal, composed)
     [score] = screen_candidates(composed, (), start.values).candidate_scores
     found = refit_with_effects(composed, composed.candidate_effects, {**start.values, **score.predicted_values})
-    for name, reported in found.effect_parameters_as_reported(found.effects[0]).items():
+    for name, reported in found.effects[0].parameters_as_reported(found.values, found.std).items():
         assert reported.value == pytest.approx(values[name], rel=0.01 if kind == "effort_gain" else 0.05), name
     assert found.held_out_loss.chi2_per_sample < 0.01 * start.held_out_loss.chi2_per_sample
 

@@ -174,13 +174,13 @@ def _errors_to_dict(fit: RefitStatistics) -> dict[str, Any]:
 def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list[dict[str, Any]]:
     """All candidates: accepted effects, then other refits by held-out loss, then the rest by score."""
     added, alone = judged.accepted_selected_effects, judged.single_effect_models
-    before = seen.nominal_model.held_out_loss
+    before, last = seen.nominal_model.held_out_loss, [entry.refitted_model for entry in added[-1:]]
     closures = {fit.effects[0].label: held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
     probabilities = judged.selected_effect_and_equivalent_probabilities
     found = [
-        *((e.effect, added[-1].refitted_model.effect_parameters_as_reported(e.effect)) for e in added),
-        *((fit.effects[0], fit.effect_parameters_as_reported(fit.effects[0])) for fit in alone),
+        *((e.effect, e.effect.parameters_as_reported(fit.values, fit.std)) for e in added for fit in last),
+        *((fit.effects[0], fit.effects[0].parameters_as_reported(fit.values, fit.std)) for fit in alone),
         *((s.effect, s.effect.parameters_as_reported(s.predicted_values)) for s in scores.values()),
     ]
     listed: dict[str, dict[str, Any]] = {}

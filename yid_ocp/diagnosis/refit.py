@@ -20,7 +20,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_label
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress
-from yid_ocp.effects import EffectBase, ReportedParameterValue
+from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start, whiten_with_extra_errors
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_sqrt
@@ -126,10 +126,6 @@ class RefitStatistics(StoredFit):
     def total_effect_parameter_count(self) -> int:
         """The number of parameters of all effects in the model together."""
         return sum(len(effect.parameters) for effect in self.effects)
-
-    def effect_parameters_as_reported(self, effect: EffectBase) -> dict[str, ReportedParameterValue]:
-        """Return the fitted parameters of an effect in reported units, with standard deviations."""
-        return effect.parameters_as_reported(self.values, self.std)
 
     def implausible_parameters(self, effect: EffectBase, limits: Thresholds) -> list[str]:
         """List the parameters of an effect that are far outside their prior range, by a width or a factor."""

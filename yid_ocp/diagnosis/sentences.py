@@ -67,11 +67,10 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     step = f"Steps of {stated} s are too long here, so this result is for {used} s"
     links = "The error of few links looks like a gap. It was removed here; other commands need more links."
-    blocks = "No other recording could be held out, so alternate blocks of the recordings were."
     notes = (
         (stated != used, f"{step} (set problem.time_step: {used} for other commands)."),
         (result.is_corrected_for_links, links),
-        (result.is_split_in_blocks, blocks),
+        (result.is_split_in_blocks, "No recording could be held out, so alternate blocks of the recordings were."),
     )
     text += [note for applies, note in notes if applies]
     events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
@@ -195,7 +194,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """An effect with its estimates, and a warning if one is far outside its expected range."""
     values, odd = [], ""
-    for name, r in fit.effect_parameters_as_reported(effect).items():
+    for name, r in effect.parameters_as_reported(fit.values, fit.std).items():
         known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
     for name in fit.implausible_parameters(effect, limits):

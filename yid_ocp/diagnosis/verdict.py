@@ -156,9 +156,7 @@ class Judgement:
         return 1.0 - (1.0 - limits.min_explained_fraction) ** len(independent)
 
 
-def _verdict_and_reason(
-    said: Judgement, exceeds_noise: bool, are_data_sufficient: bool, limits: Thresholds
-) -> tuple[str, UnknownVerdictReason]:
+def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) -> tuple[str, UnknownVerdictReason]:
     """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`.
 
     A gap that is seen only along a candidate's signature counts only with an accepted effect.
@@ -170,10 +168,10 @@ def _verdict_and_reason(
         reason = "little"
     elif said.failed_transfer_checks:
         reason = "stand_in"
-    if not are_data_sufficient:
+    if not suffice:
         return "insufficient_data", ""
     if reason:
-        return ("unknown", reason) if exceeds_noise else ("no_gap", "")
+        return ("unknown", reason) if exceeds else ("no_gap", "")
     return ("confusable" if len(said.selected_effects[0].equivalent_effects) > 1 else "effect"), ""
 
 
@@ -198,7 +196,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             last = _inflate_fit_stds_by_disagreement(last, carried)
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
-        verdict, reason = _verdict_and_reason(said, exceeds, suffice, limits)
+        verdict, reason = _verdict(said, exceeds, suffice, limits)
         return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
     said = judged(added)

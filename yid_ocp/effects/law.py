@@ -125,10 +125,7 @@ def _spline_weights(count: int) -> Array:
 
 
 def _coordinate_indices_and_factors(system: System, location: str) -> dict[int, float]:
-    """The coordinates on which a law at a location acts, each with its stiffness over that of the typical joint.
-
-    A joint of half a link's length is twice as stiff, and bends half as far at the same curvature.
-    """
+    """The coordinates on which a law at a location acts, each with its stiffness over that of the typical joint."""
     index = system.mechanism.joint_index
     if location not in base.flexible_segment_names(system):
         return {index(location): 1.0}
