@@ -18,25 +18,10 @@ LAYERS = (
     ("errors", "version", "arrays"),
     ("registry",),  # it raises errors, so the two cannot share a layer
     ("options", "files", "least_squares", "interruption", "progress", "display"),
-    ("parallel",),
-    ("model",),
-    ("effects", "sensors"),
-    ("integrator",),
-    ("data",),
-    ("vision",),
-    ("virtual",),
-    ("problem",),
-    ("inference",),
-    ("solvers",),
-    ("analysis",),
-    ("diagnosis",),
-    ("planning",),
-    ("export", "report"),
-    ("config",),
-    ("workflow",),
-    ("cli",),
-    ("__main__",),
-)
+    ("parallel",), ("model",), ("effects", "sensors"), ("integrator",), ("data",), ("vision",), ("virtual",),
+    ("problem",), ("inference",), ("solvers",), ("analysis",), ("diagnosis",), ("planning",), ("export", "report"),
+    ("config",), ("workflow",), ("cli",), ("__main__",),
+)  # fmt: skip
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 SOURCES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path.read_text("utf-8")

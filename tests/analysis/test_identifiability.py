@@ -293,21 +293,9 @@ def unseen(function, start=None, **more):
         # equal again at the finite change alone
         (lambda a, b: a + b + 0.5 * ca.sin(2 * math.pi * (a - 2.0) / 0.6), ("N/m", "N/m"), None),
     ],
-    ids=[
-        "series",
-        "units",
-        "nearly",
-        "too far",
-        "sum",
-        "sum of units",
-        "ratio",
-        "product",
-        "another",
-        "at first",
-        "within a tenth",
-        "at the finite change",
-    ],
-)
+    ids=["series", "units", "nearly", "too far", "sum", "sum of units", "ratio", "product", "another", "at first",
+         "within a tenth", "at the finite change"],
+)  # fmt: skip
 def test_a_plain_combination_has_its_direction_and_holds_at_a_finite_change(function, units, words):
     said = unseen(function, units=dict(zip("ab", units, strict=True)))
     if words is None:

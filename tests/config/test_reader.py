@@ -207,22 +207,13 @@ def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words)
 
 # Numbers that may have any value: places, angles, offsets.
 ANY_NUMBER = {
-    "import.file_clock_offsets.NAME",
-    "plan.start_joint_positions.NAME",
-    "import.torque_constants.NAME",
-    "import.gear_ratios.NAME",
-    "sensors.NAME.constants.NAME",
-    "sensors.NAME.constants.NAME.NAME",
-    "model.arms.locked_joints.NAME",
-    "model.joint_springs.NAME.rest_position",
-    "model.effects.values.NAME",
-    "parameters.NAME.initial",
-    "track.virtual_frames.latency",
-    "track.options.filters.floor_height",
-    "track.options.filters.floor_margin_above_object_foot",
-    "track.options.filters.max_depth_behind_robot_base",
+    "import.file_clock_offsets.NAME", "plan.start_joint_positions.NAME", "import.torque_constants.NAME",
+    "import.gear_ratios.NAME", "sensors.NAME.constants.NAME", "sensors.NAME.constants.NAME.NAME",
+    "model.arms.locked_joints.NAME", "model.joint_springs.NAME.rest_position", "model.effects.values.NAME",
+    "parameters.NAME.initial", "track.virtual_frames.latency", "track.options.filters.floor_height",
+    "track.options.filters.floor_margin_above_object_foot", "track.options.filters.max_depth_behind_robot_base",
     "track.options.clock_offset.initial_stamp_minus_joint_time",
-}
+}  # fmt: skip
 
 
 def numbers(hint, wrap=lambda value: value, path=(), option=None):
