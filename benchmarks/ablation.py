@@ -1,19 +1,26 @@
-"""What each rule of a diagnosis is worth: finished cases judged again, one threshold at its neutral value.
+"""What each rule of a diagnosis is worth: finished cases judged again, one rule at a time switched off.
 
-    python benchmarks/ablation.py DIR [--set KEY=VALUE ...]
+    python benchmarks/ablation.py DIR ... [--set KEY=VALUE ...]
 
-DIR is the folder of a finished `yid-ocp blind`. Nothing is refitted: a case whose verdict would need another refit is
-counted as not judged. A rule that changes nothing here can go, unless another ensemble needs it.
+DIR is the folder of a finished `yid-ocp blind`, or that of `benchmarks/unchanged.py --keep`. Nothing is refitted: a
+case whose verdict would need another refit is counted as not judged, so rules that steer the search are not tested
+fully. A rule that changes nothing here can go, unless other recordings need it.
 """
 
 from __future__ import annotations
 
 import argparse
+import inspect
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from yid_ocp.diagnosis import select, verdict
+from yid_ocp.diagnosis.blind_scores import rejudge_diagnosis_evidence
+from yid_ocp.files import read_input_json
 from yid_ocp.workflow.blind import rescore_blind
 
 NEUTRAL = {
@@ -33,10 +40,56 @@ NEUTRAL = {
     "min_explained_fraction": 0.0,
 }
 """Values at which a threshold asks for nothing, or for as little as makes sense."""
+CONSTANTS = {
+    "_MODEL_ERROR_CHI2": (select, math.inf),
+    "_LOSS_RTOL": (select, 1e-12),
+    "_MIN_REST_FRACTION": (select, 0.0),
+    "_MIN_CHI2_FRACTION": (select, 0.0),
+    "_LOG_ODDS_FACTOR": (select, 1.0),
+    "_SET_PROBABILITY": (select, 1.0),
+}
+"""Constants of modules, with their neutral values."""
+CRITERIA = {
+    "mean log ratio of blocks": (select, "_distance_in_prediction", "float(ratios.mean())", "-math.inf"),
+    "at most sqrt(2N)": (select, "_near_best_models", "math.sqrt(2 * samples)", "math.inf"),
+    "plausible reference": (select, "_near_best_models", "if _is_plausible(fit, limits))", ")"),
+    "plausible models first": (select, "_near_best_models", "not _is_plausible(own[0], limits), *", "True, *"),
+    "fewest parameters first": (select, "_near_best_models", "(float(fit.total_effect_parameter_count), ", "(0.0, "),
+    "plausible second effects": (select, "_plausible_beside", "fit.implausible_parameters(effect, limits)", "False"),
+    "significant effects": (select, "_is_needed", "is_clear and all(", "is_clear or not all("),
+    "two thirds of a small gap": (verdict, "_explained_fraction", "min(least, limits", "min(math.inf, limits"),
+    "small gaps": (verdict, "_explained_fraction", "1.0 if fits_to_noise and", "1.0 if False and"),
+    "differs from neutral": (verdict, "_compare", "entry.is_consistent and moved", "entry.is_consistent"),
+    "first effect alone": (verdict, "judge", "and len(added) > 1", "and False"),
+}
+"""Conditions in code: module, function, the text and what replaces it."""
+
+
+@contextmanager
+def switched_off(name: str) -> Iterator[list[str]]:
+    """Switch a rule off; gives the settings that do so, if it is a threshold."""
+    if name in CONSTANTS:
+        module, value = CONSTANTS[name]
+        before = getattr(module, name)
+        setattr(module, name, value)
+        yield []
+        setattr(module, name, before)
+    elif name in CRITERIA:
+        module, function, old, new = CRITERIA[name]
+        before, source = getattr(module, function), inspect.getsource(getattr(module, function))
+        if source.count(old) != 1:
+            raise SystemExit(f"{name}: {function} has no longer one place with `{old}`")
+        exec(source.replace(old, new), vars(module))
+        yield []
+        setattr(module, function, before)
+    else:
+        yield [f"diagnosis.{name}={NEUTRAL[name]}"] if name in NEUTRAL else []
 
 
 def changes(folder: Path, settings: Sequence[str]) -> Counter[str]:
     """How many cases change their verdict or effects, and which way."""
+    if not (folder / "answers").is_dir():
+        return changes_of_known_cases(folder, settings)
     found = rescore_blind(folder, folder / "rescored", settings).result
     count: Counter[str] = Counter(cases=found["cases"], not_judged=found["not_judged"])
     for own in found["rescored"]["changed"]:
@@ -46,18 +99,42 @@ def changes(folder: Path, settings: Sequence[str]) -> Counter[str]:
     return count
 
 
+def changes_of_known_cases(folder: Path, settings: Sequence[str]) -> Counter[str]:
+    """How many cases of a folder of tasks have another verdict or other effects than with all rules."""
+    changed = {key.removeprefix("diagnosis."): float(value) for key, _, value in (s.partition("=") for s in settings)}
+    changed |= {key: int(changed[key]) for key in ("n_refit_pairs", "max_effects") if key in changed}
+    count: Counter[str] = Counter()
+    for file in sorted(folder.glob("*.json")):
+        found = read_input_json(file).get("value") or {}
+        if evidence := found.get("evidence"):
+            judged = rejudge_diagnosis_evidence(evidence, changed)
+            count["cases"] += 1
+            if judged["verdict"] == "not_judged":
+                count["not_judged"] += 1
+            elif (judged["verdict"], named(judged)) != (found["said"]["verdict"], named(found["said"])):
+                count["otherwise"] += 1
+    return count
+
+
+def named(result: dict[str, Any]) -> set[str]:
+    """Labels of all effects that a result names, alone or in sets."""
+    return {f"{own['kind']}@{own['location']}" for part in (result["effects"], *result["confusable"]) for own in part}
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Judge a finished blind proof again, one rule off at a time.")
-    parser.add_argument("folder", type=Path)
+    parser = argparse.ArgumentParser(description="Judge finished cases again, one rule off at a time.")
+    parser.add_argument("folders", type=Path, nargs="+", metavar="DIR")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="for every row")
     arguments = parser.parse_args()
-    print("| threshold | neutral | right, then wrong | wrong, then right | otherwise changed | not judged | cases |")
-    print("|---|---|---|---|---|---|---|")
-    for name, value in {"(as set)": math.nan, **NEUTRAL}.items():
-        own = [f"diagnosis.{name}={value}"] if math.isfinite(value) else []
-        count = changes(arguments.folder, [*arguments.set, *own])
+    print("| rule that is off | right, then wrong | wrong, then right | otherwise changed | not judged | cases |")
+    print("|---|---|---|---|---|---|")
+    for name in ("(none)", *NEUTRAL, *CONSTANTS, *CRITERIA):
+        count: Counter[str] = Counter()
+        with switched_off(name) as own:
+            for folder in arguments.folders:
+                count += changes(folder, [*arguments.set, *own])
         numbers = [count[key] for key in ("lost", "gained", "otherwise", "not_judged", "cases")]
-        print(f"| {name} | {value:g} | {' | '.join(map(str, numbers))} |")
+        print(f"| {name} | {' | '.join(map(str, numbers))} |")
 
 
 if __name__ == "__main__":

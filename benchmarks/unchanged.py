@@ -23,6 +23,7 @@ from diagnosis_cases import CASES, found, show
 
 from yid_ocp import cli
 from yid_ocp.config.reader import load_config
+from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.workflow.run_inputs import resolve_default_recording
 
@@ -74,7 +75,10 @@ def diagnosed(name: str) -> dict[str, Any]:
         key: {"value": nominal.values[key], "std": number(nominal.std[key])}
         for key in nominal.problem.shared_parameters
     }
-    return {"status": said["verdict"], "effects": effects, "parameters": parameters}
+    # for `ablation.py`, not compared
+    judged = {"said": {key: said[key] for key in ("verdict", "effects", "confusable")}}
+    judged["evidence"] = diagnosis_evidence_to_dict(finding)
+    return {"status": said["verdict"], "effects": effects, "parameters": parameters, **judged}
 
 
 def number(value: float) -> float | None:
@@ -129,7 +133,7 @@ def main() -> int:
             print(f"{name}: {result.error or 'its recordings are not here'}")
             failed += bool(result.error)
         elif arguments.record:
-            recorded[name] = result.value
+            recorded[name] = {key: own for key, own in result.value.items() if key not in ("said", "evidence")}
         elif name not in recorded:
             print(f"{name}: not recorded")
         else:

@@ -56,10 +56,14 @@ def test_a_rule_is_worth_the_cases_that_change_without_it(benchmark_module, monk
         return SimpleNamespace(result={"cases": 9, "not_judged": 1, "rescored": {"changed": changed}})
 
     monkeypatch.setattr(ablation, "rescore_blind", rescored)
+    (tmp_path / "answers").mkdir()
     found = ablation.changes(tmp_path, ["diagnosis.min_z=0"])
     assert dict(found) == {"cases": 9, "not_judged": 1, "lost": 1, "gained": 1, "otherwise": 1}
     assert asked == [["diagnosis.min_z=0"]]
     assert set(ablation.NEUTRAL) <= {entry.name for entry in fields(Thresholds)}
+    for name in (*ablation.CONSTANTS, *ablation.CRITERIA):  # each has one place in the code
+        with ablation.switched_off(name) as settings:
+            assert settings == []
 
 
 @pytest.fixture(scope="module")

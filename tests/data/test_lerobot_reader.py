@@ -153,20 +153,13 @@ def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_pa
 @pytest.mark.parametrize(
     "more",
     [
-        {"data_path": "{episode_index.foo}"},
-        {"data_path": "{episode_index:>9999999999}"},
-        {"data_path": "{episode_index!r}{episode_index"},
-        {"data_path": "../{episode_index:06d}.parquet"},
-        {"chunks_size": 0.5},
-        {"chunks_size": math.inf},
-        {"features": "text"},
-        {"features": None},
-        {"features": {"observation.state": ["a"]}},
-        {"fps": math.nan},
-        {"total_episodes": "many"},
+        {"data_path": "{episode_index.foo}"}, {"data_path": "{episode_index:>9999999999}"},
+        {"data_path": "{episode_index!r}{episode_index"}, {"data_path": "../{episode_index:06d}.parquet"},
+        {"chunks_size": 0.5}, {"chunks_size": math.inf}, {"features": "text"}, {"features": None},
+        {"features": {"observation.state": ["a"]}}, {"fps": math.nan}, {"total_episodes": "many"},
     ],
     ids=lambda more: str(*more.values())[:30],
-)
+)  # fmt: skip
 def test_metadata_of_other_types_is_refused(more: Any, tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1", **more)
     for read in (read_lerobot_episode, preview_file):
