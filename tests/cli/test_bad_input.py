@@ -86,7 +86,7 @@ def test_no_such_configuration(cli, pendulum):
     assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
     assert_refused(cli("check", folder), "this is a folder", "a YAML file")
     (folder / "list.yaml").write_text("- 1\n")
-    assert_refused(cli("solve", folder / "list.yaml"), "keys and values")
+    assert_refused(cli("solve", folder / "list.yaml"), "keys with values")
     (folder / "latin.yaml").write_bytes(b"description: \xe9\n")
     assert_refused(cli("solve", folder / "latin.yaml"), "UTF-8")
 

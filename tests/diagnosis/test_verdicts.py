@@ -221,7 +221,7 @@ def test_candidates_that_do_not_fit_are_refused(bench, short, candidates, words)
 @pytest.mark.parametrize("std", [None, 0.0])
 def test_a_noise_level_that_is_zero_or_absent_is_refused(bench, short, std):
     silent = replace(short, joints=replace(short.joints, effort_std=std))
-    refused(lambda: diagnose(bench.problem([silent]), FRICTION), "noise level")
+    refused(lambda: diagnose(bench.problem([silent]), FRICTION), "noise ")
 
 
 def test_held_out_data_must_be_other_data_and_the_papers_weighting_cannot_be_diagnosed(bench, short):

@@ -183,7 +183,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     ("scale", "options", "message"),
     [
         (1000, TrackOptions(), "metres"),
-        (1, TrackOptions(filters=vision.CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "camera's pose"),
+        (1, TrackOptions(filters=vision.CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "track.camera_pose"),
     ],
 )
 def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, message):

@@ -107,7 +107,7 @@ def test_gaps_are_cut_out_and_said(damaged, carried_out):
     file = damaged(lambda recording: without(recording, 0.55, 0.66))
     result = carried_out("solve", file, settings=["output.write_report=false"]).result
     assert [doubt["cause"] for doubt in result["doubts"]] == ["gap"]
-    assert "2 parts of it, 1.07 s, are used" in result["doubts"][0]["what"]
+    assert "2 parts of the data, 1.07 s, are used" in result["doubts"][0]["what"]
     assert result["fit"]["believed"]
 
 
