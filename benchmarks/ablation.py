@@ -17,7 +17,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.diagnosis import select, verdict
 from yid_ocp.diagnosis.blind_scores import rejudge_diagnosis_evidence
 from yid_ocp.files import read_input_json
@@ -70,18 +72,17 @@ def switched_off(name: str) -> Iterator[list[str]]:
     """Switch a rule off; gives the settings that do so, if it is a threshold."""
     if name in CONSTANTS:
         module, value = CONSTANTS[name]
-        before = getattr(module, name)
-        setattr(module, name, value)
-        yield []
-        setattr(module, name, before)
+        with mock.patch.object(module, name, value):
+            yield []
     elif name in CRITERIA:
         module, function, old, new = CRITERIA[name]
-        before, source = getattr(module, function), inspect.getsource(getattr(module, function))
+        source = inspect.getsource(getattr(module, function))
         if source.count(old) != 1:
             raise SystemExit(f"{name}: {function} has no longer one place with `{old}`")
-        exec(source.replace(old, new), vars(module))
-        yield []
-        setattr(module, function, before)
+        made: dict[str, Any] = {}
+        exec(source.replace(old, new), vars(module), made)
+        with mock.patch.object(module, function, made[function]):
+            yield []
     else:
         yield [f"diagnosis.{name}={NEUTRAL[name]}"] if name in NEUTRAL else []
 
@@ -101,8 +102,9 @@ def changes(folder: Path, settings: Sequence[str]) -> Counter[str]:
 
 def changes_of_known_cases(folder: Path, settings: Sequence[str]) -> Counter[str]:
     """How many cases of a folder of tasks have another verdict or other effects than with all rules."""
-    changed = {key.removeprefix("diagnosis."): float(value) for key, _, value in (s.partition("=") for s in settings)}
-    changed |= {key: int(changed[key]) for key in ("n_refit_pairs", "max_effects") if key in changed}
+    wanted = load_config(None, settings, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
+    names = [text.partition("=")[0].removeprefix("diagnosis.") for text in settings]
+    changed = {name: getattr(wanted, name) for name in names}
     count: Counter[str] = Counter()
     for file in sorted(folder.glob("*.json")):
         found = read_input_json(file).get("value") or {}

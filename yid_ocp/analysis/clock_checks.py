@@ -250,8 +250,7 @@ def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[Estima
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
         words = f"time stamps of {name} of {own} (stated: ± {1e3 * std:.3g} ms) are {said} by a fit; they are corrected"
-        if abs(shift) > _MAX_CLOCK_SHIFT_Z * std:
-            ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
+        if (ratio := abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)) > 1:
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
     return problem, issues
 

@@ -339,6 +339,14 @@ def elastic_joints_of_segment(system: System, segment: str) -> tuple[ElasticJoin
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
+def nominal_bending_stiffness_by_joint(system: System, segment: str) -> dict[str, float]:
+    """Return the nominal stiffness [N m/rad] of the joints that bend a segment, or of all its joints if none bends."""
+    springs = elastic_joints_of_segment(system, segment)
+    chosen = [spring for spring in springs if spring.deformation == "bend"] or springs
+    function = ca.Function("stiffness", [system.parameters.symbols], [s.stiffness for s in chosen])
+    return {s.joint_name: float(k) for s, k in zip(chosen, function.call([system.parameters.vector()]), strict=True)}
+
+
 def effort_limit_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:

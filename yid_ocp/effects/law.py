@@ -129,12 +129,9 @@ def _coordinate_indices_and_factors(system: System, location: str) -> dict[int, 
     index = system.mechanism.joint_index
     if location not in base.flexible_segment_names(system):
         return {index(location): 1.0}
-    springs = base.elastic_joints_of_segment(system, location)
-    bends = [spring for spring in springs if spring.deformation == "bend"] or [*springs]
-    values = ca.vertcat(*(spring.stiffness for spring in bends))
-    stiffness = ca.Function("stiffness", [system.parameters.symbols], [values])(system.parameters.vector()).full()[:, 0]
-    factors = stiffness / np.median(stiffness) if np.median(stiffness) > 0 else np.ones(len(bends))
-    return {index(spring.joint_name): float(own) for spring, own in zip(bends, factors, strict=True)}
+    stiffness = base.nominal_bending_stiffness_by_joint(system, location)
+    typical = float(np.median([*stiffness.values()])) if stiffness else 0.0
+    return {index(joint): own / typical if typical > 0 else 1.0 for joint, own in stiffness.items()}
 
 
 def _servo_input(state: MidpointStateSymbols, index: int) -> ca.SX:

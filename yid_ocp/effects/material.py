@@ -20,12 +20,8 @@ _MIN_LARGEST_ANGLE = 0.02  # minimum of that angle [rad]
 
 def _bending_stiffness(system: System, segment: str) -> float:
     """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
-    springs = elastic_joints_of_segment(system, segment)
-    chosen = [s.stiffness for s in springs if s.deformation == "bend"] or [s.stiffness for s in springs]
-    if not chosen:
-        return 1.0
-    function = ca.Function("stiffness", [system.parameters.symbols], [ca.vertcat(*chosen)])
-    return max(float(np.mean(np.array(function(system.parameters.vector())))), 1e-6)
+    stiffness = [*base.nominal_bending_stiffness_by_joint(system, segment).values()]
+    return max(float(np.mean(stiffness)), 1e-6) if stiffness else 1.0
 
 
 class _SegmentEffect(EffectBase):

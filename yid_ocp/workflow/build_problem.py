@@ -175,13 +175,13 @@ def build_problem(
     _check_grasps_close(run, problem)
     more = _object_point_issues(problem)
     _raise_for_issues(run, more)
-    stamped, (problem, clocks) = problem, problem_with_fitted_point_clocks(problem)
-    if problem is not stamped:  # issues that only the uncertain clock caused are dropped
+    as_stamped, (problem, clocks) = problem, problem_with_fitted_point_clocks(problem)
+    if problem is not as_stamped:  # issues that only the uncertain clock caused are dropped
         corrected = ([episode.recording for episode in group] for group in (problem.episodes, problem.held_out))
         _raise_for_issues(run, clocks)
         left = {(doubt.cause, doubt.recording) for doubt in _check_recordings(run, system, free, *corrected)[2]}
         issues = tuple(own for own in issues if own.weight == "warning" or (own.cause, own.recording) in left)
-    if more or problem is not stamped:
+    if more or problem is not as_stamped:
         problem = problem.with_options(replace(said, data_issues=(*issues, *more, *clocks)))
     return problem
 
