@@ -351,7 +351,6 @@ _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
     "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),
     "explained": _CalibrationRule("min_explained_fraction", _of("explained"), "named", "least", 0.75),
-    "carried": _CalibrationRule("always_allowed_transfer_z", _of("carried"), "named", "most", 3.0),
 }
 """All rules by name. `_STATISTIC_TEXTS` describes their statistics."""
 _STATISTIC_TEXTS = {
@@ -361,7 +360,6 @@ _STATISTIC_TEXTS = {
     "rival": "log odds of the most likely effect against the true one",
     "closure": "lower end of the closure by the best effect",
     "explained": "explained part of the gap",
-    "carried": "difference between recordings in standard deviations",
 }
 
 

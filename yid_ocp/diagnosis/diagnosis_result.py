@@ -126,7 +126,6 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. None: not known."""
     tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
-    differences = (entry.absolute_difference_and_std for entry in result.transfer_checks)
     smoothed = None if result.nominal_model.has_process_noise else result.smoother_result
     found = {
         "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
@@ -135,8 +134,6 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
         "closure_low": result.closure_by_selected_effects.ci_low,
         "explained": result.explained_fraction,
-        # largest difference between estimation and held-out estimates [standard deviations]
-        "carried": max((apart / std for apart, std in differences if std > 0), default=None),
         "behind": {
             fit.effects[-1].label: {"left": fit.held_out_loss.chi2_per_sample, "squares": bic_difference(fit, alone[0])}
             for fit in alone

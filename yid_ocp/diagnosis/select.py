@@ -18,7 +18,6 @@ from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 
-_MODEL_ERROR_CHI2 = 1e3  # chi2/n above which the residual is model error, not noise
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
 # of what effects explain: a model's response to them errs by 5 %, as links and time step are finite, and leaves this
 _MIN_CHI2_FRACTION = 0.05**2
@@ -114,9 +113,8 @@ def _near_best_models(
 ) -> list[tuple[RefitStatistics, float]]:
     """Models that the recordings cannot distinguish from the best one, with their distance from it, 0 to 1.
 
-    Plausible models come first. If the best one leaves only noise, the distance is a log odds in units of what decides.
-    Otherwise it is the held-out error in units of its standard error, and of equals the simplest is first. A model that
-    is not plausible is then the best one only if no plausible model explains enough.
+    If the best one leaves only noise, the distance is a log odds in units of what decides. Otherwise it is the held-out
+    error in units of its standard error, and the simplest of the models comes first.
     """
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
@@ -129,14 +127,10 @@ def _near_best_models(
         distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:
-        most = (1 - limits.min_explained_fraction) * nominal.held_out_loss.excess_chi2_per_sample
-        enough = [fit for fit in fits if fit.held_out_loss.excess_chi2_per_sample <= most]
-        best = min((fit for fit in enough if _is_plausible(fit, limits)), key=_chi2, default=best)
         distances = [_distance_in_prediction(fit, best) for fit in fits]
         ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
-    near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
-    near.sort(key=lambda own: (not _is_plausible(own[0], limits), *own[2]))
-    return [(fit, distance) for fit, distance, _ in near]
+    near = sorted(zip(fits, distances, ranks, strict=True), key=lambda own: own[2])
+    return [(fit, distance) for fit, distance, _ in near if distance <= 1]
 
 
 def _chi2(fit: RefitStatistics) -> float:
@@ -146,23 +140,15 @@ def _chi2(fit: RefitStatistics) -> float:
 def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> float:
     """Held-out loss beyond that of the best model, and the mean logarithm of blocks' ratios, in standard errors.
 
-    The larger of both counts, because a few large blocks dominate the error of the sum. If model error dominates, fewer
-    parameters outweigh a larger loss as in BIC, with blocks as samples.
+    The larger of both counts, because a few large blocks dominate the error of the sum.
     """
     loss, best = fit.held_out_loss, other.held_out_loss
-    (lost, error), count = held_out_improvement_and_error(loss, best), len(best.block_chi2)
-    is_model_error = best.chi2_per_sample > _MODEL_ERROR_CHI2
-    fewer = other.total_effect_parameter_count - fit.total_effect_parameter_count if is_model_error else 0
-    if lost <= math.expm1(fewer * math.log(count) / count) * best.chi2_per_sample:
+    lost, error = held_out_improvement_and_error(loss, best)
+    if lost <= 0:
         return 0.0
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
-    spread = float(np.std(ratios, ddof=1)) / math.sqrt(count)
+    spread = float(np.std(ratios, ddof=1)) / math.sqrt(len(ratios))
     return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
-
-
-def _is_plausible(fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the parameters of the effect that was added last have usual values."""
-    return not fit.implausible_parameters(fit.effects[-1], limits)
 
 
 def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:

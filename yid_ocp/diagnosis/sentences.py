@@ -105,12 +105,10 @@ def _gap(result: DiagnosisResult) -> str:
     tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
     fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
     sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
-    unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    detectable, samples = f"{sum(seen)} of {len(seen)}", tests[0].degrees_of_freedom
-    needed = result.thresholds.min_samples_per_unknown * unknowns
-    said = f"{samples:.0f} effective samples for {unknowns} unknowns (at least {needed:.0f} are needed)"
+    unknowns, count = len(result.nominal_model.values), len(result.screening.detectability)
+    said = f"{tests[0].degrees_of_freedom:.0f} effective samples for {unknowns} unknowns"
     texts = {
-        "insufficient_data": f"The data are insufficient: {said}; {detectable} candidates are detectable.",
+        "insufficient_data": f"The data are insufficient: {said}; none of {count} candidates is detectable.",
         "no_gap": f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).",
     }
     if result.verdict in texts:

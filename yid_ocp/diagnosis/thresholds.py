@@ -33,7 +33,6 @@ class Thresholds:
     gap_significance_level: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance level of a gap, of all residuals or along a candidate")
     ] = 1e-4
-    min_samples_per_unknown: Annotated[float, Gt(0), OptionInfo("effective samples needed for every unknown")] = 3.0
     # which candidates are worth a refit
     n_refit_per_round: Annotated[int, Ge(1), OptionInfo("number of candidates refitted per round")] = 6
     n_refit_pairs: Annotated[int, Ge(0), OptionInfo("pairs of candidates refitted if one effect leaves a gap")] = 4
@@ -48,10 +47,6 @@ class Thresholds:
     prior_range_margin_in_widths: Annotated[
         float, Ge(0), OptionInfo("how far a value may leave its usual range: in widths, or a factor of 1 + this")
     ] = 1.0
-    transfer_rtol: Annotated[
-        float, Ge(0), OptionInfo("relative difference by which an effect may differ on held-out recordings")
-    ] = 0.3
-    always_allowed_transfer_z: Annotated[float, Gt(0), OptionInfo("allowed difference in standard deviations")] = 4.5
     min_explained_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("explained fraction or closure that one effect must reach")
     ] = 0.75

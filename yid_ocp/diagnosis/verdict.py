@@ -82,15 +82,14 @@ class NominalModelGapEvidence:
         is_along_candidate = bonferroni_corrected_min_candidate_p_value(seen) < limits.gap_significance_level
         return self.has_left_baseline or is_along_candidate or self.exceeds_noise(limits)
 
-    def are_data_sufficient(self, limits: Thresholds) -> bool:
-        """Check whether the data suffice for the nominal model's unknowns, and whether any candidate is detectable."""
-        is_seen = any(entry.is_detectable for entry in self.screening.detectability)
-        enough = limits.min_samples_per_unknown * len(self.nominal_model.values)
-        return is_seen and self.nominal_test.degrees_of_freedom >= enough
+    @property
+    def are_data_sufficient(self) -> bool:
+        """Whether any candidate is detectable in these data."""
+        return any(entry.is_detectable for entry in self.screening.detectability)
 
     def warrants_search(self, limits: Thresholds) -> bool:
         """Check whether there may be a gap and the data suffice to search for its cause."""
-        return self.may_have_gap(limits) and self.are_data_sufficient(limits)
+        return self.may_have_gap(limits) and self.are_data_sufficient
 
 
 @dataclass(frozen=True)
@@ -181,7 +180,6 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     Refits and screenings are requested by name and can come from a record, so the verdict depends on numbers alone.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
-    exceeds, suffice = evidence.exceeds_noise(limits), evidence.are_data_sufficient(limits)
     fits, added = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...]()
     if evidence.warrants_search(limits):
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
@@ -196,7 +194,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             last = _inflate_fit_stds_by_disagreement(last, carried)
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
-        verdict, reason = _verdict(said, exceeds, suffice, limits)
+        verdict, reason = _verdict(said, evidence.exceeds_noise(limits), evidence.are_data_sufficient, limits)
         return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
     said = judged(added)
@@ -244,29 +242,23 @@ def _check_effect_amplitude_transfer(
     again = search.refit_on_held_out(fit)
     if again is None:
         return ()
-    return tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again, search.thresholds))
+    return tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again))
 
 
-def _compare(
-    effect: EffectBase, first: RefitStatistics, second: RefitStatistics, limits: Thresholds
-) -> list[EffectAmplitudeTransferCheck]:
-    """Comparison of the amplitudes of one effect in two fits."""
-    neutral, found, moved = effect.neutral_values, [], False
-    width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
-    size = max(
-        abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_parameter_names
-    )
+def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics) -> list[EffectAmplitudeTransferCheck]:
+    """Comparison of the amplitudes of one effect in two fits.
+
+    Recordings that disagree by as much as the effect differs from neutral do not determine it.
+    """
+    found, away = [], []
     for name in effect.amplitude_parameter_names:
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
-        apart, spread = entry.absolute_difference_and_std
-        allowed = max(limits.always_allowed_transfer_z * spread, limits.transfer_rtol * size * width[name])
-        # recordings that disagree by as much as the effect differs from neutral do not determine it
-        moved |= abs(entry.estimation_value - neutral[name]) > _DISAGREEMENT_Z * entry.std_of_significant_disagreement
-        # an unknown standard deviation is no evidence against transfer
-        found.append(replace(entry, is_consistent=not apart > allowed))
-    return [replace(entry, is_consistent=entry.is_consistent and moved) for entry in found]
+        least = _DISAGREEMENT_Z * entry.std_of_significant_disagreement
+        away.append(abs(entry.estimation_value - effect.neutral_values[name]) > least)
+        found.append(entry)
+    return [replace(entry, is_consistent=any(away)) for entry in found]
 
 
 def _inflate_fit_stds_by_disagreement(
