@@ -349,9 +349,16 @@ def _selected(
     return SelectedEffect(effect, fit, closed, tuple(effects[i] for i in kept), tuple(shares[kept].tolist()))
 
 
-def selected_effect_alone(
-    entry: SelectedEffect, nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
+def first_effect_alone(
+    added: Sequence[SelectedEffect], nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> SelectedEffect:
-    """Return `entry` as the only selected effect, with its equivalent effects among the `fits` of single effects."""
+    """Return the first effect as the only selected one, with its equivalent effects among the `fits` of single effects.
+
+    Its standard deviations are at least as large as the change of its parameters by the other effects.
+    """
+    first, fit, full = added[0], added[0].refitted_model, added[-1].refitted_model
+    std = {
+        name: max(fit.std[name], abs(fit.values[name] - full.values[name])) for name in first.effect.parameters.names
+    }
     near = [(fit.effects[-1], distance) for fit, distance in _near_best_models(nominal, fits, limits)]
-    return _selected(entry.effect, entry.refitted_model, entry.cumulative_closure, near)
+    return _selected(first.effect, replace(fit, std={**fit.std, **std}), first.cumulative_closure, near)

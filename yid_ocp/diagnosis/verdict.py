@@ -200,7 +200,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     said = judged(added)
     if said.verdict == "unknown" and len(added) > 1:
         # a further effect that only corrects errors of the first is no reason to doubt this one
-        alone = judged((select.selected_effect_alone(added[0], nominal, fits, limits),))
+        alone = judged((select.first_effect_alone(added, nominal, fits, limits),))
         said = alone if alone.verdict != "unknown" else said
     search.end_stage("carry_over")
     return said
