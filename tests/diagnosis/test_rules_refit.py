@@ -273,7 +273,7 @@ def test_where_the_model_with_all_candidates_fails_there_are_none(monkeypatch):
 
 
 def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypatch):
-    """Of ten seconds each: one, from which the pace is known, the two that end within 35 s, one more, and no other."""
+    """Of ten seconds each, one after the other: four begin within 35 s."""
     now, tried, batches = [0.0], [((effect(f"{kind}@x"),), {}) for kind in "abcdef"], []
 
     def one(problem, effects, start, store, name, limits):
@@ -288,7 +288,7 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     monkeypatch.setattr(module, "refit_with_effects", one)
     monkeypatch.setattr(module, "map_with_merged_calls", batched)
-    search, march = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0), [["a"], ["b", "c"], ["d"]]
+    search, march = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0), [["a"], ["b"], ["c"], ["d"]]
     found = refit_with_each_effect(search, (), tried, {})
     assert ([f.effects[-1].kind for f in found], batches, search.skipped) == ([*"abcd"], march, ["e@x", "f@x"])
     assert refit_with_each_effect(search, (), tried[:1], {}) == []

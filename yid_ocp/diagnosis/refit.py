@@ -424,14 +424,12 @@ def refit_with_each_effect(
     together = {effect.label: effect for effects, _ in tried for effect in (*base, *effects)}
     search.rounds.append((tuple(together.values()), len(tried)))
     fits: list[RefitStatistics | None] = []
-    rest, begun = list(tried), time.perf_counter()
-    while rest and not search.record_skip_if_past_deadline(*(join_effect_labels(effects) for effects, _ in rest)):
-        # a batch is cheaper than single refits; with a deadline, only as many as fit, best first
-        now = time.perf_counter()
-        paced = len(rest) if search.deadline == math.inf else (search.deadline - now) * len(fits) / (now - begun + 1e-9)
-        count = max(int(paced), 1)
-        batch, rest = rest[:count], rest[count:]
-        fits += map_with_merged_calls(one, batch)
+    # a batch is cheaper than single refits, which a deadline needs
+    size = len(tried) if search.deadline == math.inf else 1
+    for i in range(0, len(tried), size):
+        if search.record_skip_if_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
+            break
+        fits += map_with_merged_calls(one, tried[i : i + size])
     return [fit for fit in fits if fit is not None and math.isfinite(fit.held_out_loss.total_chi2)]
 
 

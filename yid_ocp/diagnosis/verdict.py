@@ -160,13 +160,13 @@ def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) 
 
     A gap that is seen only along a candidate's signature counts only with an accepted effect.
     """
-    reason: UnknownVerdictReason = ""
-    if not said.selected_effects:
-        reason = "none"
-    elif said._largest_explained_fraction < said.required_total_explained_fraction(limits):
-        reason = "little"
-    elif said.failed_transfer_checks:
-        reason = "stand_in"
+    explains_little = said._largest_explained_fraction < said.required_total_explained_fraction(limits)
+    reasons: tuple[tuple[UnknownVerdictReason, bool], ...] = (
+        ("none", not said.selected_effects),
+        ("little", explains_little),
+        ("stand_in", bool(said.failed_transfer_checks)),
+    )
+    reason: UnknownVerdictReason = next((name for name, holds in reasons if holds), "")
     if not suffice:
         return "insufficient_data", ""
     if reason:
