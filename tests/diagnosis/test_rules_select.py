@@ -368,6 +368,22 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     assert alone.compose()[1] == ["b"]
 
 
+def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it(monkeypatch):
+    _, chosen, found = Rounds(monkeypatch, GROWING).compose(max_effects=1)
+    assert (chosen, found[0].extended_models) == (["a"], ())
+    entry = Rounds(monkeypatch, GROWING | {"ab": (3.1, 3.2), "ac": (3.1, 3.2)}).compose(max_effects=2)[2][0]
+    assert [fit.effects[-1].kind for fit in entry.extended_models] == ["b", "c"]
+    name, value = next(iter(entry.refitted_model.values.items()))
+    moved = [
+        replace(fit, values=fit.values | {name: value + by})
+        for fit, by in zip(entry.extended_models, (0.3, -0.4), strict=True)
+    ]
+    for lost, std in ((loss(3.0, 3.2), math.sqrt(0.125)), (loss(1.0, 1.0), 0.01)):
+        own = replace(entry, refitted_model=replace(entry.refitted_model, held_out_loss=lost))
+        found = select.with_stds_that_include_model_error(replace(own, extended_models=tuple(moved)), LIMITS)
+        assert found.std[name] == pytest.approx(std)
+
+
 LITTLE = {"": (1.6, 1.8), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
 
 

@@ -58,6 +58,7 @@ class SelectedEffect:
     cumulative_closure: GapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
+    extended_models: tuple[RefitStatistics, ...] = ()  # `refitted_model` with one plausible effect more
 
 
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
@@ -212,7 +213,7 @@ def select_effects(
     effect comes first (its last fit if no other effect is selected), then all other fits by held-out loss.
     """
     limits, alone, chosen, before = search.thresholds, screened, _Choice(nominal), nominal
-    first: list[RefitStatistics] = []
+    first, later = list[RefitStatistics](), list[RefitStatistics]()
     while len(chosen.fit.effects) < limits.max_effects:
         base, current = chosen.fit.effects, chosen.fit
         if base:
@@ -232,6 +233,7 @@ def select_effects(
         if len(base) == 1:
             pairs = _pairs_to_refit(search, alone, base[0])
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
+        later += fits if base else []
         near = _near_best_models(nominal, _plausible_beside(base, fits, limits) if base else fits, limits)
         first = first or sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
         better = next((fit for fit, _ in near if _is_needed(current, fit, limits)), None)
@@ -249,7 +251,7 @@ def select_effects(
     if len(chosen.fit.effects) == 1:
         # its last fit may differ from its first one
         first = [chosen.fit, *(fit for fit in first if fit.effects != chosen.fit.effects)]
-    return tuple(first), _with_closures(search, nominal, chosen, first)
+    return tuple(first), _with_closures(search, nominal, chosen, first, later)
 
 
 def _promised_fraction(nominal: RefitStatistics, current: RefitStatistics, screened: ScreeningResult) -> float:
@@ -323,7 +325,11 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
 
 
 def _with_closures(
-    search: RefitContext, nominal: RefitStatistics, chosen: _Choice, first: Sequence[RefitStatistics]
+    search: RefitContext,
+    nominal: RefitStatistics,
+    chosen: _Choice,
+    first: Sequence[RefitStatistics],
+    later: Sequence[RefitStatistics],
 ) -> tuple[SelectedEffect, ...]:
     """The selected effects in order, each with the fit of all effects up to it (or of all, if that fit fails)."""
     effects, found = chosen.fit.effects, []
@@ -332,7 +338,9 @@ def _with_closures(
         again = f"{join_effect_labels(effects[:i])} again"
         fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
         closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        found.append(_selected(effect, fit, closed, chosen.rivals[effect.label]))
+        more = [other for other in later if other.effects[:-1] == fit.effects]
+        more = _plausible_beside(fit.effects, more, search.thresholds)
+        found.append(replace(_selected(effect, fit, closed, chosen.rivals[effect.label]), extended_models=tuple(more)))
     return tuple(found)
 
 
@@ -349,16 +357,24 @@ def _selected(
     return SelectedEffect(effect, fit, closed, tuple(effects[i] for i in kept), tuple(shares[kept].tolist()))
 
 
-def first_effect_alone(
-    added: Sequence[SelectedEffect], nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
+def selected_effect_alone(
+    entry: SelectedEffect, nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> SelectedEffect:
-    """Return the first effect as the only selected one, with its equivalent effects among the `fits` of single effects.
-
-    Its standard deviations are at least as large as the change of its parameters by the other effects.
-    """
-    first, fit, full = added[0], added[0].refitted_model, added[-1].refitted_model
-    std = {
-        name: max(fit.std[name], abs(fit.values[name] - full.values[name])) for name in first.effect.parameters.names
-    }
+    """Return `entry` as the only selected effect, with its equivalent effects among the `fits` of single effects."""
     near = [(fit.effects[-1], distance) for fit, distance in _near_best_models(nominal, fits, limits)]
-    return _selected(first.effect, replace(fit, std={**fit.std, **std}), first.cumulative_closure, near)
+    found = _selected(entry.effect, entry.refitted_model, entry.cumulative_closure, near)
+    return replace(found, extended_models=entry.extended_models)
+
+
+def with_stds_that_include_model_error(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:
+    """Return the refit of `entry`, with stds of at least the rms change of a value by one effect more.
+
+    This holds if the refit leaves a gap, in which any further effect may have a part.
+    """
+    fit, std = entry.refitted_model, dict(entry.refitted_model.std)
+    if _leaves_noise(fit, limits) or not entry.extended_models:
+        return fit
+    for name in (name for effect in fit.effects for name in effect.parameters.names):
+        moved = [other.values[name] - fit.values[name] for other in entry.extended_models]
+        std[name] = max(std[name], float(np.sqrt(np.mean(np.square(moved)))))
+    return replace(fit, std=std)

@@ -191,6 +191,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             last = chosen[-1].refitted_model
             explained = _explained_fraction(nominal, last, limits)
             carried = _check_effect_amplitude_transfer(search, last)
+            last = select.with_stds_that_include_model_error(chosen[-1], limits)
             last = _inflate_fit_stds_by_disagreement(last, carried)
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
@@ -200,7 +201,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     said = judged(added)
     if said.verdict == "unknown" and len(added) > 1:
         # a further effect that only corrects errors of the first is no reason to doubt this one
-        alone = judged((select.first_effect_alone(added, nominal, fits, limits),))
+        alone = judged((select.selected_effect_alone(added[0], nominal, fits, limits),))
         said = alone if alone.verdict != "unknown" else said
     search.end_stage("carry_over")
     return said
