@@ -197,9 +197,12 @@ def test_an_input_that_is_no_regular_file_is_refused_at_once(tmp_path, name, kin
 
 
 @pytest.mark.parametrize("text", [b"\xff", b"{", b"[" * 100_000])
-def test_json_that_is_none_is_refused(tmp_path, text):
+def test_json_that_is_none_is_refused(tmp_path, monkeypatch, text):
     (tmp_path / "a.json").write_bytes(text)
     with pytest.raises(DataError):
+        read_input_json(tmp_path / "a.json")
+    monkeypatch.setattr(Path, "read_text", Mock(side_effect=OSError(5, "any words")))
+    with pytest.raises(DataError, match=r"\(Input/output error\)(.|\n)*try: copy it again"):
         read_input_json(tmp_path / "a.json")
 
 

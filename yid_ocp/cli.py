@@ -516,10 +516,10 @@ def _failed(error: Exception, as_json: bool) -> int:
         hint = "read the output to its end, or write it to a file"
         return _wrong(OutputError(what, where="standard output", allowed="an open pipe or file", hint=hint), False)
     if isinstance(error, OSError):
-        what = f"the operating system refused access: {error.strerror or error}"
-        allowed = "a path with the needed permissions and free disk space"
-        hint = "check permissions and free disk space"
-        return _wrong(OutputError(what, where=str(error.filename or ""), allowed=allowed, hint=hint), as_json)
+        what = f"the operating system reports: {error.strerror or error}"
+        where, allowed = str(error.filename or "files of this command"), "usable paths, and enough free disk space"
+        hint = "check the path" if isinstance(error, FileNotFoundError) else "check permissions and free disk space"
+        return _wrong(OutputError(what, where=where, allowed=allowed, hint=hint), as_json)
     if isinstance(error, ValueError) and "embedded null" in str(error):  # what Python says of a NUL in a path
         what, allowed = "a path contains a null character", "paths without null characters"
         return _wrong(ConfigError(what, where="command line", allowed=allowed, hint="correct the path"), as_json)

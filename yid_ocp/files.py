@@ -97,8 +97,9 @@ def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = os_error_reason(error) if isinstance(error, OSError) else "it is not UTF-8 text"
-        what = f"the file cannot be read ({reason})"
-        raise DataError(what, where=str(path), allowed="text in UTF-8", hint="save it as UTF-8") from error
+        hint = "copy it again from its source" if isinstance(error, OSError) else "save it as UTF-8"
+        what, allowed = f"the file cannot be read ({reason})", "readable text in UTF-8"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
 
 
 def read_input_json(path: Path) -> Any:

@@ -9,6 +9,7 @@ import pathlib
 import re
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import h5py
 import pytest
@@ -166,20 +167,13 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
     assert "did you mean 'max_iterations'?" in wrong.err
     assert json.loads(cli("solve", "--json", "--sett", "a").out)["what"] == "there is no option '--sett'"
     assert cli("solve", "--sett", "a").out == ""
-
-    def broken(arguments):
-        raise ZeroDivisionError("no good")
-
-    monkeypatch.setattr("yid_ocp.workflow.check.run_and_return_exit_code", broken)
+    broken, command = Mock(side_effect=ZeroDivisionError("no good")), "yid_ocp.workflow.check.run_and_return_exit_code"
+    monkeypatch.setattr(command, broken)
     bug = cli("check", pendulum, "--json")
     said = json.loads(bug.out)
     assert (bug.code, said["exit_code"], said["kind"], said["what"]) == (3, 3, "bug", "ZeroDivisionError: no good")
     pathlib.Path(said["where"]).unlink()  # which is there
-
-    def stopped(arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("yid_ocp.workflow.check.run_and_return_exit_code", stopped)
+    monkeypatch.setattr(command, Mock(side_effect=KeyboardInterrupt))
     ended = cli("check", pendulum, "--json")
     assert (ended.code, json.loads(ended.out)["exit_code"]) == (130, 130)
 
@@ -340,10 +334,7 @@ def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulu
     done = cli("check", pendulum, "--out", "c")
     assert done.code == 0, done.err
     assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in done.out
-
-    def unread(*arguments, **more):
-        raise ValueError("no such joint type")
-
+    unread = Mock(side_effect=ValueError("no such joint type"))
     monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", unread)
     done = cli("check", pendulum, "--out", "d")
     assert "warning: double_pendulum.urdf is not compared, because Pinocchio cannot read it: no such joint" in done.out

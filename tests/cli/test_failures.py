@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -45,10 +47,7 @@ def test_a_rollout_that_fails_leaves_reason_and_best_point(carried_out, pendulum
 
 
 def test_a_bug_is_told_from_wrong_input(cli, pendulum, left_nothing, monkeypatch):
-    def broken(*arguments, **named):
-        raise ZeroDivisionError("a mistake of ours")
-
-    monkeypatch.setattr(estimation, "solve", broken)
+    monkeypatch.setattr(estimation, "solve", Mock(side_effect=ZeroDivisionError("a mistake of ours")))
     done = cli("solve", pendulum)
     assert done.code == 3
     assert "Traceback" not in done.err
@@ -107,10 +106,10 @@ def test_an_interrupted_or_killed_run_does_not_look_finished(pendulum, tmp_path,
 
 
 def test_a_full_disk_is_the_users_business(cli, pendulum, left_nothing, monkeypatch):
-    def full(*arguments):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("yid_ocp.workflow.run_folder.os.replace", full)
+    with monkeypatch.context() as patch:
+        patch.setattr(estimation, "solve", Mock(side_effect=FileNotFoundError(2, "No such file", "a")))
+        assert re.search("reports: No such file\n.*: a\n.*\n  try: check the path\n", cli("solve", pendulum).err)
+    monkeypatch.setattr("yid_ocp.workflow.run_folder.os.replace", Mock(side_effect=OSError(28, "No space left on")))
     done = cli("solve", pendulum)
     assert done.code == 2
     assert "No space left on device" in done.err

@@ -44,7 +44,7 @@ def test_markers_of_a_file(tmp_path: Path) -> None:
     assert np.allclose(points.position, 1e-3 * written, equal_nan=True)
     assert np.argwhere(np.isnan(points.position).all(axis=2)).tolist() == [[2, 1], [4, 0]]
     assert sorted(recording.notes) == [
-        "*3 was left out (it has no label)",
+        "*3 was left out (without label)",
         "LKneeAngles was left out (result of a body model)",
         "force was left out (an analog channel)",
         "gone was left out (never seen)",
@@ -83,6 +83,9 @@ def test_files_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     write_c3d(tmp_path / "inch.c3d", unit="inch")
     with pytest.raises(DataError, match="unit of the markers is 'inch'"):
         read_c3d(tmp_path / "inch.c3d")
+    write_c3d(tmp_path / "none.c3d", ("*1", "LKneeAngles"))
+    with pytest.raises(DataError, match="no usable marker: 1 without label, 1 result of a body model"):
+        read_c3d(tmp_path / "none.c3d")
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(DataError, match="needs the package ezc3d") as caught:
         read_c3d(tmp_path / "run.c3d")

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -147,13 +148,16 @@ def test_csv_errors(case: str, tmp_path: Path) -> None:
     assert hint in caught.value.hint
 
 
-def test_csv_that_is_no_text(tmp_path: Path) -> None:
+def test_csv_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
     absent = tmp_path / "absent.csv"
     for file, message in ((path, "table in UTF-8"), (tmp_path, "this is a folder"), (absent, "no such file")):
         with pytest.raises(DataError, match=message):
             read_csv(file)
+    monkeypatch.setattr("csv.reader", Mock(side_effect=OSError(5, "any words")))
+    with pytest.raises(DataError, match=r"cannot be read \(Input/output error\)(.|\n)*try: copy it again"):
+        read_csv(path)
 
 
 def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monkeypatch):

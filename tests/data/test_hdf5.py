@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -165,9 +166,9 @@ MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
     "format not UTF-8": (lambda f: f.attrs.create("format", np.bytes_(b"\xff\xfe")), "not UTF-8", ""),
     "group": (lambda f: f.move("joints", "joint"), "no group 'joint'", "did you mean 'joints'"),
     "dataset at the top": (lambda f: f.create_dataset("points", data=[1.0]), "'points' is not a group", ""),
-    "dataset": (lambda f: f.move("joints/effort", "joints/efort"), "no dataset 'efort'", "did you mean 'effort'"),
-    "dataset of points": (lambda f: f.move("points_arm/position", "points_arm/xyz"), "no dataset 'xyz'", ""),
-    "attribute": (lambda f: f["joints"].attrs.create("effrt_std", 1.0), "no attribute 'effrt_std'", "'effort_std'"),
+    "dataset": (lambda f: f.move("joints/effort", "joints/efort"), "unknown dataset, 'efort'", "did you mean 'effort'"),
+    "dataset of points": (lambda f: f.move("points_arm/position", "points_arm/xyz"), "unknown dataset, 'xyz'", ""),
+    "attribute": (lambda f: f["joints"].attrs.create("effrt_std", 1.0), "unknown attribute, 'effrt_std'", "effort_std"),
     "no t": (lambda f: f["joints"].__delitem__("t"), "dataset 't' is missing", ""),
     "no position": (lambda f: f["points_arm"].__delitem__("position"), "dataset 'position' is missing", ""),
     "no names": (lambda f: f["joints"].attrs.pop("names"), "attribute 'names' is missing", ""),
@@ -232,11 +233,7 @@ def test_files_of_other_tools(file: Path) -> None:
 
 def test_a_recording_that_cannot_be_written_leaves_the_old_one(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = file.read_bytes()
-
-    def refuse(source: object, target: object) -> None:
-        raise PermissionError(13, "no")
-
-    monkeypatch.setattr(os, "replace", refuse)
+    monkeypatch.setattr(os, "replace", Mock(side_effect=PermissionError(13, "no")))
     with pytest.raises(OutputError, match="Permission denied"):
         write_recording(example().time_slice(0.0, 0.1), file)
     assert [entry.name for entry in file.parent.iterdir()] == ["run.h5"]

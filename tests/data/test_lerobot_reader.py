@@ -120,8 +120,9 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
         table = table.set_column(table.schema.get_field_index(name), name, [values])
     parquet.write_table(table, file)
     if asked:
-        with pytest.raises(DataError, match="unit of the joint positions is unknown"):
+        with pytest.raises(DataError, match="unit of the joint positions is unknown") as caught:
             read_any(path)
+        assert ("position=rad" in caught.value.allowed) == (robot == "panda")
         recording = read_any(path, units={"position": "rad", "position_command": "rad"})
     else:
         recording = read_any(path)
@@ -139,7 +140,7 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
         ({"fps": "fast"}, {}, 'fps = "fast" is not allowed'),
         ({"features": {"action": {}}}, {}, "no observation.state"),
         ({}, {"joints": ["elbow"], "units": {"position": "deg"}}, "no joint 'elbow'"),
-        ({}, {"episode": 1}, "unit of the joint positions is unknown: they reach 131"),
+        ({}, {"episode": 1}, "unit of the joint positions is unknown: the largest absolute value is 131"),
     ],
     ids=["beyond", "negative", "lost", "version", "rate", "text", "state", "joint", "degrees"],
 )

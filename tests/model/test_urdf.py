@@ -193,7 +193,7 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
     for word in [*words, str(path)]:
         assert word in str(caught.value)
     (tmp_path / "page.urdf").write_text("<html></html>")
-    with pytest.raises(ModelError, match="the URDF cannot be read: 'name' is missing"):
+    with pytest.raises(ModelError, match="the URDF cannot be read: an element has no 'name'"):
         read_urdf(tmp_path / "page.urdf")
 
 

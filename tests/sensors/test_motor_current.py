@@ -116,8 +116,8 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
     assert made.sensor_setting_keys == ("joints.effort", "joints.position", "motors_left.current")
     for change, message in (
         (lambda file: file.create_group("motor"), "no group 'motor'"),
-        (lambda file: file["motors_left"].create_dataset("voltage", data=T), "no dataset 'voltage'"),
-        (lambda file: file["motors_left"].attrs.update(voltage_std=1.0), "no attribute 'voltage_std'"),
+        (lambda file: file["motors_left"].create_dataset("voltage", data=T), "unknown dataset, 'voltage'"),
+        (lambda file: file["motors_left"].attrs.update(voltage_std=1.0), "unknown attribute, 'voltage_std'"),
         (lambda file: file["motors_left/current"].attrs.update(unit="mA"), "the unit of the dataset is 'mA'"),
         (lambda file: file["motors_left"].__delitem__("t"), "the dataset 't' is missing"),
         (lambda file: file["motors_left"].__delitem__("current"), "the group has no dataset"),
@@ -134,9 +134,9 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
     [
         ({"values_by_quantity": {"current": np.zeros((400, 2))}}, r"shape \(400, 2\)"),
         ({"values_by_quantity": {"current": np.full((401, 2), np.nan)}}, "not finite"),
-        ({"values_by_quantity": {"voltage": np.zeros((401, 2))}}, "kind of sensor have no dataset 'voltage'"),
+        ({"values_by_quantity": {"voltage": np.zeros((401, 2))}}, "unknown dataset, 'voltage'"),
         ({"noise_and_bias_stds_by_attribute": {"current_std": -1.0}}, "current_std is -1.0"),
-        ({"name": "engines"}, "kind of sensor have no dataset 'current'"),
+        ({"name": "engines"}, "unknown dataset, 'current'"),
         ({"t": T[::-1]}, "does not advance"),
     ],
 )
@@ -153,7 +153,7 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
         (SensorOptions(constants={"torque_constant": 0.0}), {}, "a torque constant is zero"),
         (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "joint 'shoulder' has no value"),
         (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "noise level of the motor currents"),
-        (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder'"),
+        (KNOWN, {"names": ("elbow", "sholder")}, "joint 'sholder', which the model lacks"),
         (replace(KNOWN, use=False), {}, "no sensor of the model has a measurement"),
         (KNOWN, {"t": T[:1], "values_by_quantity": {"current": np.zeros((1, 2))}}, "0 s of efforts are too short"),
         (

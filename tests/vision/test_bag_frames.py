@@ -157,8 +157,9 @@ def test_messages_of_one_time_are_told_apart(tmp_path):
 def test_what_a_bag_lacks_is_said(tmp_path, fill, options, message):
     with Film(tmp_path, "db3 folder") as bag:
         fill(bag)
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=message) as caught:
         read_frames(bag.path, **{"pose": POSE, **options})
+    assert "--field" not in caught.value.hint  # which `track` does not have
 
 
 def test_a_cloud_without_places_and_a_cut_off_one_are_bad_frames(tmp_path):

@@ -326,17 +326,16 @@ class Recording(ReprMixin):
 def validated_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
     """Check shapes, clocks, names, values and units of a recording, and return it unchanged.
 
-    `allow_nan_effort` permits NaN in `effort` and `external_effort`. `where` names the recording in errors (default:
-    its name).
+    `allow_nan_effort` permits NaN in `effort` and `external_effort`. Errors call the recording `where`, or its name.
 
     Raises
     ------
     DataError
         There is no group, or a group is empty. Names are repeated or do not match the arrays. A clock is not finite and
-        strictly increasing. A joint value is not finite. A point has infinite coordinates, or one or two coordinates.
-        A standard deviation is negative. The kind of effort is unknown. A pose is not a rigid transform. Positions of
-        joints exceed 50 rad or points 50 m, which indicates degrees or millimetres. Speeds or efforts are beyond any
-        machine. `marker_reference_pose` does not match the first group of points.
+        strictly increasing. A joint value is not finite. A point has an infinite coordinate, or one or two NaN (three
+        NaN: not seen). A standard deviation is negative. The kind of effort is unknown. A pose is not a rigid
+        transform. A joint position exceeds 50 rad or a coordinate 50 m, which indicates degrees or millimetres. A speed
+        or effort is beyond any machine. `marker_reference_pose` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
     allowed, hint = "a group of joints, points or another sensor", "add joints or points"
@@ -374,7 +373,7 @@ def _sampled(t: Array) -> str:
 def raise_data_error_unless(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
     """Raise a `DataError` with the texts `what`, `where`, `allowed` and `hint` unless a condition holds."""
     if not condition:
-        hint = hint or "correct this entry of the recording, or import the original data again"
+        hint = hint or "correct the entry that `where` names, or import the original data again"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -478,7 +477,7 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     raise_data_error_unless(own, "the group has no dataset of measured values", where, allowed, hint)
     for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:
-            what = f"groups of this kind of sensor have no {noun} '{name}'"
+            what = f"the group has an unknown {noun}, '{name}'"
             raise_data_error_unless(name in known, what, where, **unknown_name_error_arguments(name, known))
     for quantity, values in own.items():
         parts = len(declared[quantity].components)

@@ -166,11 +166,11 @@ def _read_group(
         ("attribute", set(map(str, group.attrs)), attributes, set(required)),
     ):
         for name in sorted(found - set(known)):
-            what, hint = f"groups of this kind have no {noun} '{name}'", f"rename or delete the {noun}"
+            what, hint = f"the group has an unknown {noun}, '{name}'", f"rename or delete the {noun}"
             raise DataError(what, where=where, **unknown_name_error_arguments(name, known, hint))
         for name in sorted(wanted - found):
             what, hint = f"the {noun} '{name}' is missing", f"add the {noun}, or leave the group out"
-            raise DataError(what, where=where, allowed=", ".join(known), hint=hint)
+            raise DataError(what, where=where, allowed=f"groups with {', '.join(sorted(wanted))}", hint=hint)
     what, is_twice = "`std` is both a dataset and an attribute", "std" in group and "std" in group.attrs
     raise_data_error_unless(not is_twice, what, where, "a dataset or an attribute", "delete one of them")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
@@ -221,11 +221,11 @@ _MAX_GROUP_DEPTH = 10
 
 
 def check_readable_in_child_process(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
-    """Check in a forked process that a file can be read. A crash of the library then cannot end this process.
+    """Check in a forked process that a file of the format `noun` can be read. A crash then ends only that process.
 
     `complaint` reads the file in the fork and returns a description of the error, empty on success. Raises `DataError`
-    with this description, or if the file (of the format `noun`) is not a regular file, or if the fork crashes. A fork
-    is used because a new process takes a second, and pool processes may have no children.
+    with this description, if `path` is not a regular file, or if the fork crashes or takes longer than `_READ_TIMEOUT`.
+    A new Python process in place of the fork would take a second, and the processes of a pool may not start one.
     """
     files.check_input_file(path)
     if not hasattr(os, "fork"):
@@ -262,8 +262,8 @@ def check_readable_in_child_process(path: Path, complaint: Callable[[Path], str]
         what = answer[1:]
     if what:
         most = f"{files.MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
-        allowed = f"an undamaged {noun} file of at most {most}, without links to other files"
-        hint = "copy the file again from its source; if this does not help, export or import the original data again"
+        allowed = f"an undamaged {noun} file with at most {most} in total, without links to other files"
+        hint = "if it is damaged, copy it again from its source; otherwise export or import the original data again"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
 
 

@@ -208,7 +208,7 @@ def _parsed(file: Path) -> SimpleNamespace:
     except ModelError:
         raise
     except Exception as error:  # a malformed file raises many kinds
-        reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "what", error)
+        reason = f"an element has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
         allowed, hint = "a URDF file with links and joints", "check it with check_urdf, or export it again"
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 

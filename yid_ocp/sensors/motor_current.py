@@ -54,7 +54,7 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraSensor) ->
     for name in group.names:
         if name not in around.system.mechanism.joint_names:
             said = unknown_name_error_arguments(name, around.system.mechanism.joint_names)
-            raise DataError(f"the model has no joint '{name}'", where=where, **said)
+            raise DataError(f"the motor currents name joint '{name}', which the model lacks", where=where, **said)
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)

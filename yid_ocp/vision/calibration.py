@@ -301,7 +301,8 @@ class _Calibrator:
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
-                raise _UntoldError("no clock offset fits enough frames", "check the time stamps of the frames")
+                told = f"one clock offset fits only {len(chosen)} of {len(used)} frames, {_MIN_FRAMES} are needed"
+                raise _UntoldError(told, "check the frames' time stamps: one clock without jumps")
         presence = seen_occluded_and_seen_through_surface_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= _MIN_ARM_COVERAGE * free:
@@ -368,7 +369,7 @@ class _Calibrator:
                 chosen.append(StampedCloud(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _MIN_FRAMES:
             hint = "check the specified pose and the unit of the clouds"
-            raise _UntoldError("the points of the clouds do not lie on the arm", hint)
+            raise _UntoldError(f"only {len(chosen)} frames have points on the arm, {_MIN_FRAMES} are needed", hint)
 
         def cost(state: CameraState) -> RobustCostDerivatives:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]

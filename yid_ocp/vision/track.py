@@ -116,8 +116,8 @@ class FrameTracker:
         anywhere = options.root_placement != "model"
         if anywhere and scene.robot_urdf is not None:
             hint = "set track.options.root_placement to model, or model.robot to null"
-            what, where = "a robot holds the object, so the model determines its root", "track.options.root_placement"
-            raise ConfigError(what, where=where, allowed="model", hint=hint)
+            what = f"root_placement is '{options.root_placement}', but the robot that holds the object gives its place"
+            raise ConfigError(what, where="track.options.root_placement", allowed="model", hint=hint)
         if anywhere:
             system, loose = system_with_free_root(system, values)
         self.system, self.parameter_values = system, values

@@ -31,8 +31,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     """Read and check a recording in any known format. The path's suffix selects the reader.
 
     Formats: HDF5 recording, CSV file, rosbag, MCAP file, ROS 2 bag folder, C3D file, LeRobot dataset. `options` are
-    those of the reader in `READERS`. Raises `DataError` if the format or an option is unknown, or the reader refuses
-    the file.
+    those of the reader in `READERS`. Raises `DataError` for an unknown format or option, or if the reader raises it.
     """
     path = Path(path)
     known_as = _format_of(path)

@@ -112,11 +112,10 @@ class OpenBag:
             what = f"there are no {noun} on the topic '{name}'"
             raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known))
 
-    def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
+    def no_usable_topics_error(self, what: str, allowed: str, hint: str = "give another bag") -> DataError:
         """Return the `DataError` for a bag without usable topics. Its text lists the topics of the bag."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "none"
-        where, hint = f"{self.path}, topics: {held}", "choose a field by --field, or another bag"
-        return DataError(what, where=where, allowed=allowed, hint=hint)
+        return DataError(what, where=f"{self.path}, topics: {held}", allowed=allowed, hint=hint)
 
 
 def time_since_first_message_function(
@@ -194,7 +193,8 @@ def read_bag(
     if not groups and not seen and not bag.mounted:
         kinds = ", ".join((*_KNOWN, _TREES[0]))
         allowed = f"topics of the types {kinds}, or fields of any: --field position=/TOPIC.FIELD"
-        raise bag.file.no_usable_topics_error("the bag has no joint states and no points", allowed)
+        what, hint = "the bag has no joint states and no points", "name a topic's field by --field, or another bag"
+        raise bag.file.no_usable_topics_error(what, allowed, hint)
     places = [message for entries in seen.values() for _, message in entries]
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]
     seconds = time_since_first_message_function(used_messages)

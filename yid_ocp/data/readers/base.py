@@ -82,7 +82,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
 
 def _set_unit(units: dict[str, str], quantity: str, unit: str) -> None:
     if units.setdefault(quantity, unit) != unit:
-        what, hint = f"'{quantity}' has two units, {units[quantity]} and {unit}", f"leave one out: {quantity}={unit}"
+        what, hint = f"'{quantity}' has two units, {units[quantity]} and {unit}", f"keep one, such as {quantity}={unit}"
         raise DataError(what, where="--units", allowed="one unit for every quantity", hint=hint)
 
 
@@ -249,8 +249,7 @@ def joints_on_fastest_clock(
     """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
-    its periods around it. Raises `DataError`, with `hint`, if sources share a joint, differ in channels, or share no
-    time.
+    its periods around it. Raises `DataError` (with `hint`) if sources share a joint or no time, or differ in channels.
     """
     if len(groups) == 1:
         return groups[0][1], ()

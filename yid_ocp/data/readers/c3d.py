@@ -109,12 +109,12 @@ def _markers(path: Path) -> _Markers:
     why = {}
     for i, label in enumerate(labels):
         unlabelled = not label or label.startswith("*")
-        reason = "result of a body model" if label in computed else "it has no label" if unlabelled else ""
+        reason = "result of a body model" if label in computed else "without label" if unlabelled else ""
         if reason or unseen[:, i].all():
             why[i] = reason or "never seen"
     kept = [i for i in range(len(labels)) if i not in why]
     if not kept:
-        what = "no labelled marker of the C3D file was ever seen"
+        what = "the C3D file has no usable marker: " + ", ".join(f"{n} {r}" for r, n in Counter(why.values()).items())
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label markers, and export again")
     others = []
     for i, reason in why.items():

@@ -29,7 +29,7 @@ from yid_ocp.data.recording import (
     SensorChannelGroup,
 )
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
-from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256
+from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256, os_error_reason
 from yid_ocp.sensors import CHANNEL_KINDS
 
 _MOUNTED = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
@@ -254,7 +254,9 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
                 if any(map(str.strip, cells)) and not cells[0].lstrip().startswith(("#", "sep=")):
                     yield lines.line_num, cells
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        what, hint = "the file is not a table in UTF-8 text", "export it as CSV in UTF-8"
+        what, hint = f"the file is not a table in UTF-8 text ({error})", "export it as CSV in UTF-8"
+        if isinstance(error, OSError):
+            what, hint = f"the file cannot be read ({os_error_reason(error)})", "copy it again from its source"
         raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8", hint=hint) from error
 
 

@@ -131,8 +131,8 @@ def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None
     if widest <= _MAX_RADIANS and not _NEVER_RADIANS.search(robot):
         return
     of = f", and LeRobot does not record a {robot} in radians" if _NEVER_RADIANS.search(robot) else ""
-    what = f"the unit of the joint positions is unknown: they reach {widest:.3g}{of}"
-    allowed, hint = "--units deg, or --units position=rad", "--units deg"
+    what = f"the unit of the joint positions is unknown: the largest absolute value is {widest:.3g}{of}"
+    allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "--units deg"
     if widest <= _MAX_NORMALISED:
         hint = "--units deg if the robot was recorded with use_degrees=true. Otherwise the values are normalised to "
         hint += "the calibrated range (-100 to 100) and cannot be converted: record again with use_degrees=true"
