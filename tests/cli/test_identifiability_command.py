@@ -186,7 +186,7 @@ def test_a_part_that_fails_is_said(run, tmp_path, monkeypatch):
 
     failing.__module__, failing.__qualname__ = "yid_ocp.workflow.identifiability", "profiled"
     monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", failing)
-    words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
+    words = r"2 of 2 tasks failed; the first failure is that of spring_1.stiffness, SolverError: no s(.|\n)*mend it"
     with pytest.raises(ParallelWorkError, match=words):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
 

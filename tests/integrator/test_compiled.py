@@ -5,6 +5,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from unittest.mock import Mock
 
 import casadi as ca
 import numpy as np
@@ -107,10 +108,7 @@ def test_derivatives_that_the_cache_has_are_not_derived_again(parts, urdf_folder
 
     first, turned = swept(names), swept(names[::-1])
     np.testing.assert_array_equal(turned, first[:, :, ::-1])
-
-    def derive(*_):
-        raise AssertionError("derived again")
-
+    derive = Mock(side_effect=AssertionError("derived again"))
     monkeypatch.setattr(codegen, "parameter_jacobian_function", derive)
     np.testing.assert_array_equal(swept(names), first)
     with pytest.raises(AssertionError, match="derived again"):

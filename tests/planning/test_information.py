@@ -260,6 +260,10 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
         plan_informative_motion(blind, replace(OPTIONS, parameters_to_identify=("shoulder.damping",)))
     for word in ("information about shoulder.damping", "a parameter that changes readings", "standard deviations"):
         assert word in str(caught.value)
+    options = SimpleNamespace(clamp_pose_point_names="a")
+    clamped = SimpleNamespace(system=problem.system, episodes=[None], options=options)
+    with pytest.raises(ConfigError, match=r"a plan cannot move clamps(.|\n)*try: let a robot"):
+        SplineMotionExperiment.from_options(clamped, {}, OPTIONS)
 
 
 @pytest.mark.parametrize(

@@ -222,9 +222,10 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
     ("more", "words"),
     [
         ({"target_position": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "nearer target")),
-        ({"point": "tipp"}, ("no frame 'tipp'",)),
+        ({"point": "tipp"}, ("no frame 'tipp'", "where: plan.point\n")),
+        ({"goal": "box", "frames_in_box": ("tipp",)}, ("no frame 'tipp'", "where: plan.frames_in_box\n")),
         ({"point": None}, ("plan.point is missing",)),
-        ({"point_target_offset_from_start": (0.0, 0.1, 0.0)}, ("is given twice", "either plan.target_position")),
+        ({"point_target_offset_from_start": (0.0, 0.1, 0.0)}, ("is given twice", "plan.target_position, plan.point_t")),
         ({"target_position": None}, ("the target of the point is not given",)),
         ({"start_joint_positions": {"shoulder": 1.5}}, ("starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2")),
         ({"start_joint_positions": {"sholder": 0.5}}, ("'sholder' is not a joint", "did you mean 'shoulder'?")),
@@ -246,5 +247,6 @@ def test_what_is_refused(moved, wanted, more, words):
 
 
 def test_a_system_without_moved_joints_is_refused(urdf_folder, wanted):
-    with pytest.raises(ConfigError, match="the model has no arm with prescribed joints"):
-        plan_motion_to_target(pendulum_step(urdf_folder), wanted)
+    for driven, what in (((), "the model has no arm with prescribed"), (["elbow"], "'elbow' is driven, not pre")):
+        with pytest.raises(ConfigError, match=what):
+            plan_motion_to_target(pendulum_step(urdf_folder, driven=driven), wanted)

@@ -186,7 +186,7 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
     for arguments, parts in (
         ((found, "--format", "usd"), ["no format 'usd'", "allowed: mjcf", "UsdPhysics has no schema for cables"]),
         ((found, "--format", "csv"), ["a run folder cannot be written as CSV", "export a recording"]),
-        ((recording, "--format", "mjcf"), ["is not a run folder", "solve"]),
+        ((recording, "--format", "mjcf"), ["the format mjcf needs a run folder", "solve"]),
         ((broken,), ["result.json", "not JSON"]),
         ((tmp_path,), ["no finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),

@@ -425,6 +425,8 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "too many links": ((*CABLE, "--links", "99"), "99 links", "--links"),
     "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
+    "other number": (("--object", "tapered_rod", "--number", "tip_radus=1"), "is not an additional", "'tip_radius'?"),
+    "number alone": (("--object", "tapered_rod", "--number", "tip_radius"), "not an additional", "tip_radius=NUMBER\n"),
     "grasp of no point": ((*CABLE, "--grasp", "hub"), "is not FRAME=POINT", "FRAME=POINT"),
     "import flags of a recording": ((*CABLE, "--units", "deg"), "is a recording already", "leave"),
 }  # fmt: skip

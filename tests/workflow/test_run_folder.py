@@ -10,6 +10,7 @@ import re
 import shlex
 from importlib import metadata
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -166,15 +167,12 @@ def test_a_name_that_cannot_be_a_new_folder_is_refused(settings, tmp_path, monke
 
 
 def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, monkeypatch):
-    def full(*arguments):
-        raise OSError(28, "No space left on device")
-
     def fail_in_task(file):
         with pytest.raises(OutputError) as failed:
             write_text(file, "a")
         raise ParallelWorkError(f"3 tasks failed: {failed.value}", hint="mend it")
 
-    monkeypatch.setattr("yid_ocp.files.os.replace", full)
+    monkeypatch.setattr("yid_ocp.files.os.replace", Mock(side_effect=OSError(28, "No space left on device")))
     with (
         pytest.raises(OutputError, match="No space left") as caught,
         atomic_run_folder(settings, tmp_path / "runs" / "run") as folder,

@@ -179,8 +179,9 @@ def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
     """Read the sealed labels of cases from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
-        what, hint = "the labels differ from the commitment", "use the file labels.json that was written with it"
-        raise DataError(what, where="sealed labels", allowed=f"text with SHA-256 {commitment[:12]}...", hint=hint)
+        what, hint = "the labels are not those sealed before the diagnosis", "restore this file of the blind test"
+        where, allowed = "sealed/labels.json", f"the file with the SHA-256 in commitment.json, {commitment[:12]}..."
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
 
 

@@ -237,7 +237,7 @@ class CompiledKernel:
         made = _filled(_StepMaps, *widths, _doubles(inputs), *map(_doubles, loads), after, effort)
         motion, given = self._motion(count, theta, None, None, feedback, None), (along.multipliers, along.torque)
         if self._call("yid_step_maps", motion, _along(along.state, *given), made) != NewtonStatusCode.OK:
-            raise np.linalg.LinAlgError("the equations of a step are singular")
+            raise np.linalg.LinAlgError("the equations of a time step have a singular Jacobian")
         return after, effort
 
     def _call(self, function: str, *structs: _Struct) -> int:

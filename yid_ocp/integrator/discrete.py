@@ -261,9 +261,9 @@ def _summed_terms(
         at_rest.update(terms.static_equations)
         closed += [] if terms.force_with_derivatives is None else [terms.force_with_derivatives]
     if missing := [name for name in names if name not in equations]:
-        what = f"internal coordinate '{missing[0]}' has no equation"
-        hint = "return it in `internal_equations` of the effect"
-        raise ModelError(what, where="effects of the model", allowed="one equation per internal coordinate", hint=hint)
+        own = next(e for e in system.effects if missing[0] in e.internal_coordinate_symbols)
+        what, hint = f"internal coordinate '{missing[0]}' has no equation", "return one in its `internal_equations`"
+        raise ModelError(what, where=f"{own.kind}@{own.location}", allowed="one equation per coordinate", hint=hint)
     parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
     summed = ForceWithFactoredDerivatives(*(sum(rest, first) for first, *rest in parts)) if closed else None
     internal = [ca.vertcat(ca.SX(0, 1), *(rows[name] for name in names)) for rows in (equations, equations | at_rest)]

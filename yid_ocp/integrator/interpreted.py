@@ -232,7 +232,7 @@ class InterpretedKernel:
             point = self._point(theta, along.state[k], along.state[k + 1], along.multipliers[k], u)
             moved = self._moved(slopes(point)[0], wanted, feedback, before, k, loads)
             if moved is None:
-                raise np.linalg.LinAlgError("the equations of a step are singular")
+                raise np.linalg.LinAlgError("the equations of a time step have a singular Jacobian")
             found.append((moved[0], np.vstack([moved[2], moved[1] / self._model.time_step])))
         return np.array([one[0] for one in found]), np.array([one[1] for one in found])
 

@@ -143,13 +143,13 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     if not failed:
         return [entry.value for entry in results]
     first, _, rest = failed[0].error.partition("\n")
-    what = f"{len(failed)} of {len(results)} tasks failed, {failed[0].name} with {first}"
+    what = f"{len(failed)} of {len(results)} tasks failed; the first failure is that of {failed[0].name}, {first}"
     ours = {kind.__name__ for kind in YidError.__subclasses__()}
     if first.partition(":")[0] in ours:
-        told = "; ".join(line.strip() for line in rest.splitlines())
-        what = f"{what}; {told}" if told else what
-        where, hint = f"task '{failed[0].name}'", "correct this cause and run the same command: it repeats failed tasks"
-        raise ParallelWorkError(what, where=where, allowed="tasks without errors", hint=hint)
+        told = dict(line.strip().partition(": ")[::2] for line in rest.splitlines())  # as `YidError.__str__` writes it
+        where = f"task '{failed[0].name}': {told.get('where', 'its arguments')}"
+        hint = f"{told.get('try', 'correct this cause')}; then run the same command, which repeats failed tasks"
+        raise ParallelWorkError(what, where=where, allowed=told.get("allowed", "tasks without errors"), hint=hint)
     raise RuntimeError(f"{what}; the same command tries them again")
 
 
@@ -186,7 +186,7 @@ def _mapped(value: Any, change: Callable[[Path], Any]) -> Any:
         return [_mapped(entry, change) for entry in value]
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    raise TypeError(f"a task takes plain data and paths, not {type(value).__name__}")
+    raise TypeError(f"a task has an argument of type {type(value).__name__}, which is neither plain data nor a Path")
 
 
 @dataclass(frozen=True, eq=False)

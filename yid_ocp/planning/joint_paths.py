@@ -108,13 +108,13 @@ class PlanOptions:
 
 
 class FramePositionEvaluator:
-    """A compiled function of the world positions of frames, with Jacobian. Raises `ConfigError` for unknown frames."""
+    """A compiled function of frames' world positions, with Jacobian. `ConfigError` at `where` for unknown frames."""
 
-    def __init__(self, system: System, names: Sequence[str]) -> None:
+    def __init__(self, system: System, names: Sequence[str], where: str = "plan.point") -> None:
         for name in names:
             if not system.mechanism.has_frame(name):
                 said = unknown_name_error_arguments(name, system.point_frames)
-                raise ConfigError(f"there is no frame '{name}'", where="plan.point or plan.frames_in_box", **said)
+                raise ConfigError(f"there is no frame '{name}'", where=where, **said)
         self.names = tuple(names)
         with CASADI_LOCK:
             q, theta = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*(entry.symbol for entry in system.parameters))

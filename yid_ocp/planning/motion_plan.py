@@ -79,6 +79,7 @@ def plan_motion_to_target(
     system = step.system
     if system.driven or not system.prescribed:
         what, hint = "the model has no arm with prescribed joints", "set model.robot, and model.arms.mode: prescribed"
+        what = f"joint '{system.driven[0]}' is driven, not prescribed" if system.driven else what
         raise ConfigError(what, where="plan", allowed="a robot whose arm joints are all prescribed", hint=hint)
     known = ParameterCovarianceBeforePlan() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
@@ -125,17 +126,17 @@ def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluato
         raise ConfigError("plan.point is missing", where="plan.point", allowed=allowed, hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
-    inside = FramePositionEvaluator(system, boxed) if options.goal == "box" else None
+    inside = FramePositionEvaluator(system, boxed, "plan.frames_in_box") if options.goal == "box" else None
     return FramePositionEvaluator(system, [options.point, *calm]), inside
 
 
 def _place(options: PlanOptions, begin: Array) -> Array:
     if (options.target_position is None) == (options.point_target_offset_from_start is None):
-        what, hint = "the target of the point is not given", "set one of these two keys"
+        keys = "plan.target_position", "plan.point_target_offset_from_start"
+        what, hint = "the target of the point is not given", f"set {keys[0]} or {keys[1]}"
         if options.target_position is not None:
-            what, hint = "the target of the point is given twice", "set one of these two keys to null"
-        allowed, where = "either plan.target_position or plan.point_target_offset_from_start", "plan.target_position"
-        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
+            what, hint = "the target of the point is given twice", "set one of the two keys to null"
+        raise ConfigError(what, where=", ".join(keys), allowed="one of the two keys", hint=hint)
     if options.goal == "path" and not options.point_waypoint_offsets_from_start:
         what, where = "the path has no waypoints", "plan.point_waypoint_offsets_from_start"
         hint = "list waypoints, such as [[0, 0, 0.1]]"

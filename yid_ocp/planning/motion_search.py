@@ -1,8 +1,7 @@
 """Search for motions within limits that reach a goal or give the most information.
 
 To reach a goal, single shooting is used. The trust region keeps the bounds of the unknowns. An augmented Lagrangian
-keeps all other limits: a row g <= u adds rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until all rows
-are satisfied.
+keeps all other limits: a row g <= u adds rho/2 max(0, g - u + lam/rho)^2 to the cost; lam is raised until all hold.
 
 To maximise information, each round linearises the sensitivities J(w) and the limits, and SLSQP (Kraft 1988, DFVLR-FB
 88-28) maximises the criterion of the linear J within a trust region (Burke and Ferris 1995, doi:10.1007/BF01585997).
@@ -285,7 +284,7 @@ class DOptimalityCriterion:
     parameter_columns: tuple[int, ...]
 
     def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Return the criterion [nat] and, if `slope`, its gradient (nr, columns) with respect to `rows`."""
+        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`, empty without `slope`."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
@@ -319,7 +318,7 @@ class EffectDiscriminationCriterion:
         return found
 
     def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Return the criterion [nat] and, if `slope`, its gradient with respect to sensitivities `rows` (nr, nx)."""
+        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`, empty without `slope`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)

@@ -66,8 +66,10 @@ class SplineMotionExperiment:
         """
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_point_names or not (system.driven or system.prescribed):
-            said, allowed = "the model has no robot arm that a plan can move", "robot arms that move, without clamps"
-            raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
+            said, hint = "the model has no robot arm that a plan can move", "set model.robot and model.arms"
+            if problem.options.clamp_pose_point_names:
+                said, hint = "a plan cannot move clamps that follow recorded points", "let a robot hold the object"
+            raise ConfigError(said, where="plan", allowed="robot arms that move, without clamps", hint=hint)
         if system.servos:
             what = "motions cannot be planned for servos, whose commands differ from their motion"
             hint = "set model.arms.mode: prescribed for the plan"
@@ -171,12 +173,12 @@ class SplineMotionExperiment:
         return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
     def planned_sensitivities_to_unknowns(self, w: Array) -> Array:
-        """Return the whitened sensitivities of the recording planned with `w` to relative changes of the unknowns."""
+        """Return derivatives (nr, nx) of whitened residuals of motion `w` per change of an unknown by its size."""
         return self._weighted(self.planned_estimation_problem(w))
 
     @property
     def existing_recording_sensitivities(self) -> Array:
-        """The whitened sensitivities of existing recordings to relative changes of the problem's unknowns."""
+        """Derivatives (nr, nx) of the existing recordings' whitened residuals per change of an unknown by its size."""
         problem = self.configured_problem.with_parameter_values(self.parameter_values)
         return self._weighted(problem.with_free_parameters_without_recompiling(self.free_parameters))
 

@@ -280,8 +280,9 @@ def recording_with_sensor_error(
     joints = recording.joints
     assert joints is not None
     if joints.effort is None:
-        allowed, hint = "recordings with efforts of the joints", f"remove the effect {kind}"
-        raise ModelError("the recording has no efforts", where=f"{kind}@{location}", allowed=allowed, hint=hint)
+        what = f"recording '{recording.name}' has no joint efforts, from which the effect {kind} is computed"
+        where, allowed = f"{kind}@{location}", "recordings with joint efforts"
+        raise ModelError(what, where=where, allowed=allowed, hint="remove this effect")
     if kind == "effort_delay":
         effort = joints.effort.copy()
         # an effort acts only after the delay, so the recording contains it earlier

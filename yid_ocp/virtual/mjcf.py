@@ -170,8 +170,7 @@ def _actuation(
 ) -> tuple[float, float, float, float]:
     """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
 
-    The true value is gain x recorded - offset, delayed and with a first-order lag. The last of `effects` is applied
-    first.
+    The true value is gain x recorded - offset, delayed and with first-order lag. The last of `effects` acts first.
     """
     true = reading = ca.SX.sym("reading")
     channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
@@ -448,12 +447,13 @@ def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: b
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
-            allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
+            allowed = "rigid grasps" if not emulate else "rigid grasps, or compliant grasps of the kind point"
             what, hint = f"grasp '{grasp.name}' is compliant, which MuJoCo cannot express", "set its compliance to 0"
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():
         if value._is_zero_at_parameter_values(compliance):
-            hint, what = "remove the effect that adds the compliance", f"the compliance of joint '{joint}' is zero"
+            what = f"the compliance of joint '{joint}' is zero, an infinite stiffness, which MuJoCo cannot express"
+            hint = "remove the effect that adds the compliance"
             raise ModelError(what, where=f"joint '{joint}'", allowed="a compliance above zero", hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):

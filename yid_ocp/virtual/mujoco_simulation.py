@@ -132,10 +132,11 @@ def simulate_in_mujoco(
     injected: InjectedSimulatorTerms | None = None,
     gear_play: Mapping[str, float] | None = None,
 ) -> SimulationResult:
-    """Simulate in MuJoCo a controller that moves the driven joints along a motion, from equilibrium at initial angles.
+    """Simulate a system in MuJoCo while a controller moves its driven joints along a motion, from equilibrium.
 
-    Position servos are MuJoCo actuators, whose commands follow the motion. Raises `ModelError` if MuJoCo cannot express
-    the system (`mujoco_xml`), if it has prescribed or no driven joints, does not settle, or diverges.
+    Position servos are MuJoCo actuators, whose commands follow the motion. Parameters without an entry in `values` are
+    nominal. Raises `ModelError` if MuJoCo cannot express the system (`mujoco_xml`), or if the system has a prescribed
+    joint or no driven joint, does not settle, or diverges.
 
     Parameters
     ----------

@@ -261,8 +261,9 @@ def _check_recordings(
         doubts += _excitation(run, arm, free, kept[0])
     _raise_for_issues(run, doubts)
     if not kept[0]:
-        hint = "record without this: " + "; ".join(own.what for own in doubts if own.cause in ("gap", "clock_jump"))
-        what, allowed = "no recording has a usable part between its gaps", "0.5 s from the start or a rest without gap"
+        gaps = dict.fromkeys(own.what.partition(";")[0] for own in doubts if own.cause in ("gap", "clock_jump"))
+        what, hint = f"no recording has a usable part: {'; '.join(gaps)}", "record again without such gaps"
+        allowed = "0.5 s without a gap" + ", from the start of a recording or from a rest" * (not anywhere)
         raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(doubts)
 

@@ -74,7 +74,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         raise ConfigError("a run folder cannot be written as CSV", where="--format csv", allowed=allowed, hint=hint)
     if not source.is_dir() and form not in (None, "csv", _MCAP):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
-        what, hint = f"{source.name} is not a run folder", "choose --format csv, or give a run folder"
+        what, hint = f"the format {form} needs a run folder, not {source.name}", "give a run folder, or --format csv"
         raise ConfigError(what, where=f"--format {form}", allowed=allowed, hint=hint)
     contents: dict[str, Any] = {"notes": []}
     texts: list[str] = []

@@ -18,7 +18,7 @@ from yid_ocp.config.schema import config_json_schema, option_info_from_annotatio
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_RECORDING_GROUP
 from yid_ocp.display import Progress
-from yid_ocp.errors import ConfigError, DataError, OutputError, require_known_names
+from yid_ocp.errors import ConfigError, DataError, OutputError, nearest_name_question, require_known_names
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitialObjectSettings, init_object_templates, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
@@ -89,13 +89,14 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
     links = template.default_links if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
         raise ConfigError(f"the object has {links} links", where="--links", allowed="a whole number from 1 to 64")
-    numbers = {name: getattr(arguments, name) for name in ("length", "mass", "radius")}
+    numbers, known = {name: getattr(arguments, name) for name in ("length", "mass", "radius")}, template.further_numbers
     for text in arguments.number:
         name, equals, value = text.partition("=")
-        if name not in template.further_numbers or not equals:
-            allowed = ", ".join(f"{key}=NUMBER, {words}" for key, words in template.further_numbers.items())
+        if name not in known or not equals:
+            allowed = ", ".join(f"{key}=NUMBER, {words}" for key, words in known.items())
             what = f"'{text}' is not an additional number of a {word}"
-            raise ConfigError(what, where="--number", allowed=allowed or "none", hint="leave it out")
+            hint = f"write {name}=NUMBER" if name in known else nearest_name_question(name, known) or "leave it out"
+            raise ConfigError(what, where="--number", allowed=allowed or "none", hint=hint)
         numbers[name] = parse_comma_separated_numbers(value, 1, "--number")[0]
     for name, number in numbers.items():
         if number is not None and not 0 < number < float("inf"):

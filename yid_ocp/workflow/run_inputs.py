@@ -93,8 +93,8 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
         yield
         unchanged = all(set(registry) == names for registry, names in zip(registries, before, strict=True))
         if unchanged and not known:
-            allowed = "@EFFECTS.register(NAME), @SENSOR_READERS.register(NAME) or @register_report_section(...)"
-            raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
+            allowed = "@EFFECTS.register(NAME), or another decorator that docs/howto/extending.md describes"
+            raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add one of these")
     except (Exception, SystemExit) as error:
         for registry, names in zip(registries, before, strict=True):
             registry.unregister_names(set(registry) - names)
