@@ -47,7 +47,7 @@ class _PinocchioComparison:
 
     @property
     def words(self) -> str:
-        """The sentence on the agreement, or on each difference."""
+        """One sentence, which says that the model agrees with Pinocchio, or what differs and by how much."""
         parts = {"mass matrix": self.mass, "weight": self.weight, "inverse dynamics": self.motion}
         if self.agrees_within_rounding:
             said = f"{self.of}: mass matrix, weight and inverse dynamics agree with Pinocchio's"

@@ -227,9 +227,8 @@ def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | Non
 def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
     """Compute the sparsity patterns of the Jacobians of one step, by name.
 
-    `dR_dy` is the Jacobian of the step's residual with respect to its unknowns. `dR_dtheta` is the Jacobian of all rows
-    with respect to the parameters. `A` (state), `B_u` (input) and `B_theta` (parameters) are the Jacobians of the next
-    state.
+    `dR_dy` is the Jacobian of the step's residual with respect to its unknowns, `dR_dtheta` that of all rows with
+    respect to the parameters. `A` (state), `B_u` (input), `B_theta` (parameters) are Jacobians of the next state.
     """
     whole = ca.DM.ones(symbols.full_jacobian_sparsity_pattern).full() > 0
     system = symbols.equations.system

@@ -198,7 +198,7 @@ class _Choice:
     rivals: Mapping[str, Sequence[tuple[EffectBase, float]]] = field(default_factory=dict)  # by label
 
     def replaced(self, fit: RefitStatistics, near: Sequence[tuple[EffectBase, float]]) -> _Choice:
-        """The choice with other effects; the last has the rivals `near`, and effects that stay keep theirs."""
+        """Return the choice of the effects in `fit`. The last gets the rivals `near`, the others keep their rivals."""
         kept = {effect.label: self.rivals.get(effect.label, ()) for effect in fit.effects}
         return _Choice(fit, kept | {fit.effects[-1].label: near})
 

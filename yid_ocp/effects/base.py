@@ -236,7 +236,7 @@ def grasp_names(system: System) -> tuple[str, ...]:
 
 
 def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
-    """Return the joint names of each arm. An arm is named after its grasp, else `left` or `right`, else `gripper`."""
+    """Return joint names by arm. An arm's name is its grasp, else its joints' `left` or `right`, else `gripper`."""
     joints, tree = arm_joint_names(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:

@@ -180,7 +180,7 @@ class _JointPresliding(EffectBase):
 
     @property
     def max_abs_initial_internal_coordinates(self) -> Mapping[str, float]:
-        """Bound 1 on the initial |s|. The initial `s` of every recording is estimated."""
+        """The bound 1 on |s| at the start. The initial internal coordinate s of every recording is estimated."""
         return dict.fromkeys(self.internal_coordinate_symbols, 1.0)
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:

@@ -146,7 +146,7 @@ class _CubicStiffness(_SegmentEffect):
     )
 
     def with_prior_ranges_for_largest_angles(self, largest: Mapping[str, float]) -> _CubicStiffness:
-        """Return the effect with a prior range of k3 for the segment's largest joint angle in the data."""
+        """Return the effect with the prior range of its cubic stiffness scaled by 1 / (segment's largest angle)^2."""
         if self.location not in largest:
             return self
         factor = (_REFERENCE_ANGLE / max(largest[self.location], _MIN_LARGEST_ANGLE)) ** 2

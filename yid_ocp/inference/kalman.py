@@ -69,7 +69,7 @@ class KalmanStepMatrices:
     transition: StateTransition
 
     def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
-        """Compute the normalized innovations of `measured` (r, c), and the state means (nx, c) after the step."""
+        """Compute normalized innovations of `measured` (r, c) and next state means (nx, c). Columns are independent."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 

@@ -69,7 +69,7 @@ class SmoothedDisturbances:
 
 @dataclass(frozen=True)
 class SmoothedUnknownsResult:
-    """The result of the weak-constraint smoother: smoothed unknowns, and the evidence for each group of them."""
+    """The result of the weak-constraint smoother: smoothed unknowns, and the log evidence that each group adds."""
 
     smoothed_unknowns: tuple[SmoothedDisturbances, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # variance at the largest evidence [squared reference]
@@ -393,8 +393,7 @@ def force_log_likelihood_coefficients(
     """Return g (J,) and L (J, J) in the log likelihood g'f - f'L f / 2 of an unknown with values f (J,) in J intervals.
 
     `unknown` is the index of the unknown; f is in units of the unknown's reference standard deviation. Free parameters,
-    states and all other unknowns are integrated out; `variance` gives the variances of their groups [squared
-    reference].
+    states and other unknowns are integrated out; `variance` has the variances of their groups [squared reference].
     """
     count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
     moved = np.zeros((len(model.initial_state_std), count))

@@ -95,10 +95,10 @@ class WhiteningFilter:
     torque_bias_std: Array  # standard deviation of b after all measurements, shape (nu,) [N m]
 
     def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten the columns `rows` (r, c), and estimate the constant torque errors (nu, c) [N m] from all rows.
+        """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
 
-        The first column of `rows` is a residual in units of sensor noise, all other columns are its derivatives. `push`
-        (N, nu, c) holds the tracking filter's correction of the torque [N m] and its derivatives, in the same order.
+        All arrays have c columns: value, then derivatives. `rows` (r, c) is the residual in units of sensor noise.
+        `push` (N, nu, c) is the torque [N m] that the tracking filter adds in each of N steps; None without a filter.
         """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
@@ -328,11 +328,11 @@ def problem_with_whitening_at(
 ) -> EstimationProblem:
     """Return a problem whose residuals are whitened by sensor noise and input noise, linearized at the unknowns `x`.
 
-    `problem` itself is returned if it has no input noise, or if a rollout at `x` fails. If it has whitening filters,
-    the new ones are linearized about the motion and torques that these smooth. `rounds` is the number of
-    linearizations (2 at a fit). With `keep_weights`, the gains of existing filters are kept, which suffices after a
-    step of one standard deviation. The search for equilibria starts at `equilibrium_guesses`. `predictions` of all
-    recordings at `x`, if known, save rollouts.
+    `problem` itself is returned if it has no input noise, or if a rollout at `x` fails. New filters are linearized
+    about the smoothed motion and torques that the problem's existing filters estimate, otherwise about the rollout.
+    `rounds` is the number of linearizations (a fit uses 2). With `keep_weights`, the gains of existing filters are
+    kept, which suffices after a step of one standard deviation. The search for equilibria starts at
+    `equilibrium_guesses`. If `predictions` of all recordings at `x` are given, they are not simulated again.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
@@ -357,8 +357,8 @@ def problem_with_held_out_kalman_whitening(
 ) -> EstimationProblem:
     """Return a problem that whitens the residuals of held-out recordings by sensor and input noise.
 
-    Each held-out recording gets a Kalman filter that is linearised at the unknowns `x`, about the motion that the
-    recording's previous filter smooths. A recording without a filter first gets one that is linearised about its
+    Each held-out recording gets a Kalman filter that is linearised at the unknowns `x`, about the smoothed motion that
+    the recording's previous filter estimates. A recording without a filter first gets one that is linearised about its
     rollout. With `keep_weights`, the gains of this first filter are kept, which suffices for torque offsets. A
     recording whose rollout fails is weighted by sensor noise only.
     """

@@ -22,10 +22,10 @@ _Indices = NDArray[np.int32]
 
 
 class StepFunctions:
-    """The CasADi functions of one step and their sparsity patterns. They take `DiscreteEquations.arguments`.
+    """The CasADi functions of one step, all with the inputs `DiscreteEquations.arguments`, and sparsity patterns.
 
     Each function is built when it is first used, because a cached kernel needs none. If constraint forces act at the
-    node, the outputs for the midpoint and the end of the step are empty.
+    node, the outputs that contain the constraint Jacobian at the midpoint or at the end of the step are empty.
     """
 
     def __init__(

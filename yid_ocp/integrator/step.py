@@ -246,13 +246,15 @@ def simulate(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> Rollout:
-    """Simulate a system for `steps` time steps. Derivatives are computed along `directions`, if given.
+    """Simulate a system for N = `steps` time steps.
 
     If Newton's method fails, `status` of the result reports it, and the later entries are NaN. Raises `ModelError` if
     an array has the wrong shape.
 
     Parameters
     ----------
+    theta : array_like, shape (ntheta,)
+        Values of all parameters, in the order of `step.system.parameters`.
     start : array_like, shape (nx,)
         Initial (q, p, z): coordinates [rad or m], momenta [N m s or N s], internal coordinates.
     torque : array_like, shape (N, nu), optional
@@ -261,6 +263,8 @@ def simulate(
         Prescribed coordinates at every node [rad or m]; default: their initial values.
     feedback : TrackingFeedback, optional
         Correction of the torque by the state.
+    directions : SensitivityDirections, optional
+        Directions along which the result has derivatives; default: it has none.
     """
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return simulate_rollouts(step, [inputs])[0]

@@ -57,8 +57,7 @@ def lqr_tracking_feedback(
     Control: Linear Quadratic Methods, section 2.4). The model contains the arms without the object and is linearised
     about the measured motion. The reference momentum follows from the measured angles (N + 1, nu) [rad] and torques (N,
     nu) [N m] by the arms' DEL equations, and is therefore comparable with the model's momentum. The angles must be
-    smooth enough for numerical differentiation. `arms` is the result of `compile_driven_arms_only_step`, compiled if
-    absent.
+    smooth enough for numerical differentiation. `arms` is a result of `compile_driven_arms_only_step` (None: made).
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
@@ -309,7 +308,7 @@ class _Memory:
         self._maps = CasadiLockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
     def along(self, motion: JointMotionAndTorqueWithSensitivities, start: Array, theta: Array) -> Array:
-        """Values at every node but the last, shape (N, k)."""
+        """Return the effect's internal coordinates (N, k) along a motion from `start` (k,), without the last node."""
         before, now = motion._before_and_after
         found = [start]
         if len(now) > 1:
@@ -326,7 +325,7 @@ class _Memory:
         columns: _Wanted,
         width: int,
     ) -> Array:
-        """Derivatives of the values, shape (N, k, d)."""
+        """Return the derivatives (N, k, d) of the internal coordinates `values` (N, k) along d = `width` directions."""
         before, now = motion._before_and_after
         by_old, by_before, by_now, by_theta = self._maps(None)(_one_before(values), before, now, theta, self._time_step)
         total = np.zeros((*values.shape, width))

@@ -98,8 +98,7 @@ class Frame:
     """A named frame fixed to the link that a joint moves. `joint_index` is -1 for the world.
 
     `proximal_bodies` (in the joint's frame) and `proximal_names` (frames and joints) are parts of the same link. If the
-    mechanism is cut at this frame, they stay with the joint. All other bodies and frames of the link are beyond the
-    cut.
+    mechanism is cut at this frame, they stay with the joint. Other bodies and frames of the link are beyond the cut.
     """
 
     joint_index: int
@@ -256,8 +255,7 @@ class Mechanism(ReprMixin):
     def with_joint_chain_added_at_index(self, index: int, chain: Sequence[Joint]) -> Mechanism:
         """Return a copy with a chain of joints inserted at list index `index`. Other joints keep their parents.
 
-        The first joint's parent must precede `index`. The parent of each further joint is the previous joint of the
-        chain.
+        The first joint's parent must precede `index`. The parent of each further joint is the joint before it.
         """
         count = len(chain)
 

@@ -281,9 +281,9 @@ class System(ReprMixin):
     def build(
         mechanism: Mechanism | None = None, *, effects: Sequence[Effect] = (), **options: Unpack[SystemBuildArguments]
     ) -> System:
-        """Build a system from a robot, effects and `SystemBuildArguments`. Without a robot, it has the object alone.
+        """Build a system from the robot `mechanism` (None: no robot), effects, and objects and other `options`.
 
-        Raises `ModelError` for an unknown or repeated name, no joints, or a joint both driven and prescribed.
+        Raises `ModelError` if a name is unknown or repeated, there is no joint, or a joint is driven and prescribed.
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
@@ -387,7 +387,7 @@ class System(ReprMixin):
         return replace(mapped, effects=self.effects)
 
     def numeric_mechanism(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """Return the mechanism with numbers, from `values` or nominal, in place of all parameters."""
+        """Return the mechanism with a number for each parameter: its entry in `values`, or else its nominal value."""
         key = tuple(self.parameters.vector(values).tolist())
         found = self._last_numeric_mechanism.get(key)
         if found is None:

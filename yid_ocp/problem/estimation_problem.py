@@ -189,7 +189,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def unknown_scales(self) -> Array:
-        """The typical size (nx,) of each unknown: its initial value, or if that is 0 the prior's std or 0.1 x range."""
+        """Typical sizes (nx,) of unknowns: |initial value|; if it is 0, the prior's std; else a tenth of the range."""
         lower, upper = self.bounds
         size = np.abs(self.initial_unknowns)
         width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)

@@ -41,8 +41,8 @@ class ProcessNoiseWhitener(Protocol):
     def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
 
-        The first column of `rows` (r, c) is the residual in units of sensor noise, all other columns are its
-        derivatives. `push` (N, nu, c) is the tracking filter's torque correction and its derivative [N m].
+        All arrays have c columns: value, then derivatives. `rows` (r, c) is the residual in units of sensor noise.
+        `push` (N, nu, c) is the torque [N m] that the tracking filter adds in each of N steps; None without a filter.
         """
         ...
 

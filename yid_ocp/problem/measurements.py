@@ -47,8 +47,7 @@ class TimeGrid:
 def rollout_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
     """Make a time grid that spans the joint samples or, in a recording without joints, the first group.
 
-    Raises `DataError` if the span is shorter than two steps, or has more than `_MAX_STEPS` steps or too many steps per
-    sample.
+    Raises `DataError` if the span has fewer than two steps, more than `_MAX_STEPS`, or too many steps per sample.
     """
     t = recording.all_groups[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))

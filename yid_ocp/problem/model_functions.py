@@ -192,8 +192,7 @@ class InputCorrectionFunctions:
     ) -> tuple[Array, Array] | None:
         """Return the delays or lag times (nj,) [s] of driven joints' torques or of prescribed joints' efforts.
 
-        Also returns their derivatives (nj, d) with respect to the parameters `names`. None if no effect has a delay or
-        lag.
+        Also returns their derivatives (nj, d) by the parameters `names`. None if no effect has a delay or lag.
         """
         return self._evaluate(self._times[kind], theta, names)
 
@@ -264,7 +263,7 @@ def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> 
 
 
 def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Apply the transpose of `central_difference_velocity` to values (len(nodes), n). The result is (count, n)."""
+    """Return the transpose of `central_difference_velocity` times `pull` (len(nodes), n), for all `count` nodes."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
     scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))
     np.add.at(result, after, scaled)
@@ -279,7 +278,7 @@ def second_difference_acceleration(q: Array, nodes: IntArray, time_step: float) 
 
 
 def second_difference_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Apply the transpose of `second_difference_acceleration` to values (len(nodes), n). The result is (count, n)."""
+    """Return the transpose of `second_difference_acceleration` times `pull` (len(nodes), n), for all `count` nodes."""
     middle, result = _inner_nodes(nodes, count), np.zeros((count, pull.shape[1]))
     for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
         np.add.at(result, middle + shift, factor / time_step**2 * pull)

@@ -258,7 +258,7 @@ def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
 
 
 def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
-    """Return kinds of effects that cannot be candidates, by missing signals, such as 'camera and joints.effort'."""
+    """Map missing signals, such as 'camera and joints.effort', to the kinds of effects that cannot be candidates."""
     present, found = signal_kinds_for_effects(recordings), dict[str, list[str]]()
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):

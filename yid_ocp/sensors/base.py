@@ -81,8 +81,7 @@ class SensorOptions:
 class RecordedChannelSpec:
     """A kind of recorded quantity, with its group, dataset, unit, components and sensor constants.
 
-    Noise levels are stored in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std` or, for points, in the
-    dataset `std`.
+    Noise levels are in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std` or, for points, the dataset `std`.
     """
 
     group: str  # recording group; a recording may have several, `GROUP` and `GROUP_NAME`, each with its own clock

@@ -161,8 +161,7 @@ class Solution(ReprMixin):
     def parameters_to_dataframe(self) -> pandas.DataFrame:
         """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
-        `lower` and `upper` are the 95 % interval, infinite at an open end. Raises `ConfigError` if pandas is not
-        installed.
+        `lower` and `upper` are the 95 % interval, infinite at an open end. `ConfigError` if pandas is not installed.
         """
         pandas = import_optional("pandas", "pandas", "a data frame needs the package pandas", ConfigError)
         columns, rows = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"], {}

@@ -44,9 +44,9 @@ class GaussNewton(base.SolverWithCheckedSettings):
     Each iteration solves min |J d + r|^2 + mu |d/s|^2 for the step d, subject to lower <= x + d <= upper, with the
     Jacobian J, the damping mu and the scales s. The step is accepted if the cost falls by a sufficient part of the
     predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5). The
-    search ends at a stationary point (`is_stationary_point`); a short or damped step with a small predicted decrease is
-    not sufficient. The search also ends after many steps that together lower the cost negligibly compared with the
-    noise. This happens if the cost is not smooth (friction that changes sign, fast waves over many seconds).
+    search converges at a stationary point (`is_stationary_point`); a short or damped step with a small predicted
+    decrease is not sufficient. It also converges (`stopped_at_noise_level`) after `_PATIENCE_STEPS` steps that together
+    lower the cost negligibly compared with the noise, as on a cost with kinks (friction, fast waves over many seconds).
     """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
@@ -230,9 +230,9 @@ class SteepestDescent(base.SolverWithCheckedSettings):
     """The steepest descent method with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
 
     The gradient g comes from the adjoint method and is not scaled, as in the paper (Caldwell et al. 2014). The first
-    trial step s of an iteration is twice the last accepted step (`last`, as in the paper), or the Barzilai-Borwein step
-    (`spectral`). The spectral step needs far fewer iterations, but may raise the cost for a few of them
-    (`nonmonotone_memory`: about 10).
+    trial step s of an iteration is the last accepted step divided by `backtracking_factor` (`last`, as in the paper),
+    or the Barzilai-Borwein step (`spectral`). The spectral step needs far fewer iterations if the cost may rise in a
+    few of them: with `nonmonotone_memory: 10`, a step must only lower the largest of the last 10 costs.
 
     References
     ----------

@@ -142,7 +142,7 @@ class MappedFunctionTerm:
 
 @dataclass(frozen=True)
 class ResidualTerm:
-    """A residual term of a program's objective, r = weight (combination values - target), with the values of `term`."""
+    """A residual term of a program's objective, r = weight * (combination @ v - target), with values v of `term`."""
 
     term: MappedFunctionTerm
     combination: ca.DM | None = None  # shape (nr, ny K); None takes the values as they are
@@ -448,8 +448,7 @@ class NonlinearProgram(ReprMixin):
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
         """Return the sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
 
-        Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps the curvature of user
-        terms.
+        Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps that of user terms.
         """
         with CASADI_LOCK:
             if kind not in self._hessians:

@@ -91,7 +91,7 @@ class CameraState:
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
     def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
-        """Compute the Jacobian (N, 3, 8) of world points (N, 3) with respect to the camera's pose and depth."""
+        """Compute the Jacobian (N, 3, 8) of world points (N, 3) by rotation, position and depth (log scale, offset)."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
@@ -104,7 +104,7 @@ class CameraState:
         return result
 
     def with_state_increment(self, change: Array) -> CameraState:
-        """Return the state after a change of rotation, translation, log depth scale, depth, clock offset and drift."""
+        """Return a copy plus `change` (10,): rotation, position, depth (log scale, offset), clock (offset, drift)."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
@@ -359,10 +359,10 @@ def _add_costs(
 
 @dataclass(frozen=True)
 class SurfaceObservationFractions:
-    """The fractions of the arm's visible surface on which, before which or behind which points were measured."""
+    """The fractions of the arm's visible surface at which a point was measured on it, in front of it or behind it."""
 
     there: float  # fraction with measured points on it
-    covered: float  # fraction with measured points before it
+    covered: float  # fraction with measured points in front of it
     through: float  # fraction with measured points behind it
     samples: int  # number of surface points that were compared
 
@@ -370,7 +370,7 @@ class SurfaceObservationFractions:
 def seen_occluded_and_seen_through_surface_fractions(
     arm: ArmSurface, frames: Sequence[StampedCloud], state: CameraState, within: float
 ) -> SurfaceObservationFractions:
-    """Return the fractions of the arm's visible surface with points on it (`within` [m]), before it or behind it."""
+    """Return the fractions of the arm's visible surface with points on it (`within` [m]), in front of or behind it."""
     counts = np.zeros(4)
     for glimpse in frames:
         points, _ = arm.visible_surface_points_and_parts(state, glimpse.stamp)

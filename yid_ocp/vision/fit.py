@@ -161,8 +161,7 @@ class ShapeFitter:
         """Fit the object's shape in one frame, given the robot's configuration `q_known` (n,).
 
         The fit has two stages. Cheap passes on skeleton nodes run from every guess in `starts` (default: the undeformed
-        shape). Passes on points run from the best result. `cloud` is the filtered cloud. Raises `DataError` if it has
-        no points.
+        shape). Passes on points run from the best result. Raises `DataError` if the filtered `cloud` has no points.
         """
         if not len(cloud.points) or not len(cloud.skeleton_nodes):
             what, allowed = "the cloud has no points or no skeleton nodes", "a cloud with points and skeleton nodes"

@@ -126,7 +126,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
 
 
 def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
-    """Mark frames as dropped if they deviate from the other good frames. Returns all frames."""
+    """Return all frames. A frame is marked as dropped if its misfit or grasp gap is far from that of good frames."""
     fits = _good_fits(frames)
     if not fits:
         return list(frames)

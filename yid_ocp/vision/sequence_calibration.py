@@ -104,8 +104,7 @@ def foreign_objects_from_clusters(
     """Group clusters of foreign points from several frames into objects. Rarely seen objects are omitted.
 
     `noise` is a point's standard deviation, `box` the corners (3,) of the region of the object in all frames [m].
-    `links` gives the poses (4, 4) of the robot's links at a time. `background` says whether static points are already
-    removed.
+    `links` gives the poses (4, 4) of the robot's links at a time. With `background`, static points are removed already.
     """
     groups: list[list[tuple[float, ForeignCluster]]] = []
     for t, thing in ((t, thing) for t, seen in clusters for thing in seen):
@@ -233,9 +232,8 @@ class TubeDimensionEstimates:
     def point_std_due_to_dimensions(self, points: Array) -> Array:
         """Compute the standard deviations (np, 3) [m] of points due to wrong or uncertain tube dimensions.
 
-        `points` (np, 3, 2 s) are the derivatives of the points with respect to the 2 s dimensions of s segments. An
-        estimated dimension contributes its standard deviation, a contradicted dimension that is not estimated its whole
-        displacement.
+        `points` (np, 3, 2 s) are the derivatives of the points by the 2 s dimensions of s segments. An estimated
+        dimension adds its standard deviation, a contradicted one that is not estimated its whole displacement.
         """
         used = np.array(self.estimated_dimension_mask)
         wrong = np.where(self.contradicted_model_value_mask & ~used, self.log_ratio, 0.0)
