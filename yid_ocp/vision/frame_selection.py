@@ -125,7 +125,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     return None
 
 
-def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
+def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport]) -> list[FrameReport]:
     """Return all frames. A frame is marked as dropped if its misfit or grasp gap is far from that of good frames."""
     fits = _good_fits(frames)
     if not fits:

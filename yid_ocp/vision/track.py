@@ -319,7 +319,7 @@ class FrameTracker:
     def align_root_ends_and_mark_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Choose one root end for all frames, and mark outlying frames as dropped. Returns frames and a root note."""
         rooted, note = frame_selection.align_root_ends(frames, self.options)
-        return frame_selection.mark_outlying_frames_as_dropped(rooted, self.options), note
+        return frame_selection.mark_outlying_frames_as_dropped(rooted), note
 
     def track_result_from_frame_reports(
         self, frames: Sequence[FrameReport], note: str, common: SequenceEstimates
