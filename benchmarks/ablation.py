@@ -33,7 +33,6 @@ NEUTRAL = {
     "n_refit_pairs": 0,
     "max_effects": 1,
     "min_z": 0.0,
-    "min_gap_closed": 0.0,
     "min_log_bayes_factor": 1.92,  # that of a 95 % interval
     "prior_range_margin_in_widths": 1e9,
     "min_explained_fraction": 0.0,
@@ -41,7 +40,6 @@ NEUTRAL = {
 """Values at which a threshold asks for nothing, or for as little as makes sense."""
 CONSTANTS = {
     "_LOSS_RTOL": (select, 1e-12),
-    "_MIN_REST_FRACTION": (select, 0.0),
     "_MIN_CHI2_FRACTION": (select, 0.0),
     "_LOG_ODDS_FACTOR": (select, 1.0),
     "_SET_PROBABILITY": (select, 1.0),

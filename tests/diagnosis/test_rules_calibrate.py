@@ -49,7 +49,7 @@ def test_too_few_cases_promise_less() -> None:
     assert _conformal_quantile(list(range(40)), "least") == (1, 39 / 41)
 
 
-STATISTICS = dict.fromkeys(("evidence", "closure_low", "explained", "carried")) | {"behind": {}}
+STATISTICS = dict.fromkeys(("evidence", "explained")) | {"behind": {}}
 STATISTICS |= dict.fromkeys(("p_value", "chi2_per_dof", "candidate"), 1.0)
 
 
@@ -80,7 +80,7 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
         case("null", "no_gap", statistics={"p_value": 0.2, "chi2_per_dof": 1.3}, open={"message": "it did not run"}),
         # a false alarm counts with what it was decided by
         case("null", "unknown", statistics={"p_value": 1e-9, "chi2_per_dof": 1.2, "evidence": 7.0}),
-        case("null", "no_gap", open=STATISTICS | {"candidate": 1e-6, "closure_low": -0.1}),
+        case("null", "no_gap", open=STATISTICS | {"candidate": 1e-6}),
     ]
     effects = [
         case("single", "effect", DAMPER, multiple=size, statistics={"evidence": 10.0 * size, "explained": 0.9})
@@ -98,7 +98,6 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
     assert evidence["is"] == Thresholds().min_log_bayes_factor
     # a residual that is not significant is none, however large
     assert found["gap"]["sample"][-2:] == [pytest.approx(0.04), pytest.approx(0.2)]
-    assert found["closure"]["quantile"] == -0.1
     assert found["candidate"]["quantile"] == 1e-6
 
 

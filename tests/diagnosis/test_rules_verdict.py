@@ -85,7 +85,7 @@ ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOA
     "changed, verdict",
     {
         "an effect": ({}, "effect"),
-        "too few samples": ({"enough": False}, "insufficient_data"),
+        "too few data": ({"enough": False}, "insufficient_data"),
         "no gap": ({"gap": False, "added": ()}, "no_gap"),
         "an effect of parameters that have left an earlier run": ({"gap": False}, "effect"),
         "nothing added": ({"added": ()}, "unknown"),
@@ -248,7 +248,7 @@ def of(label, values, stds, effects=(SPRING,)):
     ("first", "second", "agrees"),
     [
         ((5.0, 0.6), (8.0, 0.8), True),
-        # apart by sqrt(2)/2 of the size: half of that, doubled, is as large as the effect
+        # d/sqrt(2) is half of the size where d is sqrt(2)/2 of it
         ((5.0, 0.01), (8.5, 0.01), True),
         ((5.0, 0.01), (8.6, 0.01), False),
         ((5.0, 0.01), (1.5, 0.01), True),
@@ -297,6 +297,33 @@ def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(firs
     again = _inflate_fit_stds_by_disagreement(other, _compare(SPRING, other, one))
     reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
     assert not abs(first[0] - second[0]) > reach  # their intervals overlap
+
+
+@pytest.mark.parametrize(("there", "std"), [(None, 0.4), (2.1, 0.4), (3.0, math.sqrt(0.5))])
+def test_an_estimate_is_as_unsure_as_further_effects_and_other_recordings_make_it(there, std, monkeypatch):
+    """Of a single effect, and of one that is judged alone because two explain too little."""
+    first = replace(fit([SPRING], f.loss(3.0, 3.2), values={"spring@elbow.k": 2.0, "spring@elbow.s": 3.0}))
+    more = [replace(first, values=first.values | {"spring@elbow.k": 2.0 + by}) for by in (0.4, -0.4)]
+    entry = replace(added(SPRING, fitted=first), extended_models=tuple(more))
+    both = (entry, added(OTHER, fitted=fit([SPRING, OTHER]), part=closed(0.3, 0.2)))
+    again = None if there is None else fit([SPRING, OTHER], values=first.values | {"spring@elbow.k": there})
+    search = Mock(thresholds=LIMITS, refit_on_held_out=Mock(return_value=again))
+    evidence = Mock(nominal_model=fit(), exceeds_noise=Mock(return_value=True))
+    monkeypatch.setattr(
+        verdict_module, "_explained_fraction", lambda _, last, limits: 0.6 if len(last.effects) == 1 else 0.7
+    )
+    for chosen in ((entry,), both):
+        monkeypatch.setattr(verdict_module, "select_effects", lambda *_, chosen=chosen: ((), chosen))
+        [found] = judge(search, evidence).selected_effects
+        assert found.refitted_model.std == {"spring@elbow.k": pytest.approx(std), "spring@elbow.s": 0.01}
+
+
+@pytest.mark.parametrize(("degrees", "seen", "enough"), [(5.1, True, True), (5.0, True, False), (9.0, False, False)])
+def test_data_suffice_if_samples_outnumber_unknowns_and_a_candidate_is_detectable(degrees, seen, enough):
+    screened = f.screening(seen=[f.visible(ONE, seen)])
+    test = f.outcome(degrees=degrees)
+    evidence = NominalModelGapEvidence(fit(values=dict.fromkeys("abcde", 1.0)), test, test, screened, True)
+    assert evidence.are_data_sufficient is evidence.warrants_search(LIMITS) is enough
 
 
 class Problem:

@@ -71,7 +71,7 @@ def gaps():
         tests = {"nominal_test": outcome(p[0], chi2=1.123), "nominal_held_out_test": outcome(p[1], chi2=2.345)}
         yield f"{verdict}, p = {p[0]:g} and {p[1]:g}", finding(verdict, **tests, **NO_EFFECT)
     few = {"nominal_test": outcome(degrees=11.6), "nominal_model": fit(values=dict.fromkeys("abcde", 1.0))}
-    for seen in ((), (False,), (False, False)):
+    for seen in ((), (True,), (True, False)):
         hidden = {"screening": screening(seen=[visible(FRICTION, own) for own in seen])}
         yield f"insufficient data, {seen}", finding("insufficient_data", **few, **hidden, **NO_EFFECT)
     quiet = {"nominal_test": outcome(0.2, chi2=1.02), "nominal_held_out_test": outcome(0.6, chi2=0.989)}

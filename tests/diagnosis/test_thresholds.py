@@ -31,7 +31,7 @@ def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):
 
 
 @pytest.mark.parametrize(
-    ("limits", "verdict"), [({"min_gap_closed": 0.999}, "unknown"), ({"gap_significance_level": 1e-300}, "no_gap")]
+    ("limits", "verdict"), [({"min_z": 1e3}, "unknown"), ({"gap_significance_level": 1e-300}, "no_gap")]
 )
 @pytest.mark.usefixtures("without_law")
 def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):

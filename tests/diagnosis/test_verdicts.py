@@ -52,16 +52,13 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert 0.9 < low <= result["gap"]["closure"] <= high + 1e-12
     assert result["gap"]["after"]["chi2_per_dof"] < 1.1 < result["gap"]["before"]["chi2_per_dof"]
     told = result["statistics"]
-    assert told["closure_low"] == low
     assert told["explained"] == finding.explained_fraction > 0.9
     assert told["candidate"] <= len(FRICTION) * result["which"][0]["p_value"]
     left = finding.single_effect_models[0].held_out_loss.chi2_per_sample
     assert told["behind"]["joint_coulomb@elbow"] == {"left": left, "squares": 0.0}
     assert min(entry["squares"] for entry in told["behind"].values()) == 0.0, "no other is as likely"
     [apart] = finding.transfer_checks
-    assert told["carried"] == pytest.approx(
-        abs(apart.estimation_value - apart.held_out_value) / np.hypot(apart.estimation_std, apart.held_out_std)
-    )
+    assert abs(apart.estimation_value - apart.held_out_value) < 4 * np.hypot(apart.estimation_std, apart.held_out_std)
     damping = finding.nominal_parameters_before_and_after["elbow.damping"]
     assert damping["before"] > damping["after"], "friction hides in the damping until it is named"
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
@@ -91,7 +88,6 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
     assert (result["verdict"], result["effects"]) == ("effect", [{"kind": "joint_coulomb", "location": "elbow"}])
     assert [entry["closure"] is not None for entry in result["which"]] == [True, False, False, False]
     assert result["untried"][-1] == "the residual gap next to joint_coulomb@elbow"
-    assert result["statistics"]["carried"] is not None, "a chosen effect is compared with the held-out recordings"
     clock[0] = 1e9
     result = stopped(Progress())
     assert (result["verdict"], result["reason"], result["effects"]) == ("unknown", "none", [])
@@ -107,7 +103,7 @@ def test_a_model_that_is_right_has_no_gap(bench):
     assert result["gap"]["before"] == result["gap"]["after"]
     told = result["statistics"]
     assert told["p_value"] > 0.01
-    assert {told[name] for name in ("closure_low", "carried", "evidence")} == {None}
+    assert told["evidence"] is None
 
 
 @pytest.mark.usefixtures("without_law")

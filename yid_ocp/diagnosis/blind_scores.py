@@ -306,7 +306,6 @@ def thresholds_always_accepting_best_candidate(limits: Thresholds) -> Thresholds
         gap_significance_level=sure,
         min_excess_chi2_per_dof=-1.0,
         min_log_bayes_factor=1e-9,
-        min_gap_closed=-math.inf,
         max_effects=1,
     )
 
@@ -349,7 +348,6 @@ _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "candidate": _CalibrationRule("gap_significance_level", _of("candidate"), "clean", "least", 1e-4),
     "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
-    "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),
     "explained": _CalibrationRule("min_explained_fraction", _of("explained"), "named", "least", 0.75),
 }
 """All rules by name. `_STATISTIC_TEXTS` describes their statistics."""
@@ -358,7 +356,6 @@ _STATISTIC_TEXTS = {
     "candidate": "p-value of the best candidate",
     "evidence": "rise of the log evidence by the best location",
     "rival": "log odds of the most likely effect against the true one",
-    "closure": "lower end of the closure by the best effect",
     "explained": "explained part of the gap",
 }
 

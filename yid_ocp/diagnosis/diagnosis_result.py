@@ -12,7 +12,7 @@ from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, bic_difference, held_out_gap_closure
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, bic_difference, held_out_gap_closure, total_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprMixin, ReprTexts
@@ -59,7 +59,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprTexts:
-        closed = self.closure_by_selected_effects.text if self.accepted_effects else ""
+        closed = total_closure(self.accepted_selected_effects).text
         said = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects), closed]
         rows = [("candidate", "parameters", "closure alone", "p")]
         for entry in judgement_to_dict(self, self, ())["which"][:8]:
@@ -77,8 +77,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     @property
     def final_model(self) -> RefittedModel:
         """The model with all accepted effects, or the nominal model if there are none."""
-        accepted = self.accepted_selected_effects
-        last = accepted[-1].refitted_model if accepted else self.nominal_model
+        last = [self.nominal_model, *(entry.refitted_model for entry in self.accepted_selected_effects)][-1]
         assert isinstance(last, RefittedModel)
         return last
 
@@ -96,17 +95,17 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
         reason = "; ".join(check.both_estimates_text for check in self.failed_transfer_checks)
-        rejected = self.selected_effects if self.unknown_reason == "stand_in" else ()
+        optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
         found = {
             "format": "yid-diagnosis/2",
             **judged,
             "gap": {**judged["gap"], "after": after, "held_out": self.held_out_names},
             "remaining": {"p_value": after["p_value"], "where": left},
             "reason": self.unknown_reason,
-            "law": self.law and self.law.to_dict(),
             "rejected_candidates": [
                 {**attributes_to_dict(e.effect, _EFFECT_KEYS), **e.cumulative_closure.to_dict(), "reason": reason}
-                for e in rejected
+                for e in self.selected_effects
+                if self.unknown_reason == "stand_in"
             ],
             "events": [event.to_dict() for event in self.events.disturbances],
             "next_experiment": self.next_experiment,
@@ -116,8 +115,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             "steps": [{"added": e.effect.label, **_errors_to_dict(e.refitted_model)} for e in self.selected_effects],
             "unseen": [v.effect.label for v in self.screening.detectability if not v.is_detectable],
             "untried": self.untried,
-            "baseline": self.baseline_comparison and self.baseline_comparison.to_dict(),
-            "counterfactual": self.counterfactual and self.counterfactual.to_dict(),
+            **{name: part and part.to_dict() for name, part in optional.items()},
             "seconds": self.stage_seconds,
         }
         return dict(to_json_types(found))
@@ -132,7 +130,6 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
-        "closure_low": result.closure_by_selected_effects.ci_low,
         "explained": result.explained_fraction,
         "behind": {
             fit.effects[-1].label: {"left": fit.held_out_loss.chi2_per_sample, "squares": bic_difference(fit, alone[0])}
@@ -148,12 +145,11 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
     before = _errors_to_dict(seen.nominal_model) | attributes_to_dict(
         seen.nominal_held_out_test, "chi2_per_dof p_value"
     )
-    closed = judged.closure_by_selected_effects if added else UNDEFINED_GAP_CLOSURE
     rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
     found = {
         "verdict": judged.verdict,
         "probability": judged.probability,
-        "gap": {"before": before, **closed.to_dict()},
+        "gap": {"before": before, **total_closure(added).to_dict()},
         "where": [attributes_to_dict(place, _PLACE_KEYS) for place in where],
         "which": _ranked_candidates(judged, seen),
         "effects": [attributes_to_dict(entry.effect, _EFFECT_KEYS) for entry in added],

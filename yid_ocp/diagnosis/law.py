@@ -38,6 +38,7 @@ _RIDGE_STD_RATIO = 3.0  # prior std of the torque at a knot (apart from curvatur
 _MIN_KNOT_RANGE = 1e-3  # smallest range of knots, for a quantity that hardly changes [unit of the quantity]
 _EVEN_STD_RATIO = 1 / 300  # std of f(x) + f(-x) over the prior's width, for a drive: its law is nearly odd
 _MIN_VISITED_PART = 0.7  # fraction of the knots' range that a fitted law must visit to keep its knots
+_MIN_CLOSURE = 0.05  # fraction of the gap that a law must close, and a second quantity beside the first
 _MIN_LEFTOVER_CLOSURE = 0.2  # fraction that a law must close of the gap that accepted effects leave
 
 
@@ -133,7 +134,7 @@ def find_gap_law(
         return None
     found.sort(key=lambda entry: entry.loss.chi2_per_sample)
     # if one quantity predicts as well as two, one is used
-    slack = search.thresholds.min_gap_closed * before.held_out_loss.excess_chi2_per_sample
+    slack = _MIN_CLOSURE * before.held_out_loss.excess_chi2_per_sample
     found = sorted(found, key=lambda entry: not _is_simplest_of_the_best(entry, found, slack))
     best, *others = found
     runner_up = None
@@ -147,7 +148,7 @@ def find_gap_law(
         if again is not None and better and better[0].loss.chi2_per_sample <= best.loss.chi2_per_sample:
             best = better[0]
     closure = held_out_gap_closure(before.held_out_loss, best.loss)
-    least = _MIN_LEFTOVER_CLOSURE if last.effects else search.thresholds.min_gap_closed
+    least = _MIN_LEFTOVER_CLOSURE if last.effects else _MIN_CLOSURE
     gained, error = held_out_improvement_and_error(before.held_out_loss, best.loss)
     if not (gained > error and closure.ci_low > least):
         return None

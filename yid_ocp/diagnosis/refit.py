@@ -122,6 +122,10 @@ class RefitStatistics(StoredFit):
     residual_count: int  # number of residuals of the estimation recordings, priors included
     has_process_noise: bool  # whether errors of torques drive the motion
 
+    def statistics(self) -> RefitStatistics:
+        """Return the statistics of the refit without its problem and evaluation, which saves memory."""
+        return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
+
     @property
     def total_effect_parameter_count(self) -> int:
         """The number of parameters of all effects in the model together."""
@@ -150,10 +154,6 @@ class RefittedModel(RefitStatistics):
     def unknowns(self) -> Array:
         """The fitted values of the problem's unknowns, shape (nx,)."""
         return self.problem.unknown_vector(self.values)
-
-    def statistics(self) -> RefitStatistics:
-        """Return the statistics of the refit without its problem and evaluation, which saves memory."""
-        return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
 
 
 @dataclass(frozen=True)
@@ -284,8 +284,8 @@ def refit_with_effects(
     _, _, end = runs[0]
     if not (end.ok and chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level):
         # earlier effects were already tried from both starts
-        moved = [effect.alternative_start(start) for effect in effects[-1:]]
-        runs += [_attempt(problem, effects, {**start, **values}) for values in moved if values is not None]
+        moved = filter(None, (effect.alternative_start(start) for effect in effects[-1:]))
+        runs += [_attempt(problem, effects, {**start, **values}) for values in moved]
     own, outcome, finish = min(runs, key=lambda run: run[-1].cost)
     if not finish.ok:
         return None
@@ -336,11 +336,10 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
         if outcome.status != Status.FAILED:
             break
     found = _seen(problem, effects, outcome)
+    moving, _, end = found
+    before, after = problem.problem.whitening_filters, moving.whitening_filters
     # without effects, all filters are fixed anew at the end of the run
-    if not (effects and found[-1].ok):
-        return found
-    moving = found[0]
-    if max_torque_bias_change_in_stds(problem.problem.whitening_filters, moving.whitening_filters) < _RELINEARIZE_Z:
+    if not effects or not end.ok or max_torque_bias_change_in_stds(before, after) < _RELINEARIZE_Z:
         return found
 
     def evaluate(
@@ -430,7 +429,7 @@ def refit_with_each_effect(
         if search.record_skip_if_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break
         fits += map_with_merged_calls(one, tried[i : i + size])
-    return [fit for fit in fits if fit is not None and math.isfinite(fit.held_out_loss.total_chi2)]
+    return [fit for fit in filter(None, fits) if math.isfinite(fit.held_out_loss.total_chi2)]
 
 
 @np.errstate(invalid="ignore")  # of recordings that cannot be predicted

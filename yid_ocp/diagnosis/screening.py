@@ -59,8 +59,10 @@ class ProjectedCandidatesLinearization:
     @property
     def _grids(self) -> list[list[_EffectSignature]]:
         """The signatures of each candidate, one per grid value."""
-        labels = dict.fromkeys(signature.effect.label for signature in self.signatures)
-        return [[own for own in self.signatures if own.effect.label == label] for label in labels]
+        grids: dict[str, list[_EffectSignature]] = {}
+        for own in self.signatures:
+            grids.setdefault(own.effect.label, []).append(own)
+        return list(grids.values())
 
 
 @dataclass(frozen=True)
@@ -188,8 +190,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Cha
     for s in series:
         u = columns[s.residual_indices] * residual[s.residual_indices, None]
         length = int(np.sqrt(len(u))) + 1
-        cumulative = np.pad(np.cumsum(u, axis=0), ((length, 0), (0, 0)))
-        cumulative = np.pad(cumulative, ((0, length - 1), (0, 0)), mode="edge")
+        cumulative = np.cumsum(np.pad(u, ((length, length - 1), (0, 0))), axis=0)
         sums = cumulative[length:] - cumulative[:-length]
         total += sums.T @ sums / length
     return total
@@ -201,9 +202,8 @@ def _score_candidates(
     visible: Sequence[CandidateDetectability],
 ) -> tuple[CandidateScore, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
-    seen = {entry.effect.label for entry in visible if entry.is_detectable}
     found = []
-    for grid in (own for own in point._grids if own[0].effect.label in seen):
+    for grid in (own for entry, own in zip(visible, point._grids, strict=True) if entry.is_detectable):
         tried = [_score(signature, point.projected_residual, series) for signature in grid]
         # shape values that make no difference differ by rounding alone: the first one stays
         best = max(tried, key=lambda s: float(f"{s.predicted_chi2_decrease:.6g}"))

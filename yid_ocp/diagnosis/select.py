@@ -21,7 +21,6 @@ from yid_ocp.effects import EffectBase
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
 # of what effects explain: a model's response to them errs by 5 %, as links and time step are finite, and leaves this
 _MIN_CHI2_FRACTION = 0.05**2
-_MIN_REST_FRACTION = 4e-4  # of the whole gap: so little can be an error of the response to the effects found
 _LOG_ODDS_FACTOR = 2.0  # by which half a difference of BIC exceeds the log odds that simulated cases show
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
 _SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
@@ -61,6 +60,11 @@ class SelectedEffect:
     extended_models: tuple[RefitStatistics, ...] = ()  # `refitted_model` with one plausible effect more
 
 
+def total_closure(entries: Sequence[SelectedEffect]) -> GapClosure:
+    """Return the fraction of the gap that all effects close together, that of the last one. Undefined without any."""
+    return next((entry.cumulative_closure for entry in reversed(entries)), UNDEFINED_GAP_CLOSURE)
+
+
 def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
     """Compute the fraction of the held-out gap that closes from `before` to `after`, with a bootstrap interval."""
     if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
@@ -79,12 +83,6 @@ def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
 def _leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether a fit's held-out chi2 per sample is near 1, so that its residual is mainly noise."""
     return fit.held_out_loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
-
-
-def _leaves_little(nominal: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether a fit leaves so little of the held-out gap that errors in the response to its effects can be the rest."""
-    most = max(limits.min_excess_chi2_per_dof, _MIN_REST_FRACTION * nominal.held_out_loss.excess_chi2_per_sample)
-    return fit.held_out_loss.excess_chi2_per_sample < most
 
 
 def held_out_improvement_and_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
@@ -145,8 +143,6 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     """
     loss, best = fit.held_out_loss, other.held_out_loss
     lost, error = held_out_improvement_and_error(loss, best)
-    if lost <= 0:
-        return 0.0
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
     spread = float(np.std(ratios, ddof=1)) / math.sqrt(len(ratios))
     return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
@@ -161,7 +157,7 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Threshold
     """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better."""
     before, after = without.held_out_loss, fit.held_out_loss
     gained, error = held_out_improvement_and_error(before, after)
-    is_clear = gained > max(error, limits.min_gap_closed * before.excess_chi2_per_sample)
+    is_clear = gained > error
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
     return is_clear and all(_is_significant(e, fit, limits) for e in _beside(without.effects, fit))
@@ -171,6 +167,10 @@ def _beside(effects: Sequence[EffectBase], fit: RefitStatistics) -> list[EffectB
     """The effects of a fit that are not among some effects."""
     known = {effect.label for effect in effects}
     return [effect for effect in fit.effects if effect.label not in known]
+
+
+def _has_all(fit: RefitStatistics, effects: Sequence[EffectBase]) -> bool:
+    return {effect.label for effect in effects} <= {effect.label for effect in fit.effects}
 
 
 def _plausible_beside(
@@ -212,41 +212,38 @@ def select_effects(
     estimates. Returns the fits of single effects in the first round and the selected effects. The fit of the chosen
     effect comes first (its last fit if no other effect is selected), then all other fits by held-out loss.
     """
-    limits, alone, chosen, before = search.thresholds, screened, _Choice(nominal), nominal
-    first, later = list[RefitStatistics](), list[RefitStatistics]()
-    while len(chosen.fit.effects) < limits.max_effects:
-        base, current = chosen.fit.effects, chosen.fit
-        if base:
-            beside = join_effect_labels(base)
-            rest = f"the residual gap next to {beside}"
-            if _leaves_little(nominal, current, limits) or search.record_skip_if_past_deadline(rest):
-                break
-            search.progress.begin_stage(f"scoring {rest}", 1.0, 12.0)
-            screened = search.screen(base, current.values, f"beside {beside}")
-            if _promised_fraction(nominal, current, screened) < limits.min_explained_fraction:
-                break
-        shortlist = _refit_shortlist(screened, limits)
-        fits = refit_with_each_effect(search, base, shortlist, current.values)
-        if moved and not base:
-            dearest_first = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
-            fits = list({fit.effects[-1].label: fit for fit in dearest_first}.values())
-        if len(base) == 1:
-            pairs = _pairs_to_refit(search, alone, base[0])
-            fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
-        later += fits if base else []
-        near = _near_best_models(nominal, _plausible_beside(base, fits, limits) if base else fits, limits)
-        first = first or sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
-        better = next((fit for fit, _ in near if _is_needed(current, fit, limits)), None)
-        if better is None:
-            break
+    limits, chosen, before = search.thresholds, _Choice(nominal), nominal
+    seen, shortlist, later = screened, _refit_shortlist(screened, limits), list[RefitStatistics]()
+    fits = refit_with_each_effect(search, (), shortlist, nominal.values)
+    if moved:
+        dearest_first = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
+        fits = list({fit.effects[-1].label: fit for fit in dearest_first}.values())
+    near = _near_best_models(nominal, fits, limits)
+    first = sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
+    while better := next((fit for fit, _ in near if _is_needed(chosen.fit, fit, limits)), None):
         # untried confusable candidates cannot be excluded yet
-        alike = screened.confusability.confusable_with(better.effects[-1].label, limits.signature_overlap)
+        alike = seen.confusability.confusable_with(better.effects[-1].label, limits.signature_overlap)
         untried = [(own[0], 0.0) for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
-        before = current
-        rivals = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == base]
-        chosen = chosen.replaced(better, [*rivals, *untried])
+        rivals = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.fit.effects]
+        before, chosen = chosen.fit, chosen.replaced(better, [*rivals, *untried])
+        base, beside = better.effects, join_effect_labels(better.effects)
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
-        search.progress.begin_stage(f"explained by {join_effect_labels(better.effects)}: {closed.text}".rstrip(": "))
+        rest = f"the residual gap next to {beside}"
+        search.progress.begin_stage(f"explained by {beside}: {closed.text}".rstrip(": "))
+        is_full = len(base) >= limits.max_effects
+        if is_full or _leaves_noise(better, limits) or search.record_skip_if_past_deadline(rest):
+            break
+        search.progress.begin_stage(f"scoring {rest}", 1.0, 12.0)
+        seen = search.screen(base, better.values, f"beside {beside}")
+        if _promised_fraction(nominal, better, seen) < limits.min_explained_fraction:
+            break
+        shortlist = _refit_shortlist(seen, limits)
+        fits = refit_with_each_effect(search, base, shortlist, better.values)
+        if len(base) == 1:
+            pairs = _pairs_to_refit(search, screened, base[0])
+            fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
+        later += [fit.statistics() for fit in fits]
+        near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
     chosen = _reconsidered(search, nominal, chosen, before)
     if len(chosen.fit.effects) == 1:
         # its last fit may differ from its first one
@@ -338,23 +335,24 @@ def _with_closures(
         again = f"{join_effect_labels(effects[:i])} again"
         fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
         closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        more = [other for other in later if other.effects[:-1] == fit.effects]
+        more = [other for other in later if len(other.effects) == i + 1 and _has_all(other, fit.effects)]
         more = _plausible_beside(fit.effects, more, search.thresholds)
-        found.append(replace(_selected(effect, fit, closed, chosen.rivals[effect.label]), extended_models=tuple(more)))
+        same = _equivalents_and_shares(effect, chosen.rivals[effect.label])
+        found.append(SelectedEffect(effect, fit, closed, *same, tuple(more)))
     return tuple(found)
 
 
-def _selected(
-    effect: EffectBase, fit: RefitStatistics, closed: GapClosure, rivals: Sequence[tuple[EffectBase, float]]
-) -> SelectedEffect:
-    """A selected effect with its likely rivals, given with their distances, and their shares of its probability."""
+def _equivalents_and_shares(
+    effect: EffectBase, rivals: Sequence[tuple[EffectBase, float]]
+) -> tuple[tuple[EffectBase, ...], tuple[float, ...]]:
+    """An effect and its likely rivals, given with their distances, and their shares of its probability."""
     known = {own.label: (own, distance) for own, distance in ((effect, 0.0), *rivals)}
     effects, distances = zip(*known.values(), strict=True)
     weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
     shares = weights / weights.sum()
     order = np.array([0, *1 + np.argsort(-shares[1:], kind="stable")])
     kept = order[np.cumsum(shares[order]) - shares[order] < _SET_PROBABILITY]
-    return SelectedEffect(effect, fit, closed, tuple(effects[i] for i in kept), tuple(shares[kept].tolist()))
+    return tuple(effects[i] for i in kept), tuple(shares[kept].tolist())
 
 
 def selected_effect_alone(
@@ -362,8 +360,8 @@ def selected_effect_alone(
 ) -> SelectedEffect:
     """Return `entry` as the only selected effect, with its equivalent effects among the `fits` of single effects."""
     near = [(fit.effects[-1], distance) for fit, distance in _near_best_models(nominal, fits, limits)]
-    found = _selected(entry.effect, entry.refitted_model, entry.cumulative_closure, near)
-    return replace(found, extended_models=entry.extended_models)
+    effects, shares = _equivalents_and_shares(entry.effect, near)
+    return replace(entry, equivalent_effects=effects, shares=shares)
 
 
 def with_stds_that_include_model_error(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:
@@ -371,10 +369,10 @@ def with_stds_that_include_model_error(entry: SelectedEffect, limits: Thresholds
 
     This holds if the refit leaves a gap, in which any further effect may have a part.
     """
-    fit, std = entry.refitted_model, dict(entry.refitted_model.std)
-    if _leaves_noise(fit, limits) or not entry.extended_models:
+    fit, count = entry.refitted_model, max(len(entry.extended_models), 1)
+    if _leaves_noise(fit, limits):
         return fit
-    for name in (name for effect in fit.effects for name in effect.parameters.names):
-        moved = [other.values[name] - fit.values[name] for other in entry.extended_models]
-        std[name] = max(std[name], float(np.sqrt(np.mean(np.square(moved)))))
-    return replace(fit, std=std)
+    names = [name for effect in fit.effects for name in effect.parameters.names]
+    moved = {name: [other.values[name] - fit.values[name] for other in entry.extended_models] for name in names}
+    std = {name: max(fit.std[name], math.hypot(*own) / math.sqrt(count)) for name, own in moved.items()}
+    return replace(fit, std={**fit.std, **std})

@@ -72,7 +72,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         (result.is_corrected_for_links, links),
         (result.is_split_in_blocks, "No recording could be held out, so alternate blocks of the recordings were."),
     )
-    text += [note for applies, note in notes if applies]
+    text += _applying(notes)
     events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
     text += [_listed("Excluded as brief disturbances: ", events), *ignored_after_overspeed_messages(result.events)]
     return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
@@ -96,6 +96,11 @@ def _listed(beginning: str, names: Iterable[str], end: str = ".") -> str:
     return f"{beginning}{text}{end}" if text else ""
 
 
+def _applying(notes: Iterable[tuple[bool, str]]) -> list[str]:
+    """The texts whose condition holds."""
+    return [text for applies, text in notes if applies]
+
+
 def _p_value_relation(p_value: float) -> str:
     return f"= {p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
 
@@ -105,10 +110,11 @@ def _gap(result: DiagnosisResult) -> str:
     tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
     fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
     sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
-    unknowns, count = len(result.nominal_model.values), len(result.screening.detectability)
-    said = f"{tests[0].degrees_of_freedom:.0f} effective samples for {unknowns} unknowns"
+    unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
+    detectable = f"{sum(seen)} of {len(seen)} candidates are detectable"
+    said = f"{tests[0].degrees_of_freedom:.0f} effective samples for {unknowns} unknowns; {detectable}"
     texts = {
-        "insufficient_data": f"The data are insufficient: {said}; none of {count} candidates is detectable.",
+        "insufficient_data": f"The data are insufficient: {said}.",
         "no_gap": f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).",
     }
     if result.verdict in texts:
@@ -230,11 +236,10 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
             moved.append(f"{own.name} goes from {before} to {now} {own.unit}")
         text.append(_listed("Against the baseline, ", moved or ["no parameter has changed detectably"]))
-        if since.between_runs_p_value < _RUNS_DIFFER_LEVEL:
-            differ = f"differ among themselves (p = {since.between_runs_p_value:.2g})"
-            text.append(f"The runs of the baseline {differ}; their ± includes this.")
-        if not since.is_baseline_explained:
-            text.append("The model did not explain the baseline's recordings, so its ± may be too small.")
+        differ = f"The runs of the baseline differ among themselves (p = {since.between_runs_p_value:.2g})"
+        small = "The model did not explain the baseline's recordings, so its ± may be too small."
+        notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}; their ± includes this.")
+        text += _applying([notes, (not since.is_baseline_explained, small)])
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
     for how, part in parts.items():
         made = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])

@@ -43,7 +43,6 @@ class Thresholds:
     # which effects are added
     max_effects: Annotated[int, Ge(1), Le(10), OptionInfo("largest number of added effects")] = 3
     min_z: Annotated[float, Ge(0), OptionInfo("standard deviations from neutral below which no effect is kept")] = 2.0
-    min_gap_closed: Annotated[float, Ge(0), Lt(1), OptionInfo("least closure that an added effect must reach")] = 0.05
     prior_range_margin_in_widths: Annotated[
         float, Ge(0), OptionInfo("how far a value may leave its usual range: in widths, or a factor of 1 + this")
     ] = 1.0

@@ -45,14 +45,10 @@ class EffectAmplitudeTransferCheck:
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
-    def absolute_difference_and_std(self) -> tuple[float, float]:
-        """The absolute difference of the two estimates, and the standard deviation of this difference."""
-        return abs(self.estimation_value - self.held_out_value), math.hypot(self.estimation_std, self.held_out_std)
-
-    @property
     def std_of_significant_disagreement(self) -> float:
         """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
-        apart, spread = self.absolute_difference_and_std
+        apart = abs(self.estimation_value - self.held_out_value)
+        spread = math.hypot(self.estimation_std, self.held_out_std)
         return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
@@ -84,8 +80,9 @@ class NominalModelGapEvidence:
 
     @property
     def are_data_sufficient(self) -> bool:
-        """Whether any candidate is detectable in these data."""
-        return any(entry.is_detectable for entry in self.screening.detectability)
+        """Whether there are more effective samples than unknowns, and any candidate is detectable."""
+        is_seen = any(entry.is_detectable for entry in self.screening.detectability)
+        return is_seen and self.nominal_test.degrees_of_freedom > len(self.nominal_model.values)
 
     def warrants_search(self, limits: Thresholds) -> bool:
         """Check whether there may be a gap and the data suffice to search for its cause."""
@@ -107,7 +104,7 @@ class Judgement:
     @property
     def closure_by_selected_effects(self) -> GapClosure:
         """The fraction of the gap that all selected effects close together. Undefined without effects."""
-        return self.selected_effects[-1].cumulative_closure if self.selected_effects else select.UNDEFINED_GAP_CLOSURE
+        return select.total_closure(self.selected_effects)
 
     @property
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
@@ -160,13 +157,12 @@ def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) 
 
     A gap that is seen only along a candidate's signature counts only with an accepted effect.
     """
-    explains_little = said._largest_explained_fraction < said.required_total_explained_fraction(limits)
-    reasons: tuple[tuple[UnknownVerdictReason, bool], ...] = (
-        ("none", not said.selected_effects),
-        ("little", explains_little),
-        ("stand_in", bool(said.failed_transfer_checks)),
-    )
-    reason: UnknownVerdictReason = next((name for name, holds in reasons if holds), "")
+    reasons: dict[UnknownVerdictReason, bool] = {
+        "none": not said.selected_effects,
+        "little": said._largest_explained_fraction < said.required_total_explained_fraction(limits),
+        "stand_in": bool(said.failed_transfer_checks),
+    }
+    reason: UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
     if not suffice:
         return "insufficient_data", ""
     if reason:
@@ -241,9 +237,7 @@ def _check_effect_amplitude_transfer(
     Empty if one recording is split, or if the refit fails; neither is evidence against an effect.
     """
     again = search.refit_on_held_out(fit)
-    if again is None:
-        return ()
-    return tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again))
+    return () if again is None else tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again))
 
 
 def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics) -> list[EffectAmplitudeTransferCheck]:
@@ -266,5 +260,5 @@ def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
     """The fit with stds of at least |difference|/sqrt(2) for amplitudes that disagree between recordings."""
-    std = {f"{e.effect_label}.{e.parameter}": max(e.estimation_std, e.std_of_significant_disagreement) for e in entries}
-    return replace(fit, std={**fit.std, **std})
+    least = {f"{e.effect_label}.{e.parameter}": e.std_of_significant_disagreement for e in entries}
+    return replace(fit, std={name: max(std, least.get(name, 0.0)) for name, std in fit.std.items()})
