@@ -128,8 +128,8 @@ def _near_best_models(
     else:
         distances = [_distance_in_prediction(fit, best) for fit in fits]
         ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
-    near = sorted(zip(fits, distances, ranks, strict=True), key=lambda own: own[2])
-    return [(fit, distance) for fit, distance, _ in near if distance <= 1]
+    near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
+    return [(fit, distance) for fit, distance, _ in sorted(near, key=lambda own: own[2])]
 
 
 def _chi2(fit: RefitStatistics) -> float:
