@@ -106,7 +106,8 @@ def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
 def loss(*means: float, count=100.0, channels=None) -> HeldOutLoss:
     """A held-out loss with these chi2/n in its blocks, all with as many samples."""
     counts = np.full(len(means), float(count))
-    return HeldOutLoss(counts * np.asarray(means, float), counts, channels or {"points.tip": (0.01, "m")})
+    squares = counts * np.asarray(means, float)
+    return HeldOutLoss(squares, counts, channels or {"points.tip": (0.01, "m")}, float(squares.sum()))
 
 
 def evaluation(residual, jacobian=None, ok=True, message="") -> Evaluation:

@@ -41,7 +41,7 @@ LIMITS = Thresholds()
     },
 )
 def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, counts, mean, gap):
-    found = HeldOutLoss(np.array(squares), np.array(counts), {})
+    found = HeldOutLoss(np.array(squares), np.array(counts), {}, math.nan)
     assert found.chi2_per_sample == pytest.approx(mean)
     assert found.excess_chi2_per_sample == pytest.approx(gap)
 
@@ -81,7 +81,7 @@ def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks():
     size = rng.uniform(0.5, 6.0, 20)
     left = 1 + 0.4 * (size - 1) + 0.1 * rng.standard_normal(20)
     counts = rng.integers(50, 150, 20).astype(float)
-    noisy = HeldOutLoss(size * counts, counts, {}), HeldOutLoss(left * counts, counts, {})
+    noisy = (HeldOutLoss(of * counts, counts, {}, math.nan) for of in (size, left))
     for pair in (noisy, (loss(0.1, 4.0, 0.2), loss(0.1, 1.5, 0.2))):
         found = held_out_gap_closure(*pair)
         np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(*pair), rtol=1e-12)
@@ -146,6 +146,17 @@ def test_a_rival_that_is_worse_in_all_blocks_is_told_apart_however_loud_one_bloc
     worse = [ratio * x for x in blocks[:-1]] + [1.2 * blocks[-1] if level > 1 else 1.02 * blocks[-1]]
     fits = [there(SMALL, *blocks), there(effect("large@x", amplitude()), *worse)]
     assert sorted(nearest(fits)) == expected
+
+
+@pytest.mark.parametrize(("size", "expected"), [(1.5, ["small@x"]), (9.0, ["large@x"])])
+def test_where_a_gap_is_left_an_implausible_model_gives_way_to_one_that_explains_enough(size, expected):
+    fits = [there(SMALL, 3.0, 3.1, a=size), there(LARGE, 4.0, 4.1)]
+    assert nearest(fits, nominal=fit((), loss(30.0, 30.0))) == expected
+    # nothing that is plausible explains three quarters
+    assert nearest(fits, nominal=fit((), loss(9.0, 9.0))) == ["small@x"]
+    # what leaves noise is judged by all recordings
+    quiet = [there(SMALL, 1.0, 1.0, a=size), there(LARGE, 4.0, 4.1)]
+    assert nearest(quiet, nominal=fit((), loss(30.0, 30.0))) == ["small@x"]
 
 
 @pytest.mark.parametrize(
@@ -602,7 +613,7 @@ def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
 
 def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
     counts = np.full(8, 10.0)
-    before, after = HeldOutLoss(2 * counts, counts, {}, 800.0), HeldOutLoss(3 * counts, counts, {}, 0.0)
+    before, after = (HeldOutLoss(of * counts, counts, {}, of * counts.sum(), by) for of, by in ((2, 800.0), (3, 0.0)))
     assert (before.chi2_per_sample, after.chi2_per_sample) == (12.0, 3.0)
     assert held_out_improvement_and_error(before, after) == (pytest.approx(9.0), 0.0)
     found = held_out_gap_closure(before, after)

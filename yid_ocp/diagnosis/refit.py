@@ -86,10 +86,9 @@ class HeldOutLoss:
     block_chi2: Array  # sums of whitened squares; infinite if a rollout failed
     block_sample_counts: Array
     channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
+    updated_chi2: float  # what the blocks add to chi2 if all parameters are fitted to them, too
     # chi2 of the deviation from a baseline, which does not depend on the resampled blocks
     baseline_chi2: float = 0.0
-    # what the blocks add to chi2 if all parameters are fitted to them, too; None: the same as without
-    updated_chi2: float | None = None
 
     @property
     def total_chi2(self) -> float:
@@ -99,7 +98,7 @@ class HeldOutLoss:
     @property
     def joint_fit_chi2(self) -> float:
         """What these recordings add to the smallest chi2 of a fit to all recordings, in the linear model."""
-        return self.total_chi2 if self.updated_chi2 is None else self.updated_chi2 + self.baseline_chi2
+        return self.updated_chi2 + self.baseline_chi2
 
     @property
     def chi2_per_sample(self) -> float:
@@ -474,7 +473,7 @@ def held_out_loss(
     contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))
     channels = held_out_rmse_and_unit_by_channel(found)
     squares = np.bincount(number, weights=whole**2).astype(float)
-    return HeldOutLoss(squares, np.bincount(number).astype(float), channels, contradiction, updated)
+    return HeldOutLoss(squares, np.bincount(number).astype(float), channels, updated, contradiction)
 
 
 def held_out_rmse_and_unit_by_channel(

@@ -113,7 +113,8 @@ def _near_best_models(
     """Models that the recordings cannot distinguish from the best one, with their distance from it, 0 to 1.
 
     If the best one leaves only noise, the distance is a log odds in units of what decides. Otherwise it is the held-out
-    error in units of its standard error, and the simplest of the models comes first.
+    error in units of its standard error, and the simplest of the models comes first. There, models with implausible
+    parameters count only if no plausible one explains enough.
     """
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
@@ -126,6 +127,11 @@ def _near_best_models(
         distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:
+        plausible = [fit for fit in fits if not fit.implausible_parameters(fit.effects[-1], limits)]
+        most = (1 - limits.min_explained_fraction) * nominal.held_out_loss.excess_chi2_per_sample
+        best_plausible = min(plausible, key=_chi2, default=nominal)
+        if best_plausible.held_out_loss.excess_chi2_per_sample <= most:
+            best, fits = best_plausible, plausible
         distances = [_distance_in_prediction(fit, best) for fit in fits]
         ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
     near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
