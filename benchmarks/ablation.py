@@ -52,7 +52,7 @@ CRITERIA = {
         select,
         "_near_best_models",
         "excess_chi2_per_sample <= most",
-        "excess_chi2_per_sample < -1",
+        "chi2_per_sample < -1",
     ),
     "fewest parameters first": (select, "_near_best_models", "(float(fit.total_effect_parameter_count), ", "(0.0, "),
     "plausible second effects": (select, "_plausible_beside", "fit.implausible_parameters(effect, limits)", "False"),

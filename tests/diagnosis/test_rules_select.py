@@ -81,7 +81,7 @@ def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks():
     size = rng.uniform(0.5, 6.0, 20)
     left = 1 + 0.4 * (size - 1) + 0.1 * rng.standard_normal(20)
     counts = rng.integers(50, 150, 20).astype(float)
-    noisy = (HeldOutLoss(of * counts, counts, {}, math.nan) for of in (size, left))
+    noisy = [HeldOutLoss(of * counts, counts, {}, math.nan) for of in (size, left)]
     for pair in (noisy, (loss(0.1, 4.0, 0.2), loss(0.1, 1.5, 0.2))):
         found = held_out_gap_closure(*pair)
         np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(*pair), rtol=1e-12)
