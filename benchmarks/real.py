@@ -175,7 +175,8 @@ def asked(name: str) -> dict[str, Any]:
     first = next((entry for entry in found["which"] if entry["kind"] == kind), None)
     value = None if first is None else first["parameters"][parameter]
     row: dict[str, Any] = {"question": name, "verdict": found["verdict"], "named": ", ".join(named) or "-"}
-    row |= {"truth": "-" if question.true is None else f"{question.asked} = {question.true[0]:g}"}
+    ends = " to ".join(dict.fromkeys(f"{end:g}" for end in question.true or ()))
+    row |= {"truth": f"{question.asked} = {ends}" if ends else "-"}
     row |= {"said": "-", "±": None, "z": None, "closes": None}
     if value is not None and first is not None:
         row |= {"said": value["value"], "±": value["std"], "closes": first["closure"]}
@@ -200,6 +201,8 @@ def main() -> int:
     parser.add_argument("questions", nargs="*", default=list(QUESTIONS), help=", ".join(QUESTIONS))
     parser.add_argument("--json", type=Path, metavar="FILE", help="answers, added to those that it has")
     arguments = parser.parse_args()
+    if unknown := sorted({*arguments.questions} - {*QUESTIONS}):
+        parser.error(f"unknown: {', '.join(unknown)}; allowed are {', '.join(QUESTIONS)}")
     file: Path | None = arguments.json
     rows: dict[str, Any] = json.loads(file.read_text()) if file is not None and file.exists() else {}
     for name in arguments.questions:
