@@ -203,6 +203,8 @@ def test_probabilities_are_compared_with_how_often_sets_hold_the_cause():
     assert [own["rate"] for own in found["probabilities"]] == [0.0, 0.0, 1.0, 1.0, 1.0]
     assert found["expected_calibration_error"] == pytest.approx((0.1 + 0.2 + 0.3 + 0.2 + 0.1) / 5)
     assert blind_scores._calibration_rates([])["expected_calibration_error"] is None
+    equal = [marked("single", probability=0.8, is_cause_in_sets=i % 2 == 0) for i in range(20)]
+    assert blind_scores._calibration_rates(equal)["expected_calibration_error"] == pytest.approx(0.3)
     # large sets and sets of each cause of a pair count, which are not right answers
     wide = score_blind_case(SINGLE, alike([WRONG], [WRONG, "a@b", "c@d", RIGHT]))
     assert (wide.right, wide.is_cause_in_sets, wide.probability) == (False, True, 0.9)

@@ -182,7 +182,7 @@ def test_effects_that_do_the_same_are_confusable(bench):
 
 
 def test_a_moment_of_data_is_insufficient(bench):
-    _, result = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION, duration=0.04)
+    _, result = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION, duration=0.03)
     assert result["verdict"] == "insufficient_data"
     assert result["effects"] == []
     assert "effective samples" in result["summary"]

@@ -226,7 +226,7 @@ def test_a_virtual_experiment_records_commands_and_no_efforts(servo_arm: System,
     # it lags and sags
     assert np.ptp(joints.position, axis=0).min() > 0.05
     assert np.abs(joints.position - joints.position_command).max() > 0.05
-    with pytest.raises(ModelError, match="no efforts"):
+    with pytest.raises(ModelError, match="no joint efforts"):
         played(servo_arm, InjectedEffect("encoder_offset", "pan", {"offset": 0.01}))
 
 

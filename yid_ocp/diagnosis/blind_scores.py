@@ -269,8 +269,9 @@ def _calibration_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 def _probabilities_and_outcomes(marks: Sequence[BlindCaseScore]) -> Array:
     """Return stated probabilities of the cause, ascending, and whether the cause is named (1 or 0), shape (n, 2)."""
-    named = sorted((m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-" and m.probability >= 0)
-    return np.array(named, float).reshape(-1, 2)
+    named = [(m.probability, m.is_cause_in_sets) for m in marks if m.answer != "-" and m.probability >= 0]
+    # equal probabilities stay in the order of cases: an order by outcome would fill bins with errors alone
+    return np.array(sorted(named, key=lambda own: own[0]), float).reshape(-1, 2)
 
 
 def _log_odds_regression(marks: Sequence[BlindCaseScore]) -> dict[str, float]:
