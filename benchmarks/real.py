@@ -1,10 +1,11 @@
 """Questions with a known answer on real recordings: what is said, how sure, how far off, at what cost.
 
-    python benchmarks/real.py [QUESTION ...] [--json FILE]
+    python benchmarks/real.py [QUESTION ...] [--json FILE] [--keep DIR]
 
 The recordings stand in ../shared/recordings beside the repository; a question without them is skipped. Every question
 is a command of a shipped configuration with the same thresholds as everything else. `z` is (said - true) over ±. With
-`--json` answers are added to those that the file has, so that questions can be asked one by one.
+`--json` answers are added to those that the file has, so that questions can be asked one by one. `--keep` stores what
+`ablation.py` needs to judge them again.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import argparse
 import json
 import math
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +21,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from yid_ocp import DiagnosisResult, load_config
+from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME
+from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict
+from yid_ocp.workflow.command_runner import CommandOutcome
+from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.solve import run_solve
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RECORDINGS = REPOSITORY.parent / "shared" / "recordings"
@@ -147,28 +154,25 @@ QUESTIONS: Mapping[str, Question] = {
 }
 
 
-def _carried_out(command: str, configuration: str, settings: tuple[str, ...], out: Path, *more: str) -> dict[str, Any]:
-    said = [part for setting in settings for part in ("--set", setting)]
-    own = [sys.executable, "-m", "yid_ocp", command, str(REPOSITORY / "configs" / configuration), *said, *more]
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run(
-        [*own, "--out", str(out), "--quiet"], env=environment, capture_output=True, text=True, check=False
-    )
-    if not (out / "result.json").is_file():
-        raise SystemExit(done.stderr)
-    found: dict[str, Any] = json.loads((out / "result.json").read_text())
-    return found
+def _diagnosed(question: Question, folder: Path) -> CommandOutcome[DiagnosisResult]:
+    file, settings = REPOSITORY / "configs" / question.configuration, question.settings
+    if question.baseline is not None:
+        run_solve(load_config(file, question.baseline), folder / "baseline")
+        settings = (*settings, f"diagnosis.baseline_run_folders=[{folder / 'baseline'}]")
+    return run_diagnose(load_config(file, settings, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME), folder / "run")
 
 
-def asked(name: str) -> dict[str, Any]:
-    """Answer to a question as a row of the table."""
+def asked(name: str, keep: Path | None) -> dict[str, Any]:
+    """Answer to a question as a row of the table; numbers that the verdict depends on go into the folder `keep`."""
     question, begun = QUESTIONS[name], os.times()
     with tempfile.TemporaryDirectory() as folder:
-        more: tuple[str, ...] = ()
-        if question.baseline is not None:
-            _carried_out("solve", question.configuration, question.baseline, Path(folder) / "baseline")
-            more = ("--baseline", str(Path(folder) / "baseline"))
-        found = _carried_out("diagnose", question.configuration, question.settings, Path(folder) / "run", *more)
+        outcome = _diagnosed(question, Path(folder))
+    found = outcome.result
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+        said = {key: found[key] for key in ("verdict", "effects", "confusable")}
+        judged = {"value": {"said": said, "evidence": diagnosis_evidence_to_dict(outcome.output)}}
+        (keep / f"{name}.json").write_text(json.dumps(judged), encoding="utf-8")
     ended = os.times()
     named = [f"{effect['kind']}@{effect['location']}" for effect in found["effects"]]
     kind, _, parameter = question.asked.partition(".")
@@ -186,7 +190,7 @@ def asked(name: str) -> dict[str, Any]:
             row["z"] = off / value["std"]
     law = found["law"]
     row["law"] = "-" if law is None else f"{law['depends_on']}@{law['location']}, {100 * law['closure']:.0f} %"
-    row["CPU [s]"] = round(ended.children_user + ended.children_system - begun.children_user - begun.children_system)
+    row["CPU [s]"] = round(sum(ended[:4]) - sum(begun[:4]))
     return row
 
 
@@ -200,6 +204,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Questions with a known answer on real recordings.")
     parser.add_argument("questions", nargs="*", default=list(QUESTIONS), help=", ".join(QUESTIONS))
     parser.add_argument("--json", type=Path, metavar="FILE", help="answers, added to those that it has")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="folder for the numbers behind the verdicts")
     arguments = parser.parse_args()
     if unknown := sorted({*arguments.questions} - {*QUESTIONS}):
         parser.error(f"unknown: {', '.join(unknown)}; allowed are {', '.join(QUESTIONS)}")
@@ -209,7 +214,7 @@ def main() -> int:
         if not (RECORDINGS / QUESTIONS[name].needs).is_dir():
             print(f"{name}: skipped, there is no {RECORDINGS / QUESTIONS[name].needs}", file=sys.stderr)
             continue
-        rows[name] = row = asked(name)
+        rows[name] = row = asked(name, arguments.keep)
         row["date"] = time.strftime("%Y-%m-%d")
         if file is not None:
             file.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
