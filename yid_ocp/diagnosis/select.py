@@ -175,10 +175,6 @@ def _beside(effects: Sequence[EffectBase], fit: RefitStatistics) -> list[EffectB
     return [effect for effect in fit.effects if effect.label not in known]
 
 
-def _has_all(fit: RefitStatistics, effects: Sequence[EffectBase]) -> bool:
-    return {effect.label for effect in effects} <= {effect.label for effect in fit.effects}
-
-
 def _plausible_beside(
     base: Sequence[EffectBase], fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> list[RefitStatistics]:
@@ -341,7 +337,8 @@ def _with_closures(
         again = f"{join_effect_labels(effects[:i])} again"
         fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
         closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        more = [other for other in later if len(other.effects) == i + 1 and _has_all(other, fit.effects)]
+        longer = [other for other in later if len(other.effects) == len(fit.effects) + 1]
+        more = [other for other in longer if len(_beside(fit.effects, other)) == 1]
         more = _plausible_beside(fit.effects, more, search.thresholds)
         same = _equivalents_and_shares(effect, chosen.rivals[effect.label])
         found.append(SelectedEffect(effect, fit, closed, *same, tuple(more)))

@@ -263,7 +263,8 @@ def _check_recordings(
     if not kept[0]:
         gaps = dict.fromkeys(own.what.partition(";")[0] for own in doubts if own.cause in ("gap", "clock_jump"))
         what, hint = f"no recording has a usable part: {'; '.join(gaps)}", "record again without such gaps"
-        allowed = "0.5 s without a gap" + ", from the start of a recording or from a rest" * (not anywhere)
+        where = "" if anywhere else ", from the start of a recording or from a rest"
+        allowed = f"0.5 s without a gap{where}"
         raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(doubts)
 
