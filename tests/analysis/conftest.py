@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from made_recordings import chain_of_motors
-from twins import twin_recording
+from made_recordings import chain_of_motors, twin_recording
 
 from yid_ocp.data import Recording
 from yid_ocp.data.recording import JointGroup, PointGroup

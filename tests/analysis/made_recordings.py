@@ -1,5 +1,6 @@
-"""Made-up recordings on a grid, and a pendulum that holds a rod."""
+"""Recordings made up on a grid or by a model, and a pendulum that holds a rod."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,7 @@ from yid_ocp.analysis.experiment_design import UnchangedExperiment
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.problem import ProblemOptions
+from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
 
 GRID = TimeGrid(10.0, 0.1, 20)
@@ -51,3 +52,19 @@ def chain_of_motors(folder, **joints):
     file = folder / "motors.urdf"
     file.write_text(f'<robot name="motors"><link name="wall"/>{"".join(parts)}</robot>')
     return read_urdf(file)
+
+
+def twin_recording(problem: EstimationProblem, x: np.ndarray, seed: int) -> Recording:
+    """The problem's recording as the model itself would measure it, with the sensors' noise."""
+    rng = np.random.default_rng(seed)
+    evaluation = problem.evaluate(x, derivatives=False)
+    assert evaluation.ok, evaluation.message
+    recording = problem.episodes[0].recording
+    groups = []
+    for group, predicted in zip(recording.points, evaluation.episode_predictions[0].predicted_outputs, strict=True):
+        count = len(predicted)
+        position, std = group.position[:count], group.std[:count]
+        seen = predicted.reshape(position.shape) + std * rng.standard_normal(position.shape)
+        seen[~np.isfinite(position)] = np.nan
+        groups.append(replace(group, t=group.t[:count], position=seen, std=std))
+    return replace(recording, points=tuple(groups))

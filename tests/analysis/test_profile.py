@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from made_models import Formula, estimate, solution
-from twins import twin_recording
+from made_recordings import twin_recording
 
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.profile import (
