@@ -519,7 +519,7 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
         "harmless": problem.options.has_no_data_issue_above_warning and bool(doubts),
         "found": found,
         "wrong": wrong,
-        "doubts": [f"{doubt.location_text}: {doubt.what}" for doubt in doubts],
+        "issues": [f"{doubt.location_text}: {doubt.what}" for doubt in doubts],
         "seconds": time.perf_counter() - begun,
     }
 

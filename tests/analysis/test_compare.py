@@ -465,7 +465,7 @@ def test_a_channel_is_worse_than_a_guess_where_the_best_one_is_clearly_nearer():
     [issue] = _worse_than_baseline_issues([ENTRY], units)
     error, guess = (math.sqrt((a**2 + b**2) / 2) for a, b in ((0.02, 0.01), (0.01, 0.0099)))
     assert issue.limit_violation_ratio == pytest.approx(error / (1.05 * guess))
-    assert (issue.recording, issue.group, issue.weight) == ("run", "points", "not_trusted")
+    assert (issue.recording, issue.group, issue.severity) == ("run", "points", "not_trusted")
     better = ENTRY | {"rmse": {"points.a": 0.0101, "points.b": 0.01}}
     assert _worse_than_baseline_issues([better], units) == channels_worse_than_naive_prediction([better], units) == []
 

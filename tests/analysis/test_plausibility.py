@@ -164,7 +164,7 @@ def test_efforts_beside_inverse_dynamics(arms, runs, case, begun):
     run = with_joints(runs[count], effort=change, t=lambda j: j.t + begun)
     found = inverse_dynamics_effort_issues(arms[count], run)
     assert_issues(found, expected)
-    assert {(doubt.recording, doubt.weight) for doubt in found} <= {(runs[count].name, "not_trusted")}
+    assert {(doubt.recording, doubt.severity) for doubt in found} <= {(runs[count].name, "not_trusted")}
 
 
 def assert_issues(found, expected):
@@ -296,7 +296,7 @@ def test_limits_of_joints(arms, runs):
         assert (doubt.limit_violation_ratio, doubt.recording) == (pytest.approx(ratio, rel=1e-3), run.name)
         assert f"left_e1 goes {past} rad beyond its limits of -0.05 to 2.62" in doubt.what
     (doubt,) = joint_limit_issues(arm, with_joints(run, position=lambda j: np.degrees(j.position)))
-    assert (doubt.cause, doubt.weight) == ("degrees", "refused")
+    assert (doubt.cause, doubt.severity) == ("degrees", "refused")
     assert doubt.limit_violation_ratio == pytest.approx(754.1, rel=1e-3)
     assert "angles reach 78 rad" in doubt.what
     (doubt,) = joint_limit_issues(arm, with_joints(run, t=lambda j: j.t / 30))
@@ -417,7 +417,7 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
         size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
         told = 1e-3 * size * (-1 if "slowly" in doubt.what else 1)
         assert told == pytest.approx(drift if drift else late, rel=0.05, abs=3e-3 * std)
-        assert (doubt.group, doubt.weight) == ("points_arm", "not_trusted")
+        assert (doubt.group, doubt.severity) == ("points_arm", "not_trusted")
         assert doubt.setting == "sensors.points_arm.use: false"
         # over the limit of half a period of both, at the end of the recording for a drift
         whole = 5.0 * drift if drift else late
@@ -540,7 +540,7 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         apart = np.sqrt(np.mean(np.sum((change(place) - place) ** 2, axis=2)))
-        assert (doubt.recording, doubt.group, doubt.weight) == ("run", "points_camera", "not_trusted")
+        assert (doubt.recording, doubt.group, doubt.severity) == ("run", "points_camera", "not_trusted")
         assert doubt.limit_violation_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
         assert words in doubt.what
     assert list(object_point_rollout_issues(episode, result, 0.0)) == []
@@ -623,7 +623,7 @@ def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
     for seed in range(3):
         recording = swung(drives, size=0.03, seed=seed, **{**SLOW, "rate": rate})
         found = list(slow_motion_excitation_issues(drives, recording, USUAL))
-        assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
+        assert [(d.cause, d.severity) for d in found] == ([("weak_excitation", "warning")] if said else [])
         for doubt in found:
             assert doubt.limit_violation_ratio == pytest.approx(5.0 / seen, rel=0.02)
             assert (doubt.group, doubt.channel) == ("joints", "position")
@@ -687,7 +687,7 @@ def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a
 
 def test_a_clock_that_runs_apart_is_told_by_what_the_fit_leaves(springs):
     (doubt,) = doubts(springs, drift=0.01)
-    assert (doubt.cause, doubt.weight, doubt.group) == ("clock_drift", "not_trusted", "points_camera")
+    assert (doubt.cause, doubt.severity, doubt.group) == ("clock_drift", "not_trusted", "points_camera")
     told, std = map(float, re.search(r"runs ([\d.]+) ± ([\d.]+) parts per thousand too fast", doubt.what).groups())
     assert told == pytest.approx(10.0, abs=4 * std + 0.5)
 
@@ -710,7 +710,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
 
 def test_noise_that_settings_state_ten_times_too_large(springs):
     (doubt,) = doubts(springs, std=1e-2)
-    assert (doubt.cause, doubt.weight, doubt.group) == ("noise_overstated", "warning", "points_camera")
+    assert (doubt.cause, doubt.severity, doubt.group) == ("noise_overstated", "warning", "points_camera")
     assert "the fit leaves 0.001 m of points_camera" in doubt.what
     name, value = doubt.setting.split(": ")
     assert name == "sensors.points_camera.std"

@@ -24,7 +24,7 @@ SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
     "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation",
         "covariance", "discretisation_notes", "stability",
-    "doubts", "torque_offsets", "to_use",
+    "issues", "torque_offsets", "to_use",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval"}
 
@@ -161,7 +161,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
         "what": "there is no key 'iteration'",
         "where": "--set solver.iteration",
         "allowed": "name, max_iterations, step_tolerance, cost_tolerance, initial_damping",
-        "hint": "did you mean 'max_iterations'?",
+        "hint": "did you mean 'max_iterations'?; new names of older keys are in the table of CHANGELOG.md",
         "exit_code": 2,
     }
     assert "did you mean 'max_iterations'?" in wrong.err

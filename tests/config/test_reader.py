@@ -16,7 +16,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
 from yid_ocp.solvers import GaussNewton, SteepestDescent
 
-RENAMED = "find its new name in the table of CHANGELOG.md"
+RENAMED = "new names of older keys are in the table of CHANGELOG.md"
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
@@ -115,7 +115,8 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("solver: {held_out: []}", ["'held_out' is a key of `recordings`"]),
         ("solver: {parameters: {}}", ["'parameters' is a key of the file itself"]),
         ("solver: {name: gauss_newton, backtracking_factor: 0.3}", ["there is no key 'backtracking_factor'"]),
-        ("xyzzy: 3", [RENAMED]),
+        ("xyzzy: 3", ["leave it out", RENAMED]),
+        ("diagnosis: {refits: 3}", ["there is no key 'refits'", RENAMED]),
         # what only code sets
         ("problem: {known_initial_states: {}}", ["there is no key"]),
         ("problem: {prior_stds: {a: 1}}", ["there is no key"]),

@@ -166,7 +166,7 @@ def test_noise_that_settings_state_counts_instead_of_the_recorded():
 def test_noise_stated_far_above_what_is_there():
     recording = changed(made(), effort_std=np.array([1.0, 0.05, 1.0]))
     (doubt,) = recording_quality_issues(recording, lambda _: SensorOptions())
-    assert (doubt.cause, doubt.weight, doubt.group) == ("noise_overstated", "warning", "joints")
+    assert (doubt.cause, doubt.severity, doubt.group) == ("noise_overstated", "warning", "joints")
     assert re.fullmatch(r"sensors.joints.effort.std: {a: 0.0[56]\d*, b: 0.05, c: 0.0[56]\d*}", doubt.setting)
     assert "the stated std is 1 (also too large for others: 2 of 3 channels in all)" in doubt.what
     # one number for all joints holds for the noisiest
@@ -263,7 +263,7 @@ def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_i
     assert [(p.joints.t[0], p.joints.t[-1]) for p in parts.recordings] == [(0.0, 2.99), (5.01, 8.0)]
     assert [p.name for p in parts.recordings] == ["made_part1", "made_part2"]
     (doubt,) = parts.issues
-    assert (doubt.cause, doubt.weight, doubt.begin, doubt.end) == ("gap", "warning", 2.99, 5.01)
+    assert (doubt.cause, doubt.severity, doubt.begin, doubt.end) == ("gap", "warning", 2.99, 5.01)
     assert "2 parts of the data, 5.98 s, are used" in doubt.what
 
 

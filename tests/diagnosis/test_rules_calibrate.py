@@ -49,7 +49,7 @@ def test_too_few_cases_promise_less() -> None:
     assert _conformal_quantile(list(range(40)), "least") == (1, 39 / 41)
 
 
-STATISTICS = dict.fromkeys(("evidence", "explained")) | {"behind": {}}
+STATISTICS = dict.fromkeys(("evidence", "explained_fraction")) | {"single_effects": {}}
 STATISTICS |= dict.fromkeys(("p_value", "chi2_per_dof", "candidate"), 1.0)
 
 
@@ -83,7 +83,7 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
         case("null", "no_gap", open=STATISTICS | {"candidate": 1e-6}),
     ]
     effects = [
-        case("single", "effect", DAMPER, multiple=size, statistics={"evidence": 10.0 * size, "explained": 0.9})
+        case("single", "effect", DAMPER, multiple=size, statistics={"evidence": 10.0 * size, "explained_fraction": 0.9})
         for size in (0.1, 1.0)
     ]
     strange = [case("left_out", "unknown", DAMPER, statistics={"evidence": 6.0})]
@@ -134,16 +134,16 @@ def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
 )
 def test_settings_are_quantiles_within_what_is_of_use(evidence, explained, worth, asked) -> None:
     clean = case("null", "no_gap", open=STATISTICS | {"evidence": evidence})
-    named = case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": explained})
+    named = case("single", "effect", DAMPER, multiple=3.0, statistics={"explained_fraction": explained})
     settings = calibrated(clean, named)["settings"]
     assert (settings["min_log_bayes_factor"], settings["min_explained_fraction"]) == (worth, asked)
 
 
 def test_of_two_rules_for_one_setting_the_wider_counts() -> None:
     clean = case("null", "no_gap", open=STATISTICS | {"evidence": 6.0})
-    same = {"left": 1.0, "chi2_per_dof": 0.0, "error": 0.0}
-    behind = {"a@b": same | {"squares": -4.0}, "kelvin_voigt@T1": same | {"squares": 14.0}}
-    true = case("single", "effect", DAMPER, multiple=3.0, statistics={"behind": behind})
+    fits = {"a@b": -4.0, "kelvin_voigt@T1": 14.0}
+    alone = {label: {"held_out_chi2_per_sample": 1.0, "bic_difference": size} for label, size in fits.items()}
+    true = case("single", "effect", DAMPER, multiple=3.0, statistics={"single_effects": alone})
     assert calibrated(clean, true)["settings"]["min_log_bayes_factor"] == 9.0
 
 

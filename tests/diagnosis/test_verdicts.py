@@ -34,7 +34,7 @@ def found(bench, effects, candidates, **how):
     assert located or not finding.single_effect_models
     assert bool(result["effects"]) is (result["verdict"] in ("effect", "confusable"))
     assert (result["reason"] != "") is (result["verdict"] == "unknown")
-    stages = "compose nominal events screening refits carry_over localisation remaining law"
+    stages = "compose nominal events screening refits transfer localisation remaining law"
     assert list(result["seconds"]) == stages.split()
     assert finding.summary == diagnosis_summary_text(finding) == result["summary"]
     return finding, result
@@ -52,11 +52,11 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert 0.9 < low <= result["gap"]["closure"] <= high + 1e-12
     assert result["gap"]["after"]["chi2_per_dof"] < 1.1 < result["gap"]["before"]["chi2_per_dof"]
     told = result["statistics"]
-    assert told["explained"] == finding.explained_fraction > 0.9
+    assert told["explained_fraction"] == finding.explained_fraction > 0.9
     assert told["candidate"] <= len(FRICTION) * result["which"][0]["p_value"]
     left = finding.single_effect_models[0].held_out_loss.chi2_per_sample
-    assert told["behind"]["joint_coulomb@elbow"] == {"left": left, "squares": 0.0}
-    assert min(entry["squares"] for entry in told["behind"].values()) == 0.0, "no other is as likely"
+    assert told["single_effects"]["joint_coulomb@elbow"] == {"held_out_chi2_per_sample": left, "bic_difference": 0.0}
+    assert min(entry["bic_difference"] for entry in told["single_effects"].values()) == 0.0, "no other is as likely"
     [apart] = finding.transfer_checks
     assert abs(apart.estimation_value - apart.held_out_value) < 4 * np.hypot(apart.estimation_std, apart.held_out_std)
     damping = finding.nominal_parameters_before_and_after["elbow.damping"]

@@ -13,8 +13,8 @@ from yid_ocp.inference.uncertainty import VERDICT_SENTENCE_TEXTS, VERDICT_TABLE_
 from yid_ocp.report import diagnosis_summaries, summaries, terminal  # noqa: F401, they register
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 
-GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
-BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True, "worse_than_guess": []}
+GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "data_trusted": True, "worse_than_guess": []}
+BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "data_trusted": True, "worse_than_guess": []}
 
 
 def parameter(said: str, value: float = 2.0) -> dict:
@@ -115,7 +115,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert lines[:2] == [first, f"{sure} N m/rad"]
     unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
     assert "no value is known to within 10 %" in told("yid-solve/1", unsure)[1]
-    assert "to within 10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"believed": False}})[1]
+    assert "to within 10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"data_trusted": False}})[1]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
     lines = told("yid-solve/1", said)
     worse = "worse than a guess without a model: w_T2 of run, 50 mm against 20 mm (stays)"

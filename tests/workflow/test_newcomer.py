@@ -207,7 +207,7 @@ def test_a_cable_on_a_ur5_and_a_cross_on_a_panda(desk: Path, user: Newcomer, dur
     carried_out("run.h5", "import", str(bag), "--point-sensor-name", "mocap")
     carried_out("run.yaml", "init", user.settings["robot"], "run.h5", *numbers)
     checked = carried_out("checked", "check", "run.yaml")
-    assert not checked["warnings"] + checked["doubts"]
+    assert not checked["warnings"] + checked["issues"]
     check_truth(carried_out("solved", "solve", "run.yaml"), user.truth)
 
 
@@ -223,7 +223,7 @@ def test_a_rod_on_an_arm_of_servos(desk: Path) -> None:
         )
     carried_out("rod.yaml", "init", "default:servo_arm.urdf", "run_3.h5", "run_4.h5", *ROD_NUMBERS)
     assert load_config("rod.yaml").model.arms.mode == "servo"
-    assert not carried_out("checked", "check", "rod.yaml")["doubts"]
+    assert not carried_out("checked", "check", "rod.yaml")["issues"]
     solved = carried_out("solved", "solve", "rod.yaml")
     check_truth(solved, SERVO.truth)
     for name, value in SERVOS.items():

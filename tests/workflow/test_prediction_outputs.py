@@ -213,7 +213,7 @@ EFFORT, POINTS = [("joints", "effort")], [("points", "")]
 def test_a_sensor_counts_as_a_whole(rmse, guess, places):
     found = estimation._worse_than_baseline_issues([entry(rmse, guess)], UNITS)
     assert [(doubt.group, doubt.channel) for doubt in found] == places
-    assert all((d.cause, d.weight, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
+    assert all((d.cause, d.severity, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
 
 
 def test_the_best_guess_counts():
@@ -233,8 +233,8 @@ def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum
     settings = [f"recordings.held_out=[{tmp_path / 'held_out.h5'}]", "output.write_report=false"]
     done = carried_out("solve", tmp_path / "run.yaml", settings=settings)
     result = done.result
-    assert result["fit"]["believed"] is believed
-    assert [doubt["cause"] for doubt in result["doubts"]] == ([] if believed else ["worse_than_guess"])
+    assert result["fit"]["data_trusted"] is believed
+    assert [doubt["cause"] for doubt in result["issues"]] == ([] if believed else ["worse_than_guess"])
     assert result["parameters"]["shoulder.stiffness"]["verdict"] == ("identifiable" if believed else "not_trusted")
     assert ("a prediction without a model has a smaller error" in done.out) is not believed
 

@@ -46,15 +46,15 @@ def noisy(recording):
 def test_a_run_on_good_recordings_says_nothing(damaged, carried_out):
     done = carried_out("solve", damaged(), "--strict", settings=["output.write_report=false"])
     assert "times its limit" not in done.out
-    assert (done.result["doubts"], done.result["fit"]["believed"]) == ([], True)
+    assert (done.result["issues"], done.result["fit"]["data_trusted"]) == ([], True)
     assert done.result["parameters"]["shoulder.stiffness"]["verdict"] == "identifiable"
 
 
 def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, carried_out):
     done = carried_out("solve", damaged(noisy))
     result = done.result
-    assert {doubt["cause"] for doubt in result["doubts"]} == {"noise"}
-    assert not result["fit"]["believed"]
+    assert {doubt["cause"] for doubt in result["issues"]} == {"noise"}
+    assert not result["fit"]["data_trusted"]
     free = [entry for entry in result["parameters"].values() if entry["free"]]
     assert {entry["verdict"] for entry in free} <= {"not_trusted", "not_identifiable"}
     assert any(line.split("  ")[0] == "issue" for line in done.out.splitlines()[:6])
@@ -70,11 +70,11 @@ def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
     run = load_config(damaged())
     problem = build_problem(run)
     doubt = Issue("effort_sign", "made up", "not_trusted", 5.0, "", "damaged")
-    for weight, verdict in (("warning", "identifiable"), ("not_trusted", "not_trusted")):
-        said = problem.with_options(replace(problem.options, data_issues=(replace(doubt, weight=weight),)))
+    for severity, verdict in (("warning", "identifiable"), ("not_trusted", "not_trusted")):
+        said = problem.with_options(replace(problem.options, data_issues=(replace(doubt, severity=severity),)))
         solution = solve(said, run.solver)
         assert solution.goodness_of_fit.explains
-        assert solution.goodness_of_fit.believed == (weight == "warning")
+        assert solution.goodness_of_fit.data_trusted == (severity == "warning")
         assert solution.parameters["shoulder.stiffness"].verdict == verdict
 
 
@@ -106,9 +106,9 @@ def test_times_that_are_not_seconds_stop_a_run_at_once(cli, damaged, tmp_path, l
 def test_gaps_are_cut_out_and_said(damaged, carried_out):
     file = damaged(lambda recording: without(recording, 0.55, 0.66))
     result = carried_out("solve", file, settings=["output.write_report=false"]).result
-    assert [doubt["cause"] for doubt in result["doubts"]] == ["gap"]
-    assert "2 parts of the data, 1.07 s, are used" in result["doubts"][0]["what"]
-    assert result["fit"]["believed"]
+    assert [doubt["cause"] for doubt in result["issues"]] == ["gap"]
+    assert "2 parts of the data, 1.07 s, are used" in result["issues"][0]["what"]
+    assert result["fit"]["data_trusted"]
 
 
 def test_the_same_data_twice_count_once(damaged):

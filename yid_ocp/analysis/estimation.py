@@ -138,8 +138,8 @@ def _checked_solution_and_issues(
     errors, units, _ = prediction_errors_units_and_fit_errors(problem, solution, held_out)
     found = clock_and_noise_issues_from_residuals(problem, solution.x, solution.evaluation)
     found += _worse_than_baseline_issues(errors, units)
-    if any(doubt.weight != "warning" for doubt in found):
-        believed = replace(solution.goodness_of_fit, believed=False)
+    if any(issue.severity != "warning" for issue in found):
+        believed = replace(solution.goodness_of_fit, data_trusted=False)
         marked = mark_free_estimates_not_trusted(solution.parameters)
         solution = replace(solution, goodness_of_fit=believed, parameters=marked)
     return solution, (*problem.options.data_issues, *found)

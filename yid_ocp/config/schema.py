@@ -77,7 +77,8 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     homes, near = list(dict.fromkeys(_sections_with_key(RunSettings, name))), nearest_name_question(name, known)
     hints = [near] if near else []
     hints += [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else []
-    hints = hints or ["leave it out, or find its new name in the table of CHANGELOG.md"]
+    # a key of an older version often resembles a present one that means something else
+    hints = [*(hints or ["leave it out"]), "new names of older keys are in the table of CHANGELOG.md"]
     if ":" in name:
         hints = ["put a space after the colon, as in {" + name.replace(":", ": ") + "}"]
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")

@@ -306,7 +306,7 @@ class Issue:
     cause: str  # key of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # sentence on the cause, with numbers
     # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
-    weight: IssueSeverity
+    severity: IssueSeverity
     # observed value over the detection limit (inverse for a lower limit), 1 to `LIMIT_VIOLATION_RATIO_CAP`
     limit_violation_ratio: float
     advice: str  # recommended action

@@ -127,7 +127,7 @@ def recording_quality_issues(recording: Recording, options: SensorOptionsLookup)
         channel_checks.saturated_effort_issues(recording),
         _standstill(recording),
     )
-    return [replace(doubt, recording=recording.name) for doubt in chain(_few_samples(recording), found)]
+    return [replace(issue, recording=recording.name) for issue in chain(_few_samples(recording), found)]
 
 
 def _units_of_time(recording: Recording) -> Iterator[Issue]:

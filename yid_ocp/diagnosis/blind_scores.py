@@ -328,8 +328,12 @@ def _odds(said: _Statistics, limits: Thresholds, truth: str) -> float:
     Only refits that leave noise alone are compared, because likelihood separates only these. Minus infinity if the
     refit of the true effect leaves more.
     """
-    most, behind = 1 + limits.min_excess_chi2_per_dof, said["behind"].items()
-    known = {label: own["squares"] for label, own in behind if own["left"] is not None and own["left"] < most}
+    most = 1 + limits.min_excess_chi2_per_dof
+    known = {
+        label: own["bic_difference"]
+        for label, own in said["single_effects"].items()
+        if own["held_out_chi2_per_sample"] is not None and own["held_out_chi2_per_sample"] < most
+    }
     return 0.5 * (known[truth] - min(known.values())) if truth in known else -math.inf
 
 
@@ -349,7 +353,7 @@ _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
     "candidate": _CalibrationRule("gap_significance_level", _of("candidate"), "clean", "least", 1e-4),
     "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
     "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
-    "explained": _CalibrationRule("min_explained_fraction", _of("explained"), "named", "least", 0.75),
+    "explained": _CalibrationRule("min_explained_fraction", _of("explained_fraction"), "named", "least", 0.75),
 }
 """All rules by name. `_STATISTIC_TEXTS` describes their statistics."""
 _STATISTIC_TEXTS = {

@@ -130,9 +130,12 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
-        "explained": result.explained_fraction,
-        "behind": {
-            fit.effects[-1].label: {"left": fit.held_out_loss.chi2_per_sample, "squares": bic_difference(fit, alone[0])}
+        "explained_fraction": result.explained_fraction,
+        "single_effects": {
+            fit.effects[-1].label: {
+                "held_out_chi2_per_sample": fit.held_out_loss.chi2_per_sample,
+                "bic_difference": bic_difference(fit, alone[0]),
+            }
             for fit in alone
         },
     }

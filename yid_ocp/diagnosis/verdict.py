@@ -199,7 +199,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
         # a further effect that only corrects errors of the first is no reason to doubt this one
         alone = judged((select.selected_effect_alone(added[0], nominal, fits, limits),))
         said = alone if alone.verdict != "unknown" else said
-    search.end_stage("carry_over")
+    search.end_stage("transfer")
     return said
 
 

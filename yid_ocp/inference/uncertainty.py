@@ -49,7 +49,7 @@ class GoodnessOfFit:
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
     explains: bool  # result of the null test (`residuals_exceed_noise`)
-    believed: bool = True  # no serious data issue (`ProblemOptions.data_issues`)
+    data_trusted: bool = True  # no serious data issue (`ProblemOptions.data_issues`)
 
 
 @dataclass(frozen=True)
@@ -418,7 +418,7 @@ def parameter_estimates(
         side = 0  # -1 at the lower bound, 1 at the upper
         if known and min(value - low, high - value) <= near:
             side = -1 if value - low <= near else 1
-        explains = fit is None or (fit.explains and fit.believed)
+        explains = fit is None or (fit.explains and fit.data_trusted)
         said = parameter_verdict(value, std, scale=sizes[entry.name], explains=explains, at_bound=side != 0)
         interval = None
         if said == "not_identifiable":

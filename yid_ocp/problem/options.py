@@ -167,4 +167,4 @@ class ProblemOptions:
     @property
     def has_no_data_issue_above_warning(self) -> bool:
         """Whether no data quality issue is more severe than a warning."""
-        return all(doubt.weight == "warning" for doubt in self.data_issues)
+        return all(issue.severity == "warning" for issue in self.data_issues)

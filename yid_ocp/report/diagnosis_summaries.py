@@ -88,7 +88,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((channel, made, *sizes, entry["unit"]))
     yield SummaryTable(rows, "Errors on recordings made without and with the effects")
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
-    if any(own["weight"] != "warning" for own in result.get("doubts", ())):
+    if any(own["severity"] != "warning" for own in result.get("issues", ())):
         yield "issues of the recordings may have caused this verdict"
     if result["next_plan"] is not None:
         yield "to separate these effects, plan a motion:"
@@ -321,7 +321,7 @@ def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
     if not fit["explains"]:
         yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
-    elif not fit["believed"]:
+    elif not fit["data_trusted"]:
         yield "the recordings have issues, so agreement of methods does not confirm the values"
     elif not found:
         yield "no parameter can be found from these recordings, so there is nothing to agree on"

@@ -359,8 +359,8 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
     ended = "no problem found: a run is possible"
-    if result.get("doubts") or result["warnings"]:
-        ended = f"a run is possible; see {'the issues' if result.get('doubts') else 'the warnings'}"
+    if result.get("issues") or result["warnings"]:
+        ended = f"a run is possible; see {'the issues' if result.get('issues') else 'the warnings'}"
     yield SummaryStatement(ended, "conclusion")
 
 

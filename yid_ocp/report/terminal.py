@@ -108,19 +108,19 @@ def p_value_text(p_value: float) -> str:
 
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
-    doubts = result.get("doubts", ())
+    issues = result.get("issues", ())
     rows: TableRows = [("issue", "where", "certainty", "times its limit")]
     advice: list[StatementTableOrCode | str] = []
-    for cause in dict.fromkeys(entry["cause"] for entry in doubts):
-        alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
+    for cause in dict.fromkeys(entry["cause"] for entry in issues):
+        alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
         for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE], start=1):
             left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
             where = entry["where"] + (f" and {left} more" if left else "")
-            rows.append((words, where, entry["sure"], f"{entry['evidence']:.3g}"))
+            rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}"))
             advice += [f"{words}: {entry['what']}; {entry['advice']}", CodeBlock(entry["setting"])]
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
-    if any(entry["weight"] != "warning" for entry in doubts):
+    if any(entry["severity"] != "warning" for entry in issues):
         yield SummaryStatement("no value counts as found, because a recording has a severe issue", "verdict")
 
 
@@ -134,7 +134,7 @@ def misfit_summary_blocks(
     if not fit["explains"]:
         yield SummaryStatement(goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
         doubted = {name: entry for name, entry in parameters.items() if entry["verdict"] == "not_trusted"}
-        if doubted and fit["believed"]:
+        if doubted and fit["data_trusted"]:
             known = []
             for name, entry in doubted.items():
                 relative = entry.get("std_relative")

@@ -179,8 +179,8 @@ def build_problem(
     if problem is not as_stamped:  # issues that only the uncertain clock caused are dropped
         corrected = ([episode.recording for episode in group] for group in (problem.episodes, problem.held_out))
         _raise_for_issues(run, clocks)
-        left = {(doubt.cause, doubt.recording) for doubt in _check_recordings(run, system, free, *corrected)[2]}
-        issues = tuple(own for own in issues if own.weight == "warning" or (own.cause, own.recording) in left)
+        left = {(issue.cause, issue.recording) for issue in _check_recordings(run, system, free, *corrected)[2]}
+        issues = tuple(own for own in issues if own.severity == "warning" or (own.cause, own.recording) in left)
     if more or problem is not as_stamped:
         problem = problem.with_options(replace(said, data_issues=(*issues, *more, *clocks)))
     return problem
@@ -240,33 +240,33 @@ def _check_recordings(
     run: RunSettings, system: System, free: Sequence[str], estimate: Sequence[Recording], held_out: Sequence[Recording]
 ) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:
     """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
-    doubts: list[Issue] = []
+    issues: list[Issue] = []
     cable = cable_topology_between_clamps(run)
     kept: tuple[list[Recording], list[Recording]] = [], []
     arm = None if cable is not None else RecordedJointsModel.from_system(system, free)
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices
     clamped = () if cable is None else cable.clamped_vertex_names
-    for role, recordings in zip(kept, _once(run, estimate, held_out, doubts), strict=True):
+    for role, recordings in zip(kept, _once(run, estimate, held_out, issues), strict=True):
         for recording in recordings:
             found = recording_quality_issues(recording, _choice(run))
-            doubts += found
-            if any(doubt.weight == "refused" for doubt in found):
+            issues += found
+            if any(issue.severity == "refused" for issue in found):
                 continue
             parts = split_recording_at_gaps(recording, clamped, anywhere)
-            doubts += parts.issues
+            issues += parts.issues
             for part in parts.recordings:
-                doubts += _beside_the_model(run, system, arm, cable, part)
+                issues += _beside_the_model(run, system, arm, cable, part)
             role += parts.recordings
     if arm is not None:
-        doubts += _excitation(run, arm, free, kept[0])
-    _raise_for_issues(run, doubts)
+        issues += _excitation(run, arm, free, kept[0])
+    _raise_for_issues(run, issues)
     if not kept[0]:
-        gaps = dict.fromkeys(own.what.partition(";")[0] for own in doubts if own.cause in ("gap", "clock_jump"))
+        gaps = dict.fromkeys(own.what.partition(";")[0] for own in issues if own.cause in ("gap", "clock_jump"))
         what, hint = f"no recording has a usable part: {'; '.join(gaps)}", "record again without such gaps"
         where = "" if anywhere else ", from the start of a recording or from a rest"
         allowed = f"0.5 s without a gap{where}"
         raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
-    return *kept, tuple(doubts)
+    return *kept, tuple(issues)
 
 
 def all_issues_of_one_recording(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
@@ -284,13 +284,13 @@ def _choice(run: RunSettings) -> Callable[[str], SensorOptions]:
 
 
 def _once(
-    run: RunSettings, estimate: Sequence[Recording], held_out: Sequence[Recording], doubts: list[Issue]
+    run: RunSettings, estimate: Sequence[Recording], held_out: Sequence[Recording], issues: list[Issue]
 ) -> tuple[list[Recording], list[Recording]]:
     used: list[Recording] = []
     others: list[Recording] = []
     for recording in estimate:
         if same := _duplicate(used, recording):
-            doubts.append(replace(same[0], what=f"{same[0].what}; it counts once"))
+            issues.append(replace(same[0], what=f"{same[0].what}; it counts once"))
         else:
             used.append(recording)
     for recording in held_out:
@@ -301,7 +301,7 @@ def _once(
             raise DataError(what, where=where, allowed="every measurement in one list", hint=hint)
         if _duplicate(others, recording):
             text = f"{recording.name} is held out twice; it counts once"
-            doubts.append(Issue("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
+            issues.append(Issue("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
         else:
             others.append(recording)
     return used, others
@@ -321,11 +321,11 @@ def _beside_the_model(
     found: list[Issue] = []
     if arm is not None and arm.has_all_angles_recorded(recording):
         found += joint_checks.joint_limit_issues(arm, recording)
-        if any(doubt.weight == "refused" for doubt in found):
+        if any(issue.severity == "refused" for issue in found):
             return found
         told = list(joint_checks.inverse_dynamics_effort_issues(arm, recording))
         told += point_checks.forward_kinematics_issues(arm, recording, _choice(run))
-        found += [doubt for doubt in told if not _is_modelled(system, doubt)]
+        found += [issue for issue in told if not _is_modelled(system, issue)]
     theta = system.parameters.vector()
     return found + list(point_checks.point_distance_issues(arm, system, theta, recording, _choice(run)))
 
@@ -345,16 +345,16 @@ def _excitation(
         whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
         weak = [list(joint_checks.slow_motion_excitation_issues(arm, one, options)) for one in whole]
         if all(weak):  # one informative recording is enough
-            found += [doubt for doubts in weak for doubt in doubts]
+            found += [issue for issues in weak for issue in issues]
     return found
 
 
-def _is_modelled(system: System, doubt: Issue) -> bool:
-    kinds = _EFFECTS_BY_CAUSE.get(doubt.cause, ())
+def _is_modelled(system: System, issue: Issue) -> bool:
+    kinds = _EFFECTS_BY_CAUSE.get(issue.cause, ())
     places = {effect.location for effect in system.effects if effect.kind in kinds}
-    if "camera_latency" in kinds and "camera_latency" not in doubt.setting:  # no camera's clock
+    if "camera_latency" in kinds and "camera_latency" not in issue.setting:  # no camera's clock
         return False
-    joint = doubt.channel.partition(".")[2]
+    joint = issue.channel.partition(".")[2]
     return bool(places) and (not joint or joint in places)
 
 
@@ -375,26 +375,26 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
     return found
 
 
-def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
+def _raise_for_issues(run: RunSettings, issues: Sequence[Issue]) -> None:
     """Raise `DataError` for issues that forbid a run; with `recordings.stop_on_any_issue`, for any issue."""
-    grave = [doubt for doubt in doubts if run.recordings.stop_on_any_issue or doubt.weight == "refused"]
+    grave = [issue for issue in issues if run.recordings.stop_on_any_issue or issue.severity == "refused"]
     if not grave:
         return
     first, *others = grave
-    more = [f"{doubt.location_text}: {doubt.what}" for doubt in others]
+    more = [f"{issue.location_text}: {issue.what}" for issue in others]
     what = "; ".join([f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}", *more])
     hint = first.advice + (f" ({first.setting})" if first.setting else "")
     raise DataError(what, where=first.location_text, allowed="recordings without this issue", hint=hint)
 
 
-def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
-    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.limit_violation_ratio))
+def _gravest_first(issues: Sequence[Issue]) -> list[Issue]:
+    return sorted(issues, key=lambda issue: (issue.severity == "warning", -issue.limit_violation_ratio))
 
 
 def issues_to_plain_data(issues: Sequence[Issue]) -> list[dict[str, Any]]:
-    """Convert data quality issues to JSON-ready dictionaries, most severe first, for the key `doubts` of a result."""
+    """Convert data quality issues to JSON-ready dictionaries, most severe first, for the key `issues` of a result."""
     found = []
-    for doubt in _gravest_first(issues):
-        own = {"evidence" if key == "limit_violation_ratio" else key: value for key, value in asdict(doubt).items()}
-        found.append(own | {"sure": doubt.certainty_word, "where": doubt.location_text})
+    for issue in _gravest_first(issues):
+        own = {"evidence" if key == "limit_violation_ratio" else key: value for key, value in asdict(issue).items()}
+        found.append(own | {"certainty": issue.certainty_word, "where": issue.location_text})
     return found

@@ -72,7 +72,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "recordings": recordings,
             "convergence": convergence,
             "discretisation": moved,
-            "doubts": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
+            "issues": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)

@@ -50,7 +50,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
         own, checks = judged.problem or problem, judged.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions
         about = {
-            "doubts": issues_to_plain_data(checks.data_issues),
+            "issues": issues_to_plain_data(checks.data_issues),
             "published": PAPER_ESTIMATES[experiment] if experiment else {},
             "truth": truth,
             "judged": solution_to_result_dict(own, judged, held_out),

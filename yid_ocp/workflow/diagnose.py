@@ -109,7 +109,7 @@ def run_diagnose(
         recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
         own = {
             "model": _final_model_to_dict(finding),
-            "doubts": issues_to_plain_data(problem.options.data_issues),
+            "issues": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.torque_offsets_by_recording(last.problem, x),
             "not_candidates": effect_kinds_without_recorded_signals(recordings),
             "unused_efforts": _has_unused_efforts(problem),

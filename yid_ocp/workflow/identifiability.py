@@ -162,7 +162,7 @@ def _identifiability_result(
         "start": asked.start_knowledge,
         "grasp_std": asked.grasp_offset_std if problem.system.grasps else None,
         "fit": None if solution is None else asdict(solution.goodness_of_fit),
-        "doubts": issues_to_plain_data(problem.options.data_issues),
+        "issues": issues_to_plain_data(problem.options.data_issues),
         "what_if": None,
     }
     if information is None or unknown is None:

@@ -63,9 +63,9 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         else:
             recording = read_third_party_recording(files[0], options, progress)
         write_recording(recording, arguments.out)
-    out, doubts = arguments.out, recording_issue_lines(recording)
-    result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording), "doubts": doubts}
-    lines = [*recording_summary_lines(recording), *doubts]
+    out, issues = arguments.out, recording_issue_lines(recording)
+    result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording), "issues": issues}
+    lines = [*recording_summary_lines(recording), *issues]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)
     return EXIT_DONE
 

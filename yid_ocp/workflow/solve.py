@@ -48,7 +48,7 @@ def run_solve(
         prediction_outputs.write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         offsets, to_path = prediction_outputs.torque_offsets_by_recording, os.path.relpath(folder.final_path)
         more = {
-            "doubts": issues_to_plain_data(checks.data_issues),
+            "issues": issues_to_plain_data(checks.data_issues),
             "safeguard": checks.cable_memory_message,
             "covariance": _covariance_result(solution, checks.data_std),
             "discretisation": discretisation_shifts_to_dict(checks.discretisation_shifts, checks.data_std),

@@ -63,7 +63,7 @@ def _run_track(
                 tracker, recording = _frame_tracker(tasks.settings, system)
                 config = tasks.work_folder / _CONFIG_FILE
                 _LAST_TRACKER[:] = [((files.read_input_text(config), config), tracker)]
-                doubts = [] if recording is None else all_issues_of_one_recording(run, system, recording)
+                issues = [] if recording is None else all_issues_of_one_recording(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("tracking")
@@ -90,12 +90,12 @@ def _run_track(
             # tracked points can be out of the object's reach if the model defines its position
             if settings.options.root_placement == "model":
                 own = all_issues_of_one_recording(run, system, tracked)
-                doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
+                issues += [issue for issue in own if issue.cause.startswith("point_")]
             theta = system.parameters.vector()
             shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
             told = [animation_of_trajectories("tracked", [shape], tracked)]
             result["truth_errors"] = {} if made is None else _truth_errors(system, found, made)
-        result |= {"doubts": issues_to_plain_data(doubts), "refused": "" if refused is None else refused.what}
+        result |= {"issues": issues_to_plain_data(issues), "refused": "" if refused is None else refused.what}
         drawn = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
         more = {"pictures": [path for path in drawn if path.exists()]}
         written = folder.write_result_and_report(run, progress, result, animations=told, section_data=more)
