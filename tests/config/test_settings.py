@@ -1,6 +1,7 @@
 """The settings: JSON Schema, page and examples; what they are without a file, and what is written back."""
 
 import dataclasses
+import re
 import runpy
 from types import SimpleNamespace
 
@@ -86,6 +87,30 @@ def test_the_schema_accepts_every_configuration(repository, rules):
 )
 def test_the_schema_refuses_typos(rules, data, valid):
     assert rules.is_valid(data) == valid
+
+
+def schema_keys(section, at=""):
+    """Dotted names of all keys that a schema allows; `*` is a name that users choose."""
+    for part in section.get("anyOf", []):
+        yield from schema_keys(part, at)
+    inner = {**section.get("properties", {}), "*": section.get("additionalProperties")}
+    for name, part in [*inner.items(), ("", section.get("items"))]:
+        if isinstance(part, dict):
+            path = ".".join(filter(None, (at, name)))
+            yield path
+            yield from schema_keys(part, path)
+
+
+def test_the_table_of_renamed_settings_leads_to_settings(repository, rules):
+    text = (repository / "CHANGELOG.md").read_text(encoding="utf-8")
+    table = re.findall(r"^\| (setting|result key|command line|Python) \| `(.+?)` \| (.+) \|$", text, re.MULTILINE)
+    assert len({row[:2] for row in table}) == len(table)
+    keys = set(schema_keys(rules.schema))
+    settings = {old: now for kind, old, now in table if kind == "setting"}
+    assert len(settings) > 200
+    assert not keys & set(settings)
+    targets = {now.split("`")[1].split(":")[0] for now in settings.values() if not now.startswith("removed")}
+    assert targets <= keys
 
 
 @pytest.mark.parametrize("name", ["dual_arm_vision", "baxter_arm", "panda_beam", "deft_bdlo1", "springs_torsion"])
