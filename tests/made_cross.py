@@ -20,14 +20,12 @@ TRUTH = {"north.bend": 0.5, "east.bend": 0.3}
 
 URDF = """<robot name="wrist"><link name="wall"/>
 <joint name="roll" type="continuous"><parent link="wall"/><child link="fork"/><axis xyz="1 0 0"/>
-  <limit effort="50" velocity="9"/></joint>
+<limit effort="50" velocity="9"/></joint>
 <link name="fork"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
-  </inertial></link>
-<joint name="pitch" type="continuous"><parent link="fork"/><child link="hub"/><axis xyz="0 1 0"/>
-  <limit effort="50" velocity="9"/></joint>
+</inertial></link><joint name="pitch" type="continuous"><parent link="fork"/><child link="hub"/><axis xyz="0 1 0"/>
+<limit effort="50" velocity="9"/></joint>
 <link name="hub"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
-  </inertial></link></robot>
-"""
+</inertial></link></robot>"""
 
 CONFIG = """\
 description: A cross of two long and two short branches.

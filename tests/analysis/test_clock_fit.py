@@ -15,21 +15,11 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, solve
 
-BENCH = """<mujoco>
-  <option timestep="0.00025" integrator="implicitfast"/>
-  <worldbody>
-    <body name="upper" pos="0 0 1">
-      <joint name="shoulder" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.6"/>
-      <body name="lower" pos="0 0 -0.3">
-        <joint name="elbow" axis="0 1 0" {elbow}/>
-        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.015" mass="0.3"/>
-        <site name="tip" pos="0 0 -0.3"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><position joint="shoulder" kp="4000" dampratio="1"/></actuator>
-</mujoco>"""
+BENCH = """<mujoco><option timestep="0.00025" integrator="implicitfast"/><worldbody><body name="upper" pos="0 0 1">
+<joint name="shoulder" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.6"/>
+<body name="lower" pos="0 0 -0.3"><joint name="elbow" axis="0 1 0" {elbow}/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.015" mass="0.3"/><site name="tip" pos="0 0 -0.3"/></body></body>
+</worldbody><actuator><position joint="shoulder" kp="4000" dampratio="1"/></actuator></mujoco>"""
 
 
 def swung(late, frequency, seed):

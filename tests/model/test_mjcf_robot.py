@@ -34,22 +34,17 @@ def arm(count: int, inner: str = "") -> str:
     return text
 
 
-FINGERS = """
-  <body name="left_finger" pos="0 0 0.06"><joint name="finger1" type="slide" axis="0 1 0" range="0 0.04"/>
-    <geom type="box" size="0.01 0.01 0.02" density="3000"/></body>
-  <body name="right_finger" pos="0 0 0.06" quat="0 0 0 1">
-    <joint name="finger2" type="slide" axis="0 1 0" range="0 0.04"/>
-    <geom type="box" size="0.01 0.01 0.02" density="3000"/></body>
-  <site name="tcp" pos="0 0 0.1"/>"""
+FINGERS = """<body name="left_finger" pos="0 0 0.06"><joint name="finger1" type="slide" axis="0 1 0" range="0 0.04"/>
+<geom type="box" size="0.01 0.01 0.02" density="3000"/></body><body name="right_finger" pos="0 0 0.06" quat="0 0 0 1">
+<joint name="finger2" type="slide" axis="0 1 0" range="0 0.04"/>
+<geom type="box" size="0.01 0.01 0.02" density="3000"/></body><site name="tcp" pos="0 0 0.1"/>"""
 MODELS = {
     # seven joints, armature and damping by a default class, fingers that follow each other, position actuators
     "arm with a gripper": f"""<mujoco><compiler angle="radian" autolimits="true"/>
-      <default><joint armature="0.1" damping="1.0"/></default>
-      <worldbody>{arm(7, FINGERS)}</worldbody>
-      <equality><joint joint1="finger2" joint2="finger1" polycoef="0 1 0 0 0"/></equality>
-      <actuator><position joint="joint1" kp="100" kv="10" forcerange="-87 87"/>
-      <motor joint="joint2" gear="2" ctrlrange="-20 20"/></actuator>
-      </mujoco>""",
+<default><joint armature="0.1" damping="1.0"/></default><worldbody>{arm(7, FINGERS)}</worldbody>
+<equality><joint joint1="finger2" joint2="finger1" polycoef="0 1 0 0 0"/></equality>
+<actuator><position joint="joint1" kp="100" kv="10" forcerange="-87 87"/>
+<motor joint="joint2" gear="2" ctrlrange="-20 20"/></actuator></mujoco>""",
     # inertia of geoms, degrees, friction: a small servo arm
     "servo arm": """<mujoco><compiler angle="degree" autolimits="true"/>
       <default><joint frictionloss="0.05" armature="0.028" range="-110 110"/></default>
@@ -61,30 +56,25 @@ MODELS = {
       </body></body></body></worldbody></mujoco>""",
     # several joints on one body, none of them at its origin
     "ball by three hinges": f"""<mujoco><compiler angle="radian"/><worldbody>
-      <body name="upper_arm" pos="0 0 1"><joint name="x" axis="1 0 0" pos="0 0 0.02"/>
-        <joint name="y" axis="0 1 0" pos="0.03 0 0.02"/><joint name="z" axis="0 0.6 0.8" pos="0 0.05 0"/>
-        {INERTIAL.format(1.5, -0.2)}
-        <body name="forearm" pos="0 0 -0.4"><joint name="elbow" axis="1 1 0" pos="0 0 0.1"/>
-          {INERTIAL.format(0.8, -0.1)}</body>
-      </body></worldbody></mujoco>""",
+<body name="upper_arm" pos="0 0 1"><joint name="x" axis="1 0 0" pos="0 0 0.02"/>
+<joint name="y" axis="0 1 0" pos="0.03 0 0.02"/><joint name="z" axis="0 0.6 0.8" pos="0 0.05 0"/>
+{INERTIAL.format(1.5, -0.2)}<body name="forearm" pos="0 0 -0.4"><joint name="elbow" axis="1 1 0" pos="0 0 0.1"/>
+{INERTIAL.format(0.8, -0.1)}</body></body></worldbody></mujoco>""",
     # coordinates that are not zero in the drawn pose, a rail and full inertias
     "rail with references": """<mujoco><compiler angle="radian" autolimits="true"/><worldbody>
-      <body name="cart" pos="0.1 0.2 0.3" quat="0.7 0.1 0.2 0.3">
-        <joint name="rail" type="slide" axis="1 0 0" ref="0.25"/>
-        <inertial mass="3" pos="0 0.1 0" fullinertia="0.03 0.04 0.05 0.001 -0.002 0.003"/>
-        <body name="pole" pos="0 0 0.1"><joint name="swing" axis="0 1 1" ref="0.7" stiffness="3"/>
-          <inertial mass="1" pos="0 0.1 0.3" fullinertia="0.03 0.04 0.05 0.001 -0.002 0.003"/></body>
-      </body></worldbody></mujoco>""",
+<body name="cart" pos="0.1 0.2 0.3" quat="0.7 0.1 0.2 0.3"><joint name="rail" type="slide" axis="1 0 0" ref="0.25"/>
+<inertial mass="3" pos="0 0.1 0" fullinertia="0.03 0.04 0.05 0.001 -0.002 0.003"/>
+<body name="pole" pos="0 0 0.1"><joint name="swing" axis="0 1 1" ref="0.7" stiffness="3"/>
+<inertial mass="1" pos="0 0.1 0.3" fullinertia="0.03 0.04 0.05 0.001 -0.002 0.003"/></body>
+</body></worldbody></mujoco>""",
     # two arms on one torso, a welded tool, a body without a name
     "two arms": f"""<mujoco><compiler angle="radian"/><worldbody><body name="torso" pos="0 0 1">{INERTIAL.format(9, 0)}
-      <joint name="waist" axis="0 0 1"/>
-      <body name="left" pos="0 0.2 0.3" euler="0.3 0 0"><joint name="left_joint" axis="0 1 0"/>
-        {INERTIAL.format(2, 0.2)}
-        <body pos="0 0 0.4">{INERTIAL.format(0.5, 0.05)}</body></body>
-      <body name="right" pos="0 -0.2 0.3" euler="-0.3 0 0"><joint name="right_joint" axis="0 1 0"/>
-        {INERTIAL.format(2, 0.2)}
-        <body name="tool" pos="0 0 0.4">{INERTIAL.format(0.5, 0.05)}</body></body>
-      </body></worldbody><equality><weld body1="tool" body2="world" active="false"/></equality></mujoco>""",
+<joint name="waist" axis="0 0 1"/>
+<body name="left" pos="0 0.2 0.3" euler="0.3 0 0"><joint name="left_joint" axis="0 1 0"/>{INERTIAL.format(2, 0.2)}
+<body pos="0 0 0.4">{INERTIAL.format(0.5, 0.05)}</body></body>
+<body name="right" pos="0 -0.2 0.3" euler="-0.3 0 0"><joint name="right_joint" axis="0 1 0"/>{INERTIAL.format(2, 0.2)}
+<body name="tool" pos="0 0 0.4">{INERTIAL.format(0.5, 0.05)}</body></body>
+</body></worldbody><equality><weld body1="tool" body2="world" active="false"/></equality></mujoco>""",
 }
 
 

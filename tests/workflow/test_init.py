@@ -310,7 +310,8 @@ def pushed_pendulum(folder: Path, phases: Sequence[float], name: str) -> None:
     torque = np.array([pin.rnea(model, data, *row) for row in zip(turns, v, a, strict=True)])
     torque += [0.3, 0.1] * np.tanh(v / 0.02) + [0.4, 0.2] * v + [0.2, -0.1] + 0.02 * rng.standard_normal(v.shape)
     names = tuple(model.names[1:])
-    write_recording(Recording(JointGroup(names, t, q, effort=torque), name=name), folder / f"{name}.h5")
+    seen = PointGroup("points", ("m1",), t, turns[:, None, :3], 1e-3)  # nobody says where
+    write_recording(Recording(JointGroup(names, t, q, effort=torque), (seen,), name=name), folder / f"{name}.h5")
 
 
 def test_an_arm_alone_with_efforts_is_identified_as_written(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,13 +22,14 @@ _TIME_WORDS = "t time times timestamp timestamps time_stamp stamp header_stamp s
 _CHANNEL_WORDS: Mapping[str, str] = {
     "position": "q pos position positions angle angles joint_pos joint_position joint_positions actual_q q_actual",
     "velocity": "dq qd vel velocity velocities speed joint_vel joint_velocity joint_velocities actual_qd dq_actual",
-    "effort": "tau eff effort efforts torque torques trq joint_effort joint_torque joint_torques tau_j tau_measured",
+    "effort": "tau eff effort efforts torque torques trq joint_effort joint_torque joint_torques tau_J tau_measured",
     "external_effort": "tau_ext ext_tau external_torque external_effort tau_ext_hat_filtered",
     "position_command": "cmd q_cmd q_des q_d q_ref pos_cmd cmd_pos position_command target_q desired_position",
     "velocity_command": "dq_cmd dq_des dq_d qd_d vel_cmd cmd_vel velocity_command target_qd desired_velocity",
     "torque_enable": "torque_enable",
 }
-"""Words for each joint channel in column names of Franka, UR, Isaac Sim, LeRobot, ROS and PlotJuggler."""
+"""Words for each joint channel in column names of Franka, UR, Isaac Sim, LeRobot, ROS and PlotJuggler. The case
+counts in `tau_J` only, because `tau_j1` is the torque of a joint `j1`."""
 _CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
 _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
@@ -41,6 +42,7 @@ UNIT_BY_WORD = {
     **{"nmm": "N mm", "n mm": "N mm", "n*mm": "N mm", "mnm": "mN m", "mn m": "mN m"},
 }
 """Units in the spellings of headers, in lower case."""
+_NUMBERED_COMMAND = re.compile(r"q_(d|des|ref|cmd)_\d+")  # of a joint without a name
 _NO_POINT = re.compile(r"(.*_)?(force|torque|moment|velocity|acceleration|orientation|rotation|quaternion)", re.I)
 _BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
 _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_BY_WORD), key=len, reverse=True))})", re.I)
@@ -89,7 +91,8 @@ def _exact_meaning(column: str, sensor_components: Sequence[str]) -> ColumnMeani
         return "t", ""
     for prefix in sorted(_EXACT_PREFIXES, key=len, reverse=True):
         if column.startswith(prefix) and column != prefix:
-            return _EXACT_PREFIXES[prefix], column.removeprefix(prefix)
+            found = _EXACT_PREFIXES[prefix], column.removeprefix(prefix)
+            return None if _NUMBERED_COMMAND.fullmatch(column) else found
     for component in sorted(sensor_components, key=len, reverse=True):
         if (name := column.removesuffix(f"_{component}")) not in ("", column):
             return component, name
@@ -107,9 +110,10 @@ def _spelled_meaning(column: str) -> ColumnMeaning:
     plain = _TOPIC_PREFIX.sub("", plain, count=1) if _TOPIC_PREFIX.match(plain) else plain
     for word in _LONGEST_FIRST:
         channel = _CHANNEL_BY_WORD[word]
-        if found := re.fullmatch(rf"{word}_?(\d+)", plain, re.IGNORECASE):
+        case = re.IGNORECASE if word.islower() else 0
+        if found := re.fullmatch(rf"{word}_?(\d+)", plain, case):
             return channel, found[1]
-        if found := re.fullmatch(rf"{word}_(.+)|(.+)_{word}", plain, re.IGNORECASE):
+        if found := re.fullmatch(rf"{word}_(.+)|(?:q_?(?=\d+_))?(.+)_{word}", plain, case):
             return channel, found[1] or found[2]
     return None
 

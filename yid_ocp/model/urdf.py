@@ -40,6 +40,7 @@ _UNLIMITED_VALUE = 1e9  # represents "no limit" where URDF requires a number
 _MIN_MASS = 1e-9  # [kg]; avoids overflow in divisions
 _MAX_NUMBER = 1e12  # in m, rad, kg and kg m^2; avoids overflow of squares
 _PRINCIPAL_MOMENT_RTOL = 1e-2  # tolerance for rounding in the file
+_PRINCIPAL_MOMENT_ATOL = 1e-12  # likewise, for point masses [kg m^2]
 _MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
 _TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
@@ -318,7 +319,7 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
     """Refuse negative moments of inertia, and warn of moments that no mass distribution has."""
     least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
-    if least < -_PRINCIPAL_MOMENT_RTOL * max(most, -least):
+    if least < -max(_PRINCIPAL_MOMENT_RTOL * max(most, -least), _PRINCIPAL_MOMENT_ATOL):
         what = f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)"
         hint = "correct the <inertia> of the link"
         raise ModelError(what, where=where, allowed="principal moments of 0 or more", hint=hint)

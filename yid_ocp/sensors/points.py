@@ -63,7 +63,7 @@ def _points(
     if not known:
         what = f"no point of the group has the name of a frame of the model: {', '.join(wanted)}"
         hint = f"set sensors.{group.name}.frame_by_recorded_name: {{POINT: FRAME}}, or sensors.{group.name}.use: false"
-        listed = unknown_name_error_arguments("", around.system.point_frames)["allowed"]
+        listed = unknown_name_error_arguments("", around.system.point_frames or mechanism.frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     for point in known:

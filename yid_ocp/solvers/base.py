@@ -123,8 +123,10 @@ class Solution(ReprMixin):
             words[name] = "–" if lost else value_and_uncertainty_text(e.value, finite_or_none(e.std), e.interval)
             rows.append((name, words[name], e.unit, VERDICT_TABLE_TEXTS[e.verdict]))
         told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
-        more = f"and {count_with_noun(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
-        fit = f"chi2 per degree of freedom {self.goodness_of_fit.chi2_per_dof:.3g}"
+        count = len(free) - len(told)
+        rest = f"and {count_with_noun(count, 'more parameter')}" if told else f"none of {count} parameters found"
+        more, chi2 = rest if count else "", self.goodness_of_fit.chi2_per_dof
+        fit = f"chi2 per degree of freedom {chi2:.3g}" if math.isfinite(chi2) else self.message
         how = f"{self.status.value.replace('_', ' ')} by {self.solver_name}"
         left_out = ("of discretisation",) if self.checks is None else self.checks.uncounted_errors
         uncounted = f"± without the error {' and '.join(left_out)}" if left_out and free else ""

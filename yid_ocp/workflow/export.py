@@ -262,7 +262,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
         after = _replayed(text, system, recordings, progress, 1)
     except (DataError, ModelError) as error:
-        return {"status": "not done", "reason": error.what}
+        return {"status": "not done", "reason": "; ".join(filter(None, (error.what, error.hint)))}
     channels = {}
     for name, mismatch in after.items():
         own = attributes_to_dict(mismatch, "unit noise=noise_rms after=rmse")

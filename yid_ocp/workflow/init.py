@@ -340,6 +340,9 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
                 said = "use: true looks for friction and payload of the arm; bias_std allows a constant error of each "
                 said += "torque (a guess: 1 % of the effort limit); a free effect effort_offset instead reports it"
         is_mounted = places and "." in group
+        if places and not (proposal.has_object or is_mounted or any(place.frame for place in places)):
+            entries = ["use: false", *entries]
+            said = "the places of its points are not known; frame_by_recorded_name: {POINT: FRAME} states them"
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
             why = "torques with noise move the arms: set mode: prescribed to use it"
             entries = ["use: false", *entries]

@@ -347,7 +347,8 @@ def _curves(
     what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
     sentences = [
         f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
-        "each the error, two standard deviations of the noise shaded; a correct model is inside 95 % of the time."
+        "each the error, two standard deviations of the sensor noise shaded. A correct model is inside 95 % of the "
+        "time, unless errors of the torques also move the arm."
     ]
     return "Measured and predicted", sentences, shown
 
