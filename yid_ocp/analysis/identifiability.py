@@ -374,8 +374,7 @@ class _Component(NamedTuple):
 
 
 _SERIES = "1/{a} + 1/{b}, like springs in series"
-# combinations of a and b: text, relative change that preserves it, b that preserves it for a new a, whether units must
-# be equal
+# combinations of a and b: text, relative change that preserves it, b for a new a, whether units must be equal
 _Combination = tuple[str, Callable[[float, float], tuple[float, float]], Callable[[float, float, float], float], bool]
 _COMBINATIONS: tuple[_Combination, ...] = (
     (_SERIES, lambda a, b: (a, -b), lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n), True),

@@ -95,7 +95,7 @@ class ExperimentChangesByIdentifiableCount(ReprMixin):
 
 
 # Function from sets of changes and a factor on the stated variances to the predicted result of each set.
-ChangeSetsEvaluationFunction = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
+_ChangeSetsEvaluationFunction = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
 
 
 def what_if(
@@ -107,7 +107,7 @@ def what_if(
     two_arm_system: System | None = None,
     considered_changes: Collection[str] | None = None,
     progress: Progress = NULL_PROGRESS,
-    evaluate_changes: ChangeSetsEvaluationFunction | None = None,
+    evaluate_changes: _ChangeSetsEvaluationFunction | None = None,
 ) -> ExperimentChangesByIdentifiableCount:
     """Rank changes of an experiment by how many parameters they make identifiable, without new measurements.
 
@@ -184,7 +184,7 @@ class _Outcomes:
         setting: UnchangedExperiment,
         inflation: float,
         progress: Progress = NULL_PROGRESS,
-        judge: ChangeSetsEvaluationFunction | None = None,
+        judge: _ChangeSetsEvaluationFunction | None = None,
     ) -> None:
         self.setting, self.inflation, self.progress = setting, inflation, progress
         self.builder = ExperimentVariantSensitivityBuilder(setting, progress)

@@ -79,7 +79,7 @@ def _make_candidate(kind: str, place: str, system: System) -> EffectBase:
     return effect_as_sharp_as_nominal_friction(make_effect(kind, place, system), system)
 
 
-def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
+def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
     """Return the candidates `effects` without those that `names` lists (as `kind` or `kind@location`).
 
     Excluded candidates stay in the compiled step at their neutral values, so that it is not compiled again. Raises
@@ -277,10 +277,10 @@ def compose_candidates(
         hint = "set problem.weighting: whitened and the noise levels under `sensors`"
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    exclude_candidates(effects, leave_out)  # reject names before compilation
+    _exclude_candidates(effects, leave_out)  # reject names before compilation
     progress.begin_stage(f"composing {len(effects)} candidates into one step", ahead=16.0)
     composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
-    return replace(composed, candidate_effects=tuple(exclude_candidates(composed.candidate_effects, leave_out)))
+    return replace(composed, candidate_effects=tuple(_exclude_candidates(composed.candidate_effects, leave_out)))
 
 
 def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFunctions) -> EstimationProblem | None:

@@ -182,8 +182,7 @@ class _EffortGain(_DistortedEffort):
     )
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        # compared efforts are linear in scale, driving torques in 1/scale: in both cases a flipped sign is a distance
-        # of two
+        # efforts are linear in scale, driving torques in 1/scale: in both cases a flipped sign is a distance of two
         [name] = self.parameters.names
         value = start.get(name, 1.0)
         if abs(value - 1) < 1:

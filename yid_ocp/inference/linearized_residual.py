@@ -154,8 +154,7 @@ class ResidualDerivativesByStateAndEffort:
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
 
-# A fit is complete if no step predicts a larger cost reduction than this fraction of the cost, or this much in units of
-# the noise.
+# A fit is complete if no step predicts a larger cost reduction than this part of the cost, or this in noise units.
 _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 

@@ -25,7 +25,7 @@ from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_ef
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
 from yid_ocp.sensors.mounted import MountedSensor
 
-RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
+_RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS = 32  # draws of encoder noise, which give the variance of a score to a quarter
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
@@ -110,7 +110,7 @@ def residual_chi2_null_test(
     residual: Array,
     parameters: float,
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
-    window: float = RESIDUAL_WINDOW_SECONDS,
+    window: float = _RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
     """Test whether a whitened residual (nr,) is only noise after a fit of `parameters` parameters.
 

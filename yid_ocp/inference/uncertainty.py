@@ -29,8 +29,7 @@ MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6
 _AT_BOUND_FRACTION = 1e-4
 # 95 % quantiles of chi2 with one degree of freedom, for an interval with one end and with two.
 _CHI2_95_ONE_SIDED, CHI2_95_TWO_SIDED = 2.705543454095404, 3.841458820694124
-# Number of time blocks into which all recordings are cut if misfit is included, and their shortest and longest length
-# [s].
+# Number of time blocks into which all recordings are cut if misfit is included, and their limits of length [s].
 _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH = 24, 0.25, 2.0
 # With at least this many recordings, or channels of recordings, scores are clustered by these.
 _MIN_CLUSTER_RECORDINGS, _MIN_CLUSTER_CHANNELS = 4, 8

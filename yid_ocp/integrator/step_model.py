@@ -21,8 +21,7 @@ NEWTON_ITERATION_LIMIT = 60
 """Newton iterations of one step before it is given up."""
 
 # Newton stops when a correction of the coordinates is below _COORDINATE_TOLERANCE [rad or m], and for short steps below
-# _VELOCITY_TOLERANCE times the step: a remaining correction loses momentum in every step (mass times correction over
-# step).
+# _VELOCITY_TOLERANCE times the step: a remaining correction loses momentum (mass times correction over step).
 _COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE, _ROUNDING_FLOOR = 1e-12, 1e-10, 1e-15
 
 

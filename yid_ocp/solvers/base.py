@@ -257,7 +257,7 @@ _HORIZON_FRACTIONS = (0.06, 0.12, 0.25, 0.5)
 # A fit with more chi2 per degree of freedom may be a wrong minimum (a soft object has several equilibrium shapes). It
 # is repeated from these multiples of the initial values, and the best fit is kept.
 _POOR_CHI2_PER_DOF = 5.0
-INITIAL_VALUE_RESTART_FACTORS = (4.0, 2.0, 10.0)
+_INITIAL_VALUE_RESTART_FACTORS = (4.0, 2.0, 10.0)
 # If all of these fits are poor, other multiples are predicted. The best one is a start where it beats every fit.
 _FAR_FACTORS = (1e-2, 3e-2, 0.1, 0.3, 30.0, 100.0, 300.0, 1000.0)
 # With process noise, a wrong minimum can have a chi2 per degree of freedom of only 1.03. Another start is tried if a
@@ -345,8 +345,8 @@ class _MultiStartSearch:
 
     def restart(self, first: Array, limits: ExcessResidualCriteria) -> None:
         """Fit again from other starts if the best fit is poor, uncertain or may be a local minimum."""
-        noisy, most = self._problem.has_process_noise, 1 + len(INITIAL_VALUE_RESTART_FACTORS)
-        for factor in INITIAL_VALUE_RESTART_FACTORS:
+        noisy, most = self._problem.has_process_noise, 1 + len(_INITIAL_VALUE_RESTART_FACTORS)
+        for factor in _INITIAL_VALUE_RESTART_FACTORS:
             if _good_fit(self._problem, self._best.evaluation):
                 break
             self._try_multiple(first, factor, most)
@@ -357,7 +357,7 @@ class _MultiStartSearch:
                 self._try_multiple(first, factor, self._n_starts + 1)
         once = len(self._fits) == 1 and noisy and _accounts_for_process_noise(self._solver)
         if once and np.any(_doubtful(self._best, first)):
-            self._try_multiple(first, INITIAL_VALUE_RESTART_FACTORS[0], 2)
+            self._try_multiple(first, _INITIAL_VALUE_RESTART_FACTORS[0], 2)
         if not uses_process_noise_covariance(self._solver):
             return
         most = self._n_starts + len(_NEARBY_START_FACTORS)

@@ -138,20 +138,10 @@ def propose_config_choices(
     standing : bool
         Whether the object stands on the ground and arms hold its ends.
     """
-    allowed = "a recording with joint states of the robot"
-    for other in recordings:
-        if other.joints is None:
-            hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
-            raise ConfigError("the recording has no joints", where=other.name, allowed=allowed, hint=hint)
-    first = recordings[0]
+    whole, first = read_urdf(robot), recordings[0]
+    known = _recorded_urdf_joints(robot, whole, recordings)
     recorded = first.joints
     assert recorded is not None
-    whole = read_urdf(robot)
-    known = [name for name in whole.joint_names if name in recorded.names]
-    if not known:
-        what = f"none of the recorded joints is in the URDF: {', '.join(recorded.names)}"
-        hint = f"rename them at the import: --joints {recorded.names[0]}={whole.joint_names[0]},..."
-        raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     tree = read_urdf(robot, joints=known)
     arms = tuple(sorted(_arms(tree), key=lambda arm: -_travel(first, arm.joints)))
     if holder is None and not branches:  # a payload is on the frame most similar to a tool
@@ -199,6 +189,21 @@ def propose_config_choices(
         recorded.effort is not None and recorded.effort_kind is None,
         *({name: value for name, value in own.items() if name in joints} for own in urdf_joint_dynamics(robot)),
     )
+
+
+def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Recording]) -> list[str]:
+    """Joints of the URDF that the first recording has. Raises `ConfigError` if it has none or a recording no joints."""
+    for other in recordings:
+        if other.joints is None:
+            hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
+            what, allowed = "the recording has no joints", "a recording with joint states of the robot"
+            raise ConfigError(what, where=other.name, allowed=allowed, hint=hint)
+    recorded = recordings[0].joint_names
+    if not (known := [name for name in whole.joint_names if name in recorded]):
+        what = f"none of the recorded joints is in the URDF: {', '.join(recorded)}"
+        hint = f"rename them at the import: --joints {recorded[0]}={whole.joint_names[0]},..."
+        raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
+    return known
 
 
 def _motor_and_gain(robot: str, mode: str, recordings: Sequence[Recording]) -> tuple[str | None, float | None]:
