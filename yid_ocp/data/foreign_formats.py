@@ -28,8 +28,7 @@ _CHANNEL_WORDS: Mapping[str, str] = {
     "velocity_command": "dq_cmd dq_des dq_d qd_d vel_cmd cmd_vel velocity_command target_qd desired_velocity",
     "torque_enable": "torque_enable",
 }
-"""Words for each joint channel in column names of Franka, UR, Isaac Sim, LeRobot, ROS and PlotJuggler. The case
-counts in `tau_J` only, because `tau_j1` is the torque of a joint `j1`."""
+"""Words for each joint channel in column names of common tools. Case counts in `tau_J`: `tau_j1` is of a joint `j1`."""
 _CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
 _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)

@@ -165,8 +165,8 @@ def _format_duration(seconds: float) -> str:
 
 
 def _format_iterate(entry: Iterate) -> str:
-    note = f", {entry.note}" if entry.note else ""
-    return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
+    parts = f"iteration {entry.iteration}", f"cost {entry.cost:.6g}", f"{entry.seconds:.1f} s", entry.note
+    return ", ".join(filter(None, parts))
 
 
 class StderrLogLinesProgress(Progress):
@@ -183,14 +183,15 @@ class StderrLogLinesProgress(Progress):
         print(f"{text} ...{self._left.of_command().removeprefix(',')}", file=sys.stderr, flush=True)
 
     def report_iterate(self, entry: Iterate) -> None:
-        """Print a line for the accepted iterate."""
+        """Print a line for the accepted iterate; after the usual number of iterates, only every five seconds."""
         self._left.n_iterates += 1
-        print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
+        if self._left.n_iterates <= _USUAL_ITERATIONS or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
+            self._last = time.monotonic()
+            print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Print a line for every tenth of the stage, or if the last line is some seconds old."""
         tenths, left = 10 * done // max(total, 1), self._left.of_parts(done, total)
-        # one line per frame would be too many
         if tenths > self._tenths or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
             self._tenths, self._last = tenths, time.monotonic()
             print(f"  {done} of {total}, {text}{left or self._left.of_command()}", file=sys.stderr, flush=True)
