@@ -33,7 +33,7 @@ from yid_ocp.model.mechanism import (
     snap_near_integer_entries,
     transform_from_xyz_rpy,
 )
-from yid_ocp.model.mjcf_robot import joint_motion_pose, mjcf_robot_description
+from yid_ocp.model.mjcf_robot import joint_motion_pose, mjcf_joint_constants, mjcf_robot_description
 from yid_ocp.model.parameters import Parameter, Parameters
 
 _UNLIMITED_VALUE = 1e9  # represents "no limit" where URDF requires a number
@@ -215,17 +215,18 @@ def _parsed(file: Path) -> SimpleNamespace:
 
 
 def urdf_joint_dynamics(robot: str | Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the damping [N m s/rad] and friction [N m] that a URDF states, by joint. Values of 0 are left out."""
-    root = ElementTree.parse(check_input_file(urdf_path_from_robot_name(robot), MAX_TEXT_BYTES)).getroot()
+    """Return the damping [N m s/rad] and friction [N m] that a URDF or MJCF file states, by joint, if above 0."""
+    file = urdf_path_from_robot_name(robot)
+    root, constants = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot(), mjcf_joint_constants(file)
     parts = [(joint.attrib["name"], part) for joint in root.findall("joint") for part in joint.iter("dynamics")]
 
-    def stated(key: str) -> dict[str, float]:
-        texts = {name: part.get(key, "0") for name, part in parts}
-        where = {name: f"joint '{name}': dynamics {key}" for name in texts}
-        values = {name: _numbers(text, 1, where[name], str(robot))[0] for name, text in texts.items()}
+    def stated(key: str, constant: str) -> dict[str, float]:
+        texts = ((name, part.get(key, "0"), f"joint '{name}': dynamics {key}") for name, part in parts)
+        values = {name: _numbers(text, 1, where, str(robot))[0] for name, text, where in texts}
+        values |= {name: own[constant] for name, own in constants.items() if constant in own}
         return {name: value for name, value in values.items() if value > 0}
 
-    return stated("damping"), stated("friction")
+    return stated("damping", "damping"), stated("friction", "frictionloss")
 
 
 def _read_inertial(element: ElementTree.Element | None) -> SimpleNamespace | None:

@@ -139,8 +139,7 @@ def propose_config_choices(
         Whether the object stands on the ground and arms hold its ends.
     """
     whole, first = read_urdf(robot), recordings[0]
-    known = _recorded_urdf_joints(robot, whole, recordings)
-    recorded = first.joints
+    recorded, known = first.joints, _recorded_urdf_joints(robot, whole, recordings)
     assert recorded is not None
     tree = read_urdf(robot, joints=known)
     arms = tuple(sorted(_arms(tree), key=lambda arm: -_travel(first, arm.joints)))

@@ -191,7 +191,7 @@ def _summary_lines(
         f"start: {proposal.initial_state}: {proposal.initial_state_reason}",
     ]
     damping = _value(proposal.urdf_joint_damping)
-    lines += [f"damping: {damping} N m s/rad, as the URDF states"] * bool(proposal.urdf_joint_damping)
+    lines += [f"damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
