@@ -42,7 +42,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     verdict = result["verdict"].replace("_", " ")
     found, _, advice = result["summary"].partition(" Next experiment: ")
     gap, _, cause = found.partition(". ")
-    parts = (f"Verdict: {verdict}. {gap.removesuffix('.')}.", cause, f"Next experiment: {advice}" if advice else "")
+    unused = "Recorded torques are not used: set sensors.joints.effort.use: true to find friction and loads of the arm."
+    told = unused if result.get("unused_efforts") else ""
+    planned = f"Next experiment: {advice}" if advice else ""
+    parts = f"Verdict: {verdict}. {gap.removesuffix('.')}.", told, cause, planned
     yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
@@ -68,11 +71,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     yield "refitted candidates come first; closure alone: part of the held-out gap that a refit with this one closes"
     yield "the others are ordered by score (significance before a refit); p: probability of such a score by noise alone"
-    left = len(result["which"]) - _MAX_CANDIDATES
-    yield f"{left} more candidates are in result.json" if left > 0 else ""
+    yield f"{left} more candidates are in result.json" if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     yield f"not detectable in the data that are used: {', '.join(result['unseen'])}" if result.get("unseen") else ""
-    unused = "recorded torques are not used: to find friction and loads of the arm, set sensors.joints.effort.use: true"
-    yield unused if result.get("unused_efforts") else ""
     for signals, kinds in result.get("not_candidates", {}).items():
         yield f"no candidates, because no recording has {signals}: {', '.join(kinds)}"
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]

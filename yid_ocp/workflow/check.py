@@ -180,7 +180,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
     if growth is not None and not growth.keeps_errors_below_resolution:
         warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
-        warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")
+        warnings.append(f"the model cannot be rolled out with the initial parameters (too soft?): {at_x.message}")
         return {}
     shifts, notes = discretisation.estimate_shifts_by_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True

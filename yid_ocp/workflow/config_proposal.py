@@ -414,11 +414,11 @@ def _near(
         if part > 1.2:
             return "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
         percent: float = _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT)
-        exact = 100 * part_when_straight
-        if math.isfinite(exact):
+        if math.isfinite(exact := 100 * part_when_straight):
             percent = _POSITION_STEP_PERCENT * round(exact / _POSITION_STEP_PERCENT)
             percent = percent if abs(exact - percent) <= _MAX_ROUNDED_PERCENT else round(exact, 2)
-        return _along(branch.name, min(100, percent)), f"up to {part:.1%} of the length away from {holder}"
+        beyond = " (beyond the end: are length, frame and clocks right?)" if part > 1.05 else ""
+        return _along(branch.name, min(100, percent)), f"up to {part:.1%} of the length away from {holder}{beyond}"
     local = poses[0, :3, :3].T @ from_holder[0]
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
     name = min(apart, key=apart.__getitem__)
