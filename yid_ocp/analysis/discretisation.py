@@ -39,7 +39,7 @@ _MAX_FINER_FIT_ITERATIONS, _MAX_LINEAR_CHANGE = 3, 10.0  # of r'r, below which a
 _MIN_STEPS_TO_COMPILE, _DERIVATIVE_COST = 2000, 0.25  # of a finer model; time of a step by one unknown over a step's
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 _MIN_NOTED_SHARE, _MIN_NOTED_FALL = 0.25, 0.05  # of the misfit beyond noise that is removed; of chi2 per sample
-_REFINED_SETTINGS = {"links": "`links` of the segments in model.object", "time_step": "problem.time_step"}
+_REFINED_SETTINGS = {"links": "double `links` of the segments in model.object", "time_step": "halve problem.time_step"}
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,7 @@ def estimate_shifts_by_discretisation(
             least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
             if not model_difference_only and excess - rest > least:
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the misfit beyond noise"
-                notes.append(f"{said}: change {_REFINED_SETTINGS[key]}")
+                notes.append(f"{said}: {_REFINED_SETTINGS[key]}")
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
     return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
