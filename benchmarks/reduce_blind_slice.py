@@ -20,8 +20,11 @@ def shortened(result: dict[str, Any]) -> dict[str, Any]:
     """What scores read of the result of a diagnosis."""
     kept = {key: result[key] for key in RESULT_KEYS if key in result}
     gap, law = result["gap"], result.get("law")
-    before = {key: gap["before"][key] for key in ("chi2_per_dof", "p_value") if key in gap["before"]}
-    kept["gap"] = {"before": before, "closure": gap["closure"], "closure_ci": gap.get("closure_ci")}
+    if "before" in gap:  # not so where a case could not be examined
+        before = {key: gap["before"][key] for key in ("chi2_per_dof", "p_value") if key in gap["before"]}
+        kept["gap"] = {"before": before, "closure": gap["closure"], "closure_ci": gap.get("closure_ci")}
+    else:
+        kept["gap"] = gap
     kept["where"] = [{"location": place["location"]} for place in result["where"]]
     kept["which"] = [
         {key: own[key] for key in ("kind", "location")}
