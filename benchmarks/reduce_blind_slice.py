@@ -25,10 +25,15 @@ def shortened(result: dict[str, Any]) -> dict[str, Any]:
         kept["gap"] = {"before": before, "closure": gap["closure"], "closure_ci": gap.get("closure_ci")}
     else:
         kept["gap"] = gap
+    added = [(own["kind"], own["location"]) for own in result["effects"]]
+
+    def is_kept(own: dict[str, Any]) -> bool:
+        """Whether a candidate was fitted."""
+        return own.get("closure") is not None or (own["kind"], own["location"]) in added
+
     kept["where"] = [{"location": place["location"]} for place in result["where"]]
     kept["which"] = [
-        {key: own[key] for key in ("kind", "location")}
-        | {"parameters": own["parameters"] if own.get("closure") is not None else {}}
+        {key: own[key] for key in ("kind", "location")} | {"parameters": own["parameters"] if is_kept(own) else {}}
         for own in result["which"]
     ]
     kept["law"] = None if law is None else {key: law[key] for key in ("location", "depends_on", "closure")}
