@@ -20,7 +20,7 @@ from yid_ocp.analysis import friction_law_comparison as ladder
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import FrictionLawSettings
-from yid_ocp.diagnosis import law as gap_law
+from yid_ocp.diagnosis import gap_law
 from yid_ocp.effects.law import (
     TorqueLaw,
     TorqueLawTable,

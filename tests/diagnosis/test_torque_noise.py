@@ -11,7 +11,7 @@ from factories import cases
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis import law
+from yid_ocp.diagnosis import gap_law
 from yid_ocp.diagnosis.diagnose import _held_out_null_test_and_spread, diagnose, fit_nominal_model
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
@@ -244,8 +244,8 @@ def test_a_law_is_sought_at_another_joint_than_that_of_a_named_effect(sprung):
     own = replace(made, problem=nominal.problem).restricted_to_effects([spring])
     found = refit_with_effects(own, [spring], nominal.values)
     assert found.problem.step is not made.problem.step
-    search, sought = RefitContext(made, Thresholds(), NULL_PROGRESS), law._neutral_law(found, "elbow", ("angle",))
-    before, families = law._refitted_families(search, problem, found, [sought], NO_EVENTS)
+    search, sought = RefitContext(made, Thresholds(), NULL_PROGRESS), gap_law._neutral_law(found, "elbow", ("angle",))
+    before, families = gap_law._refitted_families(search, problem, found, [sought], NO_EVENTS)
     assert [own.law.location for own in families] == ["elbow"]
     assert families[0].fit.cost <= before.cost
 

@@ -21,8 +21,8 @@ from yid_ocp.diagnosis import hypotheses
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
+from yid_ocp.diagnosis.gap_law import find_gap_law
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
-from yid_ocp.diagnosis.law import find_gap_law
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
     NominalSolutionAndRefitStore,

@@ -8,8 +8,8 @@ from typing import Any
 
 from yid_ocp.diagnosis.baseline import CounterfactualErrorsOfFoundEffects, ParameterShiftsSinceBaseline
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
+from yid_ocp.diagnosis.gap_law import GapLaw
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
-from yid_ocp.diagnosis.law import GapLaw
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, bic_difference, held_out_gap_closure, total_closure
