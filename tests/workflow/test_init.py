@@ -210,7 +210,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
-    assert "effects {kind: effort_offset, location: JOINT} too" in text
+    assert "effects {kind: effort_offset, location: JOINT} estimate it" in text
     assert "#   {effort_sampling_kind: sample}: the recordings do not say" in text
     Path("friction.yaml").write_text(text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:"))
     assert "joint_coulomb@roll.tau_c" in build_system(load_config("friction.yaml")).parameters
@@ -221,7 +221,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     known = proposed(replace(stated, joints=replace(stated.joints, effort_bias_std=0.2)))
     assert known.sensors["joints.effort"].bias_std is None
     text = Path("run.yaml").read_text()
-    assert (known.model.damping["pitch"], "friction of the robot file, {pitch: 0.8}" in text) == (0.4, True)
+    assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
     assert "damping: {pitch: 0.4} N m s/rad, as the robot file states" in capsys.readouterr().out
 

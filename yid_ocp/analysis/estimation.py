@@ -139,9 +139,9 @@ def _checked_solution_and_issues(
     found = clock_and_noise_issues_from_residuals(problem, solution.x, solution.evaluation)
     found += _worse_than_baseline_issues(errors, units)
     if any(issue.severity != "warning" for issue in found):
-        believed = replace(solution.goodness_of_fit, data_trusted=False)
+        untrusted = replace(solution.goodness_of_fit, data_trusted=False)
         marked = mark_free_estimates_not_trusted(solution.parameters)
-        solution = replace(solution, goodness_of_fit=believed, parameters=marked)
+        solution = replace(solution, goodness_of_fit=untrusted, parameters=marked)
     return solution, (*problem.options.data_issues, *found)
 
 

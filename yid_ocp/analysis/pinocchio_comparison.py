@@ -147,9 +147,9 @@ def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
         placed[j] = index
         for body in joint.bodies:
             fraction = 1.0 if body.gravity_fraction is None or not weight else float(body.gravity_fraction)
-            mass, tensor = float(body.mass) * fraction, _number(body.inertia_about_com)
             # gravity forces do not depend on the inertia about the centre of mass
-            inertia = pin.Inertia(mass, _number(body.center_of_mass).ravel(), tensor)
+            place, tensor = _number(body.center_of_mass).ravel(), _number(body.inertia_about_com)
+            inertia = pin.Inertia(float(body.mass) * fraction, place, tensor)
             model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
     return model
 

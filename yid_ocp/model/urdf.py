@@ -215,18 +215,18 @@ def _parsed(file: Path) -> SimpleNamespace:
 
 
 def urdf_joint_dynamics(robot: str | Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the damping [N m s/rad] and friction [N m] that a URDF or MJCF file states, by joint, if above 0."""
+    """Return the damping [N m s/rad] of a URDF or MJCF file and the friction [N m] of a URDF, by joint, if above 0."""
     file = urdf_path_from_robot_name(robot)
-    root, constants = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot(), mjcf_joint_constants(file)
+    root = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot()
     parts = [(joint.attrib["name"], part) for joint in root.findall("joint") for part in joint.iter("dynamics")]
 
-    def stated(key: str, constant: str) -> dict[str, float]:
+    def stated(key: str) -> dict[str, float]:
         texts = ((name, part.get(key, "0"), f"joint '{name}': dynamics {key}") for name, part in parts)
         values = {name: _numbers(text, 1, where, str(robot))[0] for name, text, where in texts}
-        values |= {name: own[constant] for name, own in constants.items() if constant in own}
         return {name: value for name, value in values.items() if value > 0}
 
-    return stated("damping", "damping"), stated("friction", "frictionloss")
+    constants = mjcf_joint_constants(file).items()
+    return stated("damping") | {name: own["damping"] for name, own in constants if "damping" in own}, stated("friction")
 
 
 def _read_inertial(element: ElementTree.Element | None) -> SimpleNamespace | None:
