@@ -41,7 +41,11 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "diagnose_baxter": ("diagnose", "configs/baxter_arm.yaml"),
     "diagnose_cable": ("diagnose", "configs/deft_bdlo1.yaml"),
 }
-NOISY: Mapping[str, str] = {"diagnose_torque_noise": "clean", "diagnose_torque_noise_gap": "damped_trunk"}
+NOISY: Mapping[str, str] = {
+    "diagnose_torque_noise": "clean",
+    "diagnose_torque_noise_gap": "damped_trunk",
+    "diagnose_torque_noise_outside": "tether",
+}
 """Diagnoses of one arm with two recordings of 5 s that state errors of torques, by the case of `diagnosis_cases.py`."""
 USUAL = ("solve", "diagnose", "check", "identifiability", "simulate")
 UNIT_CALLS = 100_000

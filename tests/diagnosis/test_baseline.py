@@ -115,11 +115,6 @@ def test_the_world_without_effects_is_estimated_on_its_own_recordings(beam):
         assert found[name] == pytest.approx(expected.parameters[name].value, abs=0.1 * expected.std[name])
 
 
-def test_without_earlier_runs_there_is_nothing_to_differ():
-    none = EarlierRunsBaseline.from_run_estimates([], ())
-    assert (none.combined_estimates, none.between_runs_p_value) == (None, 1.0)
-
-
 @pytest.mark.parametrize("times", [0.1, 1.0, 10.0])
 def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, times):
     """Of one parameter it is (data alone - baseline) over the root of both variances, however tight the baseline is."""

@@ -1,12 +1,10 @@
 """A threshold that is changed changes what it stands for."""
 
-from dataclasses import fields
 
 import pytest
 
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.options import options_by_key
 
 KIND = "joint_coulomb@elbow"
 
@@ -16,10 +14,6 @@ def found(bench, **limits):
     return diagnose(
         bench.problem(recordings[:1]), (KIND, "joint_stribeck@elbow"), recordings[1:], thresholds=Thresholds(**limits)
     )
-
-
-def test_every_threshold_is_a_setting():
-    assert set(options_by_key(Thresholds)) == {entry.name for entry in fields(Thresholds)}
 
 
 def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):

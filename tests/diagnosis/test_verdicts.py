@@ -122,12 +122,17 @@ def test_a_model_that_fails_with_all_candidates_is_diagnosed_at_a_shorter_step(b
 
 
 @pytest.mark.parametrize(
-    ("friction", "verdict", "steps"), [({}, "no_gap", (0.04, 0.02)), ({"tau_c": 0.1}, "effect", (0.04, 0.04))]
+    ("joints", "verdict", "steps"),
+    [
+        ((), "no_gap", (0.04, 0.02)),
+        (("elbow", "shoulder"), "effect", (0.04, 0.04)),
+        (("elbow",), "effect", (0.04, 0.01)),
+    ],
 )
 @pytest.mark.usefixtures("without_law")
-def test_the_error_of_a_long_step_is_no_gap_and_a_true_one_keeps_its_step(bench, friction, verdict, steps):
+def test_the_error_of_a_long_step_is_no_gap_alone_or_beside_an_effect(bench, joints, verdict, steps):
     """Steps four times as long as those of the recordings; refits of the finer step have names of their own."""
-    own = {f"joint_coulomb@{joint}": friction for joint in ("shoulder", "elbow") if friction}
+    own = {f"joint_coulomb@{joint}": {"tau_c": 0.1} for joint in joints}
     recordings = [bench.recording(own, seed, duration=3.0) for seed in (1, 2)]
     coarse, names = Bench(bench.system, step_with_time_step(bench.step, 0.04)), []
     known = NominalSolutionAndRefitStore(

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 
-from yid_ocp.integrator.step import simulate_rollouts
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions, episode_prediction
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel, truncate_episode
 from yid_ocp.problem.model_functions import (
@@ -326,11 +325,8 @@ def test_so_many_rollouts_are_held_at_once_as_the_memory_takes(urdf_folder, monk
     free = len(problem.free)
     held = 8 * (STEPS + 1) * 4 * (free + 1)  # bytes of one recording's states and their derivatives
     monkeypatch.setattr(episode_prediction, "_MAX_ROLLOUT_MEMORY", share * held)
-    monkeypatch.setattr(
-        episode_prediction,
-        "simulate_rollouts",
-        lambda step, members: asked.append(len(members)) or simulate_rollouts(step, members),
-    )
+    kernel, batch = type(problem.step.kernel), type(problem.step.kernel).rollout_batch
+    monkeypatch.setattr(kernel, "rollout_batch", lambda own, some: asked.append(len(some)) or batch(own, some))
     found = problem.evaluate(problem.initial_unknowns)
     assert asked == calls
     np.testing.assert_array_equal(found.residual, plain.residual)

@@ -36,7 +36,6 @@ _NORMAL_QUANTILE_95 = 1.96
 _EXTRAPOLATION_FACTOR = 2.0
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MAX_FINER_FIT_ITERATIONS, _MAX_LINEAR_CHANGE = 3, 10.0  # of r'r, below which a linear step decides
-_MIN_STEPS_TO_COMPILE, _DERIVATIVE_COST = 2000, 0.25  # of a finer model; time of a step by one unknown over a step's
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 _MIN_NOTED_SHARE, _MIN_NOTED_FALL = 0.25, 0.05  # of the misfit beyond noise that is removed; of chi2 per sample
 _REFINED_SETTINGS = {"links": "double `links` of the segments in model.object", "time_step": "halve problem.time_step"}
@@ -156,31 +155,33 @@ def predicted_refit_residual_at_finer_step(
 
 
 def problem_corrected_for_few_links(
-    problem: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
+    problem: EstimationProblem, fitted: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
 ) -> EstimationProblem | None:
-    """Return the problem with all data corrected for the error of too few links.
+    """Return `problem` with all data corrected for the error of too few links.
 
-    The change of the predictions by dividing each link in two is subtracted. `at_x` is the evaluation at the fit `x`
-    (nx,), with Jacobian. If this change is large, the finer model is refitted first. Returns None if a refit would not
+    The change of the predictions by dividing each link in two is subtracted. `fitted` is the problem with the effects
+    of a fit, if any; `at_x` is its evaluation at the fit `x` (nx,), with Jacobian. If the change is large, the finer
+    model is refitted first, to data without the changes by effects, which it lacks. Returns None if a refit would not
     lower r'r by `min_chi2_decrease`, if links cannot be divided, if torques have noise, or if the finer model fails.
     """
-    divided, segments = problem.options.divided_links_model, problem.system.segment_layouts
-    if divided is None or not segments or problem.has_process_noise:
+    if problem.has_process_noise or not (problem.options.divided_links_model and problem.system.segment_layouts):
         return None
-    guesses, before = at_x.equilibrium_guesses, at_x.residual
+    guesses, before, own = at_x.equilibrium_guesses, at_x.residual, problem.unknown_vector(fitted.named_values(x))
     try:
-        refined = _refined_problem(problem, "links")
-        point, finer = refined._unknowns(problem.unknown_names, x), refined.problem
+        refined, coarse = _refined_problem(problem, "links"), problem.evaluate(own, False, guesses)
+        point, finer = refined._unknowns(problem.unknown_names, own), refined.problem
         warm = tuple(None if q is None else refined._guess(problem.system, q) for q in guesses)
         for is_refitted in (False, True):
             if is_refitted:
-                point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(finer, point, None).x
+                by_effects = coarse.episode_predictions, at_x.episode_predictions
+                less = finer.with_episodes(list(map(_with_data_shifted, finer.episodes, *by_effects)), ())
+                point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(less, point, None).x
             fine = finer.evaluate(point, False, warm)
-            if not fine.ok:
+            if not (fine.ok and coarse.ok):
                 return None
-            predictions = at_x.episode_predictions, fine.episode_predictions
-            episodes = list(map(_with_data_shifted, problem.episodes, *predictions))
-            after = problem.with_episodes(episodes, ()).evaluate(x, False, guesses).residual
+            changes = coarse.episode_predictions, fine.episode_predictions
+            episodes = list(map(_with_data_shifted, problem.episodes, *changes))
+            after = fitted.with_episodes(episodes, ()).evaluate(x, False, guesses).residual
             if len(after) != len(before):
                 return None  # events have removed samples
             if np.sum((after - before) ** 2) <= _MAX_LINEAR_CHANGE * (before @ before):
@@ -190,7 +191,7 @@ def problem_corrected_for_few_links(
         if not before @ before - left @ left > min_chi2_decrease:
             return None
         finer = _refined_problem(problem, "links", [e.recording for e in problem.held_out], finer.step).problem
-        held_out = (own.predict_held_out(at) for own, at in ((problem, x), (finer, point)))
+        held_out = (one.predict_held_out(at) for one, at in ((problem, own), (finer, point)))
         others = [_with_data_shifted(e, one, other) for (e, one), (_, other) in zip(*held_out, strict=True)]
     except YidError:
         return None
@@ -318,9 +319,7 @@ def _refined_problem(
     recordings = [episode.recording for episode in problem.episodes]
     factors = fine.parameter_factors
     if step is None:
-        work = sum(e.grid.steps for e in problem.episodes) * (1 + _DERIVATIVE_COST * len(problem.unknown_names))
-        built = fine.build_step(problem.step.is_compiled and work > _MIN_STEPS_TO_COMPILE)
-        step = step_with_time_step(built, problem.step.time_step)
+        step = step_with_time_step(fine.build_step(problem.step.is_compiled), problem.step.time_step)
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)

@@ -12,6 +12,7 @@ import casadi as ca
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_question
+from yid_ocp.integrator.codegen import COMPARISON_SIGNS
 from yid_ocp.integrator.discrete import DiscreteEquations
 
 # Binding strength of an expression: an operand that binds less than required gets parentheses.
@@ -29,10 +30,7 @@ _TEXT_TEMPLATES: dict[int, tuple[str, int, tuple[int, ...]]] = {
     ca.OP_INV: ("1/{0}", _PRODUCT, (_POWER,)),
     ca.OP_SQ: ("{0}^2", _POWER, (_ATOM,)),
     **dict.fromkeys((ca.OP_POW, ca.OP_CONSTPOW), ("{0}^{1}", _POWER, (_ATOM, _ATOM))),
-    ca.OP_LT: ("{0} < {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_LE: ("{0} <= {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_EQ: ("{0} == {1}", _COMPARISON, (_SUM, _SUM)),
-    ca.OP_NE: ("{0} != {1}", _COMPARISON, (_SUM, _SUM)),
+    **{op: (f"{{0}} {sign} {{1}}", _COMPARISON, (_SUM, _SUM)) for op, sign in COMPARISON_SIGNS.items()},
     ca.OP_AND: ("{0} and {1}", _COMPARISON, (_ATOM, _ATOM)),
     ca.OP_OR: ("{0} or {1}", _COMPARISON, (_ATOM, _ATOM)),
     ca.OP_NOT: ("not {0}", _COMPARISON, (_ATOM,)),

@@ -170,6 +170,18 @@ class EarlierRunsBaseline:
         return CounterfactualErrorsOfFoundEffects(removed, _predicted(last, present, then, {**then, **effects}))
 
 
+def problem_with_earlier_runs(
+    problem: EstimationProblem, baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline
+) -> tuple[EstimationProblem, EarlierRunsBaseline]:
+    """Return the problem with the estimates of earlier runs as priors, unless it has such priors, and these runs."""
+    if not isinstance(baseline, EarlierRunsBaseline):
+        runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
+        baseline = EarlierRunsBaseline.from_run_estimates(runs, ())
+    known = baseline.combined_estimates
+    has_prior = bool(problem.options.multivariate_prior.parameter_names)
+    return problem if known is None or has_prior else add_baseline_prior(problem, known), baseline
+
+
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
     """Return the variance of every unknown by name, from the stated noise and priors alone."""
     problem = fit.problem

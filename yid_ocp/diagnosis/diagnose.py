@@ -18,13 +18,14 @@ from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import hypotheses
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_earlier_runs
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.gap_law import find_gap_law
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
+    EffectSearchRecord,
     NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
@@ -49,6 +50,7 @@ from yid_ocp.problem.measurements import ResidualAndJacobian
 from yid_ocp.solvers import GaussNewton, Solution, solve
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
+_MIN_FALL_OF_EXCESS = 0.25  # fraction of the excess over noise that a finer discretisation must remove
 _MIN_FORCE_EVENT_GAP_FRACTION = 0.1  # of the gap that force events must remove
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
@@ -84,10 +86,9 @@ def diagnose(
     progress : Progress
         Default: the package's log.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
-        Estimates of earlier runs of the same model (`read_estimates`), used as priors, so that changes since then are
-        diagnosed. A problem that already has these priors (`add_baseline_prior`) is used as it is. An
-        `EarlierRunsBaseline` can also hold reference recordings made without the sought effects; these are predicted
-        with the found effects removed.
+        Estimates of earlier runs of the same model (`read_estimates`), used as priors unless the problem already has
+        them (`add_baseline_prior`): changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference
+        recordings made without the sought effects, which are predicted with the found effects removed.
 
     Returns
     -------
@@ -96,10 +97,7 @@ def diagnose(
     """
     with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         begun = time.perf_counter()
-        runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
-        earlier = runs if isinstance(runs, EarlierRunsBaseline) else EarlierRunsBaseline.from_run_estimates(runs, ())
-        if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
-            problem = add_baseline_prior(problem, earlier.combined_estimates)
+        problem, earlier = problem_with_earlier_runs(problem, baseline)
         composed = hypotheses.compose_candidates(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
@@ -116,11 +114,12 @@ class _Examined:
     search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefittedModel
     truncated: tuple[HeldOutTruncation, ...]
-    whole: EstimationProblem  # the problem with all samples
+    with_events: RefitContext  # the data before events were removed
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all its recordings, if it was run
     evidence: NominalModelGapEvidence
     is_corrected_for_links: bool  # whether the data lack the error of the finite number of links
+    removed: float  # r'r that finer discretisations have removed
 
 
 def _examined(
@@ -135,8 +134,8 @@ def _examined(
     search, nominal, cuts = _followed(search, nominal, known)
     search.end_stage("nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
-    whole, with_events = search.problem.problem_with_all_samples, search
-    search, nominal, events, smoothed = _without_events(search, nominal, whole)
+    with_events = search
+    search, nominal, events, smoothed = _without_events(search, nominal)
     search.end_stage("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
     effects = search.problem.candidates_with_prior_ranges_for(states)
@@ -147,56 +146,70 @@ def _examined(
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     nominal = replace(nominal, held_out_loss=held_out_loss(own, nominal.unknowns, nominal.evaluation, spread))
-    why, h = "", own.step.time_step
     try:
         screened = screen_candidates(composed, (), nominal.values)
     except SolverError:
-        if not h > _MAX_STEP_OF_LAST_HALVING:
+        if not own.step.time_step > _MAX_STEP_OF_LAST_HALVING:
             raise
-        # without candidates, the evidence warrants no search
-        why, screened = "the model with all candidates fails", EMPTY_SCREENING_RESULT
+        screened = EMPTY_SCREENING_RESULT
     evidence = NominalModelGapEvidence(nominal, *tests, screened, discretisation_chi2=_LEFT_BY_DISCRETISATION * removed)
     search.end_stage("screening")
-    if evidence.warrants_search(limits) and not is_corrected_for_links:
-        # without the error of its discretisation, the gap may be none
-        gap = max(score.predicted_chi2_decrease for score in screened.candidate_scores)
-        fall = _fall_at_half_time_step(search, nominal, events)
-        if fall > gap / 2:
-            why, removed = f"half the time step lowers chi2 by {fall:.3g}", removed + fall
-        elif corrected := _without_error_of_links(with_events, nominal, gap):
-            return _examined(*corrected, cuts, True, removed + 2 * (nominal.cost - corrected[1].cost))
-    if why:
-        search.progress.begin_stage(f"{why}: going on at {h / 2:g} s")
-        search = replace(search, problem=search.problem.with_time_step(h / 2))
-        return _examined(search, _fitted_nominal_model(search, nominal.values), removed=removed)
-    found = nominal, cuts, whole, events, smoothed, evidence, is_corrected_for_links
-    return _Examined(replace(search, problem=composed), *found)
+    found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
+    seen = _Examined(replace(search, problem=composed), *found)
+    if screened is EMPTY_SCREENING_RESULT:
+        return _at_half_time_step(seen, "the model with all candidates fails", 0.0)
+    gap = screened.largest_predicted_chi2_decrease
+    return (evidence.warrants_search(limits) and _at_finer_discretisation(seen, nominal, gap)) or seen
+
+
+def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined | None:
+    """The nominal model, examined again at half the time step or without the error of the links.
+
+    None if neither lowers r'r of a fit by half of what a candidate would (`gap`), by a quarter of its excess over
+    noise, and significantly, or if the data lack the error of the links already.
+    """
+    if seen.is_corrected_for_links:
+        return None
+    excess, fall = 2 * fit.cost - fit.residual_count, _fall_at_half_time_step(seen.search, fit, seen.events)
+    least = max(gap / 2, _MIN_FALL_OF_EXCESS * excess, 2 * seen.search.thresholds.min_log_bayes_factor)
+    if fall > least:
+        return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
+    return _without_error_of_links(seen, fit, least)
+
+
+def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
+    h, search = seen.nominal.problem.step.time_step / 2, seen.with_events
+    search.progress.begin_stage(f"{why}: going on at {h:g} s")
+    search = replace(search, problem=search.problem.with_time_step(h), record=EffectSearchRecord(), rounds=[])
+    return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
     """How much half the time step lowers r'r - n of a fit; minus infinity if the motion cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
-    finer = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False).problem
-    fine, x = problem_corrected_for_events(finer, events), fit.unknowns
-    left = predicted_refit_residual_at_finer_step(fine, fit.problem, x, fit.evaluation)
+    composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
+    fine = problem_corrected_for_events(composed.with_nominal_and_effects_free(fit.effects), events)
+    left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
     return -math.inf if left is None else _excess_of(fit.evaluation.residual) - _excess_of(left)
 
 
-def _without_error_of_links(
-    search: RefitContext, fit: RefittedModel, gap: float
-) -> tuple[RefitContext, RefittedModel] | None:
-    """Hypotheses and nominal fit on data without the error of the links, if half of the gap is closed there."""
+def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined | None:
+    """The nominal model, examined again on data without the error of the links, if that lowers r'r by so much."""
+    search = seen.with_events
     search.progress.begin_stage("trying twice the links", 1.0, 8.5)
-    composed, x = search.problem.problem, fit.unknowns
-    corrected = problem_corrected_for_few_links(composed, x, fit.evaluation, gap / 2)
+    own = search.problem.with_nominal_and_effects_free(fit.effects)
+    corrected = problem_corrected_for_few_links(search.problem.problem, own, fit.unknowns, fit.evaluation, least)
     if corrected is None:
         return None
-    search = replace(search, problem=replace(search.problem, problem=corrected))
-    refitted = _fitted_nominal_model(search, fit.values, "the nominal model without the error of links")
-    if not 2 * (fit.cost - refitted.cost) > gap / 2:
+    problem = replace(search.problem, problem=corrected)
+    refitted = refit_with_effects(problem, fit.effects, fit.values)
+    if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return None
-    search.progress.begin_stage("twice the links close half of the gap: going on without this error")
-    return search, refitted
+    search.progress.begin_stage("twice the links lower chi2: going on without their error")
+    # stored and recorded results are of the uncorrected data
+    search = replace(search, problem=problem, store=NO_REFIT_STORE, record=EffectSearchRecord(), rounds=[])
+    nominal = _fitted_nominal_model(search, refitted.values)
+    return _examined(search, nominal, seen.truncated, True, seen.removed + 2 * (fit.cost - refitted.cost))
 
 
 def _followed(
@@ -219,10 +232,10 @@ def _followed(
 
 
 def _without_events(
-    search: RefitContext, nominal: RefittedModel, whole: EstimationProblem
+    search: RefitContext, nominal: RefittedModel
 ) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
     """Remove what events explain, refit the nominal model, and examine it again."""
-    first = search.problem
+    first, whole = search.problem, search.problem.problem_with_all_samples
     events, smoothed = _happened(whole, nominal, search.thresholds)
     for round_ in range(_MAX_EVENT_ROUNDS):
         if not events:
@@ -283,6 +296,13 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
     evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_from_baseline(nominal, limits))
     judged = judge(search, evidence)
+    # what is left beside an effect may be the error of the discretisation
+    for entry in judged.selected_effects[-2:][:1]:
+        own = entry.refitted_model
+        scores = search.record.screenings.get(f"beside {hypotheses.join_effect_labels(own.effects)}")
+        fit = scores and refit_with_effects(search.problem, own.effects, own.values)
+        if scores and fit and (finer := _at_finer_discretisation(seen, fit, scores.largest_predicted_chi2_decrease)):
+            return _diagnosed(problem, finer, earlier)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):
@@ -307,7 +327,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
-        events = _happened(seen.whole, final, limits)[0]
+        events = _happened(seen.with_events.problem.problem_with_all_samples, final, limits)[0]
     search.end_stage("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]

@@ -34,7 +34,7 @@ from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
-_BLOCK_DURATION = 1.0  # duration of the blocks into which a recording is split if none is held out [s]
+_BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
 _MIN_PREDICTED_DURATION = 1.0  # shortest part of a truncated held-out recording that is kept [s]
 KEPT_FRACTIONS_BEFORE_FAILURE = (0.9, 0.5, 0.0)
 """Fractions of the duration until the simulation of a held-out recording fails, of which it keeps one. All are below 1,
@@ -344,14 +344,13 @@ def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> i
 
 def _masked(episode: Episode, parity: int) -> Episode:
     """Return the episode with measurements of alternate blocks (`parity` 0 or 1) only; all of it is simulated."""
-    samples = []
+    samples, block = [], min(_BLOCK_DURATION / episode.grid.time_step, episode.grid.steps / 3)
     for entry in episode.measurements:
-        t = (entry.node + entry.fraction) * episode.grid.time_step
-        hidden = (np.floor(t / _BLOCK_DURATION).astype(int) % 2 != parity)[:, None] & np.ones(entry.value.shape, bool)
-        samples.append(mask_out_samples(entry, hidden))
+        is_hidden = np.floor((entry.node + entry.fraction) / block).astype(int) % 2 != parity
+        samples.append(mask_out_samples(entry, is_hidden[:, None]))
     return replace(episode, measurements=tuple(samples))
 
 
 def mask_out_samples(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
-    """Return the measurements without the samples that the mask `hidden` (M, k) marks."""
+    """Return the measurements without the samples that the mask `hidden`, (M, k) or (M, 1), marks."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

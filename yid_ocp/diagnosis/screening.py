@@ -337,6 +337,11 @@ class ScreeningResult:
     confusability: ConfusabilityMatrix
     joint_score_model: LinearModelOfAllCandidates
 
+    @property
+    def largest_predicted_chi2_decrease(self) -> float:
+        """The largest decrease of r'r that the linear model predicts for one candidate; 0 without candidates."""
+        return max((score.predicted_chi2_decrease for score in self.candidate_scores), default=0.0)
+
 
 EMPTY_SCREENING_RESULT = ScreeningResult(
     (), (), ConfusabilityMatrix((), np.zeros((0, 0))), LinearModelOfAllCandidates((), (), np.zeros((0, 0)), np.zeros(0))

@@ -255,7 +255,7 @@ def select_effects(
 
 def _promised_fraction(nominal: RefitStatistics, current: RefitStatistics, screened: ScreeningResult) -> float:
     """Fraction of the gap of r'r that the effects close together with what another one promises in the linear model."""
-    promised = max((score.predicted_chi2_decrease for score in screened.candidate_scores), default=0.0)
+    promised = screened.largest_predicted_chi2_decrease
     return (2 * (nominal.cost - current.cost) + promised) / max(2 * nominal.cost - nominal.residual_count, 1.0)
 
 

@@ -332,17 +332,13 @@ def _runs(entries: _Indices) -> list[int]:
 
 
 # libm's functions of one member after another
-_UNARY_FUNCTIONS = (
-    *("exp", "log", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
-    *("floor", "ceil", "erf", "log1p", "expm1"),
-)
+_UNARY_FUNCTIONS = "exp log tan asin acos atan sinh cosh tanh asinh acosh atanh floor ceil erf log1p expm1"
 _BINARY_FUNCTIONS = ("pow", "constpow", "atan2", "fmod", "remainder", "copysign", "hypot")
+_ARITHMETIC_SIGNS = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
+COMPARISON_SIGNS: Mapping[int, str] = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!="}
 _OPERATION_FORMS = {
     ca.OP_ASSIGN: "{0}",
-    ca.OP_ADD: "{0} + {1}",
-    ca.OP_SUB: "{0} - {1}",
-    ca.OP_MUL: "{0} * {1}",
-    ca.OP_DIV: "{0} / {1}",
+    **{op: f"{{0}} {sign} {{1}}" for op, sign in _ARITHMETIC_SIGNS.items()},
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
     ca.OP_TWICE: "{0} + {0}",
@@ -352,15 +348,12 @@ _OPERATION_FORMS = {
     ca.OP_SIGN: "sign_of({0})",
     ca.OP_FMIN: "lesser({0}, {1})",
     ca.OP_FMAX: "larger({0}, {1})",
-    ca.OP_LT: "truth({0} < {1})",
-    ca.OP_LE: "truth({0} <= {1})",
-    ca.OP_EQ: "truth({0} == {1})",
-    ca.OP_NE: "truth({0} != {1})",
+    **{op: f"truth({{0}} {sign} {{1}})" for op, sign in COMPARISON_SIGNS.items()},
     ca.OP_NOT: "truth({0} == 0)",
     ca.OP_AND: "truth(({0} != 0) & ({1} != 0))",
     ca.OP_OR: "truth(({0} != 0) | ({1} != 0))",
     ca.OP_IF_ELSE_ZERO: "choose({0} != 0, {1}, (real)ALL(0.0))",
-    **{getattr(ca, f"OP_{name.upper()}"): f"each({name}, {{0}})" for name in _UNARY_FUNCTIONS},
+    **{getattr(ca, f"OP_{name.upper()}"): f"each({name}, {{0}})" for name in _UNARY_FUNCTIONS.split()},
     **{
         getattr(ca, f"OP_{name.upper()}"): f"each_pair({name.removeprefix('const')}, {{0}}, {{1}})"
         for name in _BINARY_FUNCTIONS

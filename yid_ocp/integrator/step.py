@@ -267,12 +267,7 @@ def simulate(
         Directions along which the result has derivatives; default: it has none.
     """
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
-    return simulate_rollouts(step, [inputs])[0]
-
-
-def simulate_rollouts(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several trajectories from `checked_rollout_inputs`. Results equal `simulate` except for rounding."""
-    return step.kernel.rollout_batch(members)
+    return step.kernel.rollout_batch([inputs])[0]
 
 
 def checked_rollout_inputs(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import casadi as ca
@@ -68,34 +70,12 @@ class _DcMotorData:
         return {"servo_gain": gain, "servo_damping": drag, "servo_torque_limit": limit}
 
 
-# supply, duty per gain, duty limit and armature; the two friction laws, each in the order of `_MotorFrictionData`
-_MOTOR_FIGURES: Mapping[_MotorPreset, tuple[tuple[float, ...], ...]] = {
-    "xl330": (
-        (7.4, 0.00288, 1.0, 0.00181),
-        (0.387, 4.02, 0.0128, 0.00366),
-        (0.386, 3.4, 0.00876, 0.00462, 0.068, 0.0, 2.56),
-    ),
-    "xl320": (
-        (7.5, 0.0505, 1.0, 0.00112),
-        (0.987, 35.6, 0.0275, 0.00332),
-        (0.995, 26.2, 0.0, 0.00779, 0.221, 0.0215, 1.97),
-    ),
-    "mx64": (
-        (15.0, 0.158, 0.9625, 0.012),
-        (1.62, 3.95, 0.0904, 0.0117),
-        (1.66, 3.16, 0.0615, 0.0148, 0.0, 0.0239, 1.52),
-    ),
-    "mx106": (
-        (15.0, 0.158, 0.9625, 0.0266),
-        (2.19, 2.96, 0.104, 0.0352),
-        (2.23, 2.37, 0.0, 0.051, 0.00915, 0.105, 1.62),
-    ),
-    "sts3215": ((7.4, 0.166, 0.97, 0.0284), (1.21, 2.68, 0.0524, 0.0591)),
-}
-MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
-    name: _DcMotorData(voltage, gain, limit, armature, *(_MotorFrictionData(*law) for law in laws))
-    for name, ((voltage, gain, limit, armature), *laws) in _MOTOR_FIGURES.items()
-}
+def _as_motor_data(found: dict[str, Any]) -> Any:
+    return _DcMotorData(**found) if "plain" in found else _MotorFrictionData(**found) if "coulomb" in found else found
+
+
+_PRESETS_FILE = Path(__file__).with_name("motor_presets.json")
+MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = json.loads(_PRESETS_FILE.read_text(), object_hook=_as_motor_data)
 """Motors of desk-top arms by preset name; `STS3215` at 7.4 V."""
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_rollouts
+from yid_ocp.integrator.step import Step, checked_rollout_inputs
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
 from yid_ocp.integrator.tracking_feedback import JointMotionAndTorqueWithSensitivities
 from yid_ocp.model.system import System
@@ -231,7 +231,7 @@ class EpisodePredictor:
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
             members = [p.member for p in prepared if not isinstance(p, str)]
-            rollouts = iter(simulate_rollouts(self.integrator_step, members))
+            rollouts = iter(self.integrator_step.kernel.rollout_batch(members))
             pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from yid_ocp import files
-from yid_ocp.analysis.run_estimates import pool_estimates_and_chi2
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, add_baseline_prior
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_earlier_runs
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
@@ -76,8 +75,8 @@ def run_diagnose(
         with run_inputs.add_setting_location_to_errors(run, "diagnosis", "candidates"):
             make_candidate_effects(problem.system, [e.recording for e in problem.episodes], run.diagnosis.candidates)
         run_history.require_recordings_not_in_baseline(run, problem, runs, without)
-        if runs:
-            problem = add_baseline_prior(problem, pool_estimates_and_chi2(runs)[0])
+        earlier = EarlierRunsBaseline.from_run_estimates(runs, without)
+        problem, _ = problem_with_earlier_runs(problem, earlier)
         nominal: Solution | None = None
         try:
             if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
@@ -90,7 +89,7 @@ def run_diagnose(
                 thresholds=run.diagnosis,
                 progress=logged,
                 known_fits=NominalSolutionAndRefitStore(nominal, refits),
-                baseline=EarlierRunsBaseline.from_run_estimates(runs, without),
+                baseline=earlier,
                 exclude=run.diagnosis.excluded_candidates,
             )
         except KeyboardInterrupt:
