@@ -102,26 +102,20 @@ class TorqueLaw(base.EffectBase):
         return EffectStepTerms(generalized_force=force, internal_equations=equations, static_equations=at_rest)
 
     def _torque(self, quantity: str, x: ca.SX) -> ca.SX:
-        """f(x) by cubic B-splines, of which four are nonzero at any x."""
+        """f(x) by truncated powers: a constant, a line, and a cube that begins at each knot."""
         knots = (self.knots or {})[quantity]
         values = ca.vertcat(*(self.parameters[name].symbol for name in self.knot_parameter_names(quantity)))
-        weights = ca.SX(ca.DM(_spline_weights(len(knots)))) @ values
+        first, slope, *cubes = ca.vertsplit(ca.SX(ca.DM(_truncated_power_weights(len(knots)))) @ values)
         place = ca.fmin(ca.fmax((x - knots[0]) / (knots[1] - knots[0]), 0), len(knots) - 1)
-        total = ca.SX(0)
-        for k in range(len(knots) + 2):
-            away = ca.fabs(place - (k - 1))
-            total += weights[k] * (ca.fmax(2 - away, 0) ** 3 - 4 * ca.fmax(1 - away, 0) ** 3) / 6
-        return total
+        return first + slope * place + sum(cube * ca.fmax(place - k, 0) ** 3 for k, cube in enumerate(cubes))
 
 
-def _spline_weights(count: int) -> Array:
-    """Weights (count + 2, count) of uniform cubic B-splines for the natural spline through values at the knots."""
-    inner = np.zeros((count + 2, count + 2))
-    rows = np.arange(count)
-    for shift, weight in enumerate((1 / 6, 4 / 6, 1 / 6)):
-        inner[rows, rows + shift] = weight
-    inner[count, :3], inner[count + 1, -3:] = (1, -2, 1), (1, -2, 1)
-    return np.asarray(np.linalg.inv(inner)[:, :count], float)
+def _truncated_power_weights(count: int) -> Array:
+    """Weights (count + 1, count) of 1, x and max(x - k, 0)^3 for the natural spline through values at x = 0, 1, ..."""
+    x = np.arange(count, dtype=float)
+    powers = np.column_stack([np.ones(count), x, np.maximum(x[:, None] - x[:-1], 0) ** 3])
+    no_curvature_at_end = np.concatenate([[0, 0], x[-1] - x[:-1]])
+    return np.asarray(np.linalg.inv(np.vstack([powers, no_curvature_at_end]))[:, :count], float)
 
 
 def _coordinate_indices_and_factors(system: System, location: str) -> dict[int, float]:
