@@ -260,13 +260,16 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
     residual = residual - basis @ (basis.T @ residual)
     families = []
     for law in laws:
-        quantities: list[tuple[str, ...]] = [(q,) for q in law.quantities]
-        quantities += [("angle", "speed")] if {"angle", "speed"} <= set(law.quantities) else []
-        for own_quantities in quantities:
-            part = law.restricted_to_quantities(own_quantities)
+
+        def family(*quantities: str, law: TorqueLaw = law) -> _Family:
+            part = law.restricted_to_quantities(quantities)
             at = [names.index(name) for name in part.parameters.names]
-            slopes = jacobian[:, at] - basis @ (basis.T @ jacobian[:, at])
-            families.append(_family(part, residual, slopes))
+            return _family(part, residual, jacobian[:, at] - basis @ (basis.T @ jacobian[:, at]))
+
+        single = list(map(family, law.quantities))
+        both = [family("angle", "speed")] if {"angle", "speed"} <= set(law.quantities) else []
+        # two quantities are refitted only if their evidence is above that of each alone
+        families += [*single, *(own for own in both if own.log_evidence > max(one.log_evidence for one in single))]
     families.sort(key=lambda family: -family.log_evidence)
     over_time = [family for family in families if family.law.quantities == ("time",)]
     rest = [family for family in families if family.law.quantities != ("time",)]
