@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.solvers import solve
+from yid_ocp.solvers import fit_problem
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import build_problem
 
@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
         system = build_system(run, division)
         links = len(system.layout_of_segment(name).link_joints)
         problem = build_problem(run, build_step(run, system))
-        solution = solve(problem, run.solver)
+        solution = fit_problem(problem, run.solver)
         size = {key: solution.parameters[f"{name}.{key}"].value for key in ("length", "mass", "size_x", "size_y")}
         bend, damping = solution.parameters[f"{name}.bend"], solution.parameters[f"{name}.damping"]
         rigidity, moment = bend.value, second_moment(size["size_x"], size["size_y"])

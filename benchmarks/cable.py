@@ -42,7 +42,7 @@ from yid_ocp.problem.predictions import (
     measured_point_positions,
     naive_cable_predictions,
 )
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "deft"
 ESTIMATE = ("000", "007", "021", "035", "049", "063")
@@ -162,11 +162,11 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     problem.predictor.predict_episode(episode, theta, offset, False)
     seconds["rollout"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    solution = solve(problem, GaussNewton(max_iterations=iterations))
+    solution = fit_problem(problem, GaussNewton(max_iterations=iterations))
     seconds["fit"] = time.perf_counter() - clock
     fitted = point_rmse_by_recording(problem, solution.x, cable.unclamped_vertex_names)
     clock = time.perf_counter()
-    simple = solve(undeformed, GaussNewton(max_iterations=iterations))
+    simple = fit_problem(undeformed, GaussNewton(max_iterations=iterations))
     seconds["fit_undeformed_rest"] = time.perf_counter() - clock
     by_simple = point_rmse_by_recording(undeformed, simple.x, cable.unclamped_vertex_names)
     files = {}

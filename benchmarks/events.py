@@ -35,7 +35,7 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineMotion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -186,7 +186,7 @@ def simulated() -> None:
     for count in (1, 3, 6, 9, 12):
         recordings = [*pushed, *calm[:count]]
         problem = EstimationProblem(step, recordings, free, ProblemOptions(sensors=sensors, path_cutoff=8.0))
-        x = solve(problem, GaussNewton()).x
+        x = fit_problem(problem, GaussNewton()).x
         events = find_force_and_fault_events(problem, x, problem.evaluate(x), None).disturbances
         hits = [
             [

@@ -38,7 +38,7 @@ from yid_ocp.integrator import compiled
 from yid_ocp.parallel import Task, WorkerConfig, process_pool, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import build_problem
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -122,7 +122,7 @@ def case(settings: list[str], seed: int) -> dict[str, float]:
         name: float(x * math.exp(rng.uniform(-0.3, 0.3)))
         for name, x in zip(problem.unknown_names, problem.initial_unknowns, strict=True)
     }
-    solution = solve(
+    solution = fit_problem(
         problem, GaussNewton(max_iterations=6), initial_unknowns=problem.unknown_vector(values).tolist(), restarts=False
     )
     return {"cpu": time.process_time() - begun, "cost": float(solution.cost)}

@@ -41,7 +41,7 @@ from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_inform
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.solvers import GaussNewton, Solution, solve
+from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 from yid_ocp.virtual.experiment import (
     PointCamera,
     VirtualExperimentSettings,
@@ -84,7 +84,7 @@ def recorded(plan: InformativeMotionPlan, seed: int) -> Recording:
 
 def parameter(starts: int, recordings: int) -> None:
     problem = build_problem(load_config(CONFIG))
-    solution = solve(problem, GaussNewton(cost_tolerance=1e-5))
+    solution = fit_problem(problem, GaussNewton(cost_tolerance=1e-5))
     values = {name: entry.value for name, entry in solution.parameters.items() if name in problem.free}
     plan = plan_informative_motion(
         problem, replace(OPTIONS, n_random_starts=starts), values, None, StderrLogLinesProgress()
@@ -97,7 +97,7 @@ def parameter(starts: int, recordings: int) -> None:
         rows.append(
             _row(
                 f"the planned motion, {recording.duration:g} s, noise {i + 1}",
-                solve(alone, GaussNewton(cost_tolerance=1e-5)),
+                fit_problem(alone, GaussNewton(cost_tolerance=1e-5)),
             )
         )
     print("\n".join(aligned_table_lines(rows)))

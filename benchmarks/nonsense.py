@@ -28,7 +28,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.integrator.step import Step
-from yid_ocp.solvers import solve
+from yid_ocp.solvers import fit_problem
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.run_inputs import resolve_default_recording
 
@@ -507,7 +507,7 @@ def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = No
     found: list[str] = []
     wrong: list[str] = []
     if solving and problem.options.has_no_data_issue_above_warning:
-        outcome = solve(problem, run.solver, limits=run.diagnosis.fit_excess_residual_criteria)
+        outcome = fit_problem(problem, run.solver, limits=run.diagnosis.fit_excess_residual_criteria)
         verdicts = {name: entry for name, entry in outcome.parameters.items() if entry.verdict == "identifiable"}
         found = list(verdicts)
         truth = problem.episodes[0].recording.true_parameters

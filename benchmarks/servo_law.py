@@ -31,7 +31,7 @@ from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
-from yid_ocp.solvers import GaussNewton, Solution, solve
+from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 from yid_ocp.workflow.build_problem import build_problem
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "servo_pendulum.yaml"
@@ -110,7 +110,7 @@ def main() -> int:
     friction = FrictionLawSettings(law=arguments.friction, joints=None)
     model = replace(run.model, friction=friction)
     base = ladder.problem_estimating_from_all_recordings(build_problem(replace(run, model=model)))
-    kinds, solution = ladder.recording_names_by_name_stem(base), solve(base, run.solver, restarts=False)
+    kinds, solution = ladder.recording_names_by_name_stem(base), fit_problem(base, run.solver, restarts=False)
     print("| law of | error on kinds left out [rad] | " + " | ".join(n for own in kinds.values() for n in own) + " |")
     for quantity in (None, *arguments.quantities):
         if quantity is None:

@@ -25,7 +25,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
@@ -92,7 +92,7 @@ def estimated(system: System, recording: Recording, time_step: float) -> Estimat
     """Gauss-Newton from the truth; the unseen twists stay at theirs."""
     step = compile_step(system, time_step)
     problem = EstimationProblem(step, [recording], FREE, ProblemOptions(arm_tracking_feedback="lqr"), TRUTH)
-    found = solve(problem, GaussNewton(cost_tolerance=1e-12, max_iterations=15))
+    found = fit_problem(problem, GaussNewton(cost_tolerance=1e-12, max_iterations=15))
     std = np.array([found.std[name] for name in FREE])
     return Estimate(found.x[: len(FREE)], std, found.goodness_of_fit.chi2_per_dof, found.message)
 

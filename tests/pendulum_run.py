@@ -13,7 +13,7 @@ import pytest
 
 from yid_ocp.cli import main
 from yid_ocp.data import JointGroup, Recording, read_recording, write_recording
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import load_problem
 
 TRUTH = {"shoulder.stiffness": 4.0, "shoulder.damping": 0.3, "elbow.damping": 0.2}
@@ -107,7 +107,7 @@ def solved_pendulum(pendulum_data):
     file = pendulum_data.folder / "solved.yaml"
     file.write_text(pendulum_data.text)
     problem = load_problem(file)
-    solution = solve(problem, GaussNewton())
+    solution = fit_problem(problem, GaussNewton())
     return problem, solution, problem.predict_held_out(solution.x)
 
 

@@ -13,7 +13,7 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 
 BENCH = """<mujoco><option timestep="0.00025" integrator="implicitfast"/><worldbody><body name="upper" pos="0 0 1">
 <joint name="shoulder" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.6"/>
@@ -67,10 +67,12 @@ def test_damping_is_right_where_markers_are_late(tmp_path):
     )
     assert [doubt.recording for doubt in doubts] == [sure[0].name, sure[2].name]
     assert " ms late by a fit" in doubts[0].what
-    before, after = (solve(own, GaussNewton()).goodness_of_fit.chi2_per_dof for own in (problem, problems["fitted"]))
+    before, after = (
+        fit_problem(own, GaussNewton()).goodness_of_fit.chi2_per_dof for own in (problem, problems["fitted"])
+    )
     assert before > 1.5
     assert after == pytest.approx(1.0, abs=0.15)
-    found = {std: solve(problem, GaussNewton()).parameters for std, problem in problems.items()}
+    found = {std: fit_problem(problem, GaussNewton()).parameters for std, problem in problems.items()}
     off = {std: (own["elbow.damping"].value - 0.02) / own["elbow.damping"].std for std, own in found.items()}
     assert all(found[std][name].verdict == "identifiable" for std in (None, "fitted") for name in truth)
     assert max(abs(off[None]), abs(off["fitted"])) < 2.5

@@ -25,7 +25,7 @@ from yid_ocp.analysis.estimation import (
 from yid_ocp.cli import main
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, fit_problem
 from yid_ocp.solvers.base import StopSearch
 from yid_ocp.workflow.build_problem import load_problem
 
@@ -154,16 +154,16 @@ def compared(monkeypatch):
     asked = []
 
     def run(truth=None, disturbed=False, weighting="whitened", **solutions):
-        def solve(problem, solver, callback, limits, restarts=True):
+        def fit(problem, solver, callback, limits, restarts=True):
             asked.append((solver.name, problem.options.weighting, problem.has_process_noise, restarts))
             if callback is not None:
                 callback("step")
             return solutions["all_noise" if problem.has_process_noise else solver.name]
 
         def whole(problem, solver, callback):
-            return replace(solve(problem, solver, callback, None), message="checked")
+            return replace(fit(problem, solver, callback, None), message="checked")
 
-        monkeypatch.setattr(module, "solve", solve)
+        monkeypatch.setattr(module, "fit_problem", fit)
         monkeypatch.setattr(estimation, "solve", whole)
         monkeypatch.setattr(estimation, "add_intervals_and_checks", lambda _, made: replace(made, message="checked"))
         monkeypatch.setattr(
@@ -302,21 +302,21 @@ def test_a_callback_stops_any_search_at_its_last_iterate(repository, solver):
         if entry.iteration == 2:
             raise StopSearch("enough")
 
-    found = solve(load_problem(repository / "configs" / "springs_series_joint.yaml"), solver, callback=enough)
+    found = fit_problem(load_problem(repository / "configs" / "springs_series_joint.yaml"), solver, callback=enough)
     assert (found.status, found.message) == (Status.ITERATION_LIMIT, "enough")
     assert [entry.iteration for entry in found.history] == [0, 1, 2]
     assert np.array_equal(found.x, found.history[-1].x)
 
 
 def test_the_peak_of_memory_is_what_was_used_in_between(compared, monkeypatch):
-    def solve(*arguments, **settings):
+    def fit(*arguments, **settings):
         large = np.frombuffer(mmap.mmap(-1, 200_000_000), np.uint8)  # not from memory that the process has kept
         large.fill(1)
         time.sleep(0.1)
         return found_by(a=estimate(1.0))
 
     plain = compared(one=found_by(a=estimate(1.0))).method_results[0].peak_memory_mib
-    monkeypatch.setattr(module, "solve", solve)
+    monkeypatch.setattr(module, "fit_problem", fit)
     found = compare_methods(Problem(), [SimpleNamespace(name="one")])
     assert 150 < found.method_results[0].peak_memory_mib - plain < 300
     assert found.method_results[0].wall_seconds > 0.1
@@ -388,11 +388,11 @@ def solved(monkeypatch):
     """Solves the problem without memory where it starts, and keeps it; `ok` is whether that succeeds."""
     kept = SimpleNamespace(problems=[], ok=True)
 
-    def solve(problem, solver, start, limits):
+    def fit(problem, solver, start, limits):
         kept.problems.append(problem)
         return fitted(start, problem.unknown_names) if kept.ok else SimpleNamespace(evaluation=None)
 
-    monkeypatch.setattr(estimation.solvers, "solve", solve)
+    monkeypatch.setattr(estimation.solvers, "fit_problem", fit)
     return kept
 
 

@@ -35,7 +35,7 @@ from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers import GaussNewton, Status, solve
+from yid_ocp.solvers import GaussNewton, Status, fit_problem
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 
@@ -195,8 +195,8 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     step = compile_step(coarse.system, coarse.step.time_step / 2, coarse.step.force_split, use_compiler=False)
     values = dict(zip(coarse.free, coarse.initial_unknowns, strict=True))
     fine = EstimationProblem(step, [recording], coarse.free, coarse.options, values)
-    found = solve(coarse, GaussNewton())
-    finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
+    found = fit_problem(coarse, GaussNewton())
+    finer = fit_problem(fine, GaussNewton(), initial_unknowns=found.x)
     own, _ = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
     # without segments there are no links to divide
     told, notes = estimate_shifts_by_discretisation(coarse, found.x, found.evaluation, ("links", "time_step"))
@@ -229,7 +229,7 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     coarse, anew = (EstimationProblem(step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02))
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
-    found, finer = (solve(problem, GaussNewton()) for problem in (coarse, anew))
+    found, finer = (fit_problem(problem, GaussNewton()) for problem in (coarse, anew))
     refined = _FinerDiscretisationProblem(fine)
     own, left = _gauss_newton_step_in_finer_model(refined, found.problem, found.x, found.evaluation)
     std = np.array([found.std[name] for name in free])
@@ -432,7 +432,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     """At 5 ms it ends, with every sign of success, thousands of standard deviations from the truth."""
     options = ProblemOptions(path_cutoff=np.inf)
     problem = EstimationProblem(light(0.3, time_step), [light_recording], ("cable.bend",), options)
-    found = solve(problem, GaussNewton())
+    found = fit_problem(problem, GaussNewton())
     assert found.status == Status.CONVERGED
     entry = found.parameters["cable.bend"]
     assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)

@@ -27,7 +27,7 @@ from yid_ocp.analysis.run_estimates import (
 )
 from yid_ocp.model.servos_and_springs import ServoModelOptions
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 
 COVARIANCE = np.array([[4.0, 1.5], [1.5, 1.0]]) * 1e-4
 
@@ -202,7 +202,7 @@ def test_kinds_go_by_name_and_a_true_law_predicts_each_from_the_others_and_shows
         folds.append(tuple({e.name for e in group} for group in (problem.episodes, problem.held_out)))
         return search(self, problem, start, callback)
 
-    solution = solve(driven, GaussNewton(), restarts=False)
+    solution = fit_problem(driven, GaussNewton(), restarts=False)
     monkeypatch.setattr(GaussNewton, "minimize_cost", searched)
     fit = cross_validate_over_motion_kinds("coulomb", driven, solution, recording_names_by_name_stem(driven))
     names = {"slow_1", "slow_2", "fast_1", "turn_1"}
@@ -231,7 +231,7 @@ def test_laws_of_an_arm_that_moves_as_measured_are_judged_by_its_efforts(urdf_fo
         far = seen(["tip"], t, np.full((201, 1, 3), 9.0), std=np.full((201, 1, 3), 1e-3))
         made.append(recording(moved, far, name=f"run {seed}"))
     problem, kinds = EstimationProblem(step, made, [law]), {"one": ("run 0",), "other": ("run 1",)}
-    fit = cross_validate_over_motion_kinds("coulomb", problem, solve(problem, restarts=False), kinds)
+    fit = cross_validate_over_motion_kinds("coulomb", problem, fit_problem(problem, restarts=False), kinds)
     assert (fit.unit, fit.left_out_errors) == ("std", pytest.approx({"run 0": 1.1, "run 1": 1.1}, abs=0.2))
 
 

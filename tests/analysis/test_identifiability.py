@@ -23,7 +23,7 @@ from yid_ocp.inference.uncertainty import percent_number_text
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 
 START = {"a": 2.0, "b": 50.0}
 
@@ -379,7 +379,7 @@ def test_bad_requests_say_what_is_wrong(error, words, more):
 
 def test_two_springs_in_series_seen_at_the_ends_only(springs):
     problem = springs("series_ends")
-    info = identifiability(problem, solve(problem, GaussNewton()), intervals="all")
+    info = identifiability(problem, fit_problem(problem, GaussNewton()), intervals="all")
     assert verdicts(info) == ["not_identifiable"] * 2
     [unseen] = info.unidentifiable_directions
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, like springs in series" in unseen.words
@@ -395,7 +395,7 @@ def test_two_springs_in_series_seen_at_the_ends_only(springs):
 
 def test_two_springs_in_series_with_the_joint_seen(springs):
     problem = springs("series_joint")
-    info = identifiability(problem, solve(problem, GaussNewton()), intervals="all")
+    info = identifiability(problem, fit_problem(problem, GaussNewton()), intervals="all")
     assert verdicts(info) == ["identifiable"] * 2
     assert info.unidentifiable_directions == ()
     for entry, truth in zip(info.parameters.values(), (200.0, 300.0), strict=True):
@@ -410,7 +410,7 @@ def test_two_springs_in_series_with_the_joint_seen(springs):
 )
 def test_two_torsional_springs_under_a_known_torque(springs, points, verdict):
     problem = springs("torsion", f"sensors.points_camera.used_points={points}")
-    info = identifiability(problem, solve(problem, GaussNewton()))
+    info = identifiability(problem, fit_problem(problem, GaussNewton()))
     assert set(verdicts(info)) == {verdict}
     assert bool(info.unidentifiable_directions) == (verdict == "not_identifiable")
     assert all("like springs in series" in direction.words for direction in info.unidentifiable_directions)
@@ -444,7 +444,7 @@ def test_one_arm_of_the_paper(golden_problem, vision, known_std, unknown_std):
         assert upper - value > 2 * (value - lower)
         others = [name for name in problem.free if name != "T3.bend"]
         at = EstimationProblem(*same, others, problem.options, values | {"T3.bend": lower})
-        assert 2 * solve(at, GaussNewton()).cost == pytest.approx(3.84, abs=0.1)
+        assert 2 * fit_problem(at, GaussNewton()).cost == pytest.approx(3.84, abs=0.1)
 
 
 def test_two_arms_of_the_paper(golden_problem):

@@ -44,7 +44,7 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.workflow.build_problem import build_problem
 
@@ -676,7 +676,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0):
         own = replace(options.sensors.get(group.name, SensorOptions()), std=std)
         options = replace(options, sensors={**options.sensors, group.name: own})
     made = EstimationProblem(problem.step, [replace(recording, points=(moved,))], problem.free, options)
-    solution = solve(made, run.solver)
+    solution = fit_problem(made, run.solver)
     return clock_and_noise_issues_from_residuals(solution.problem or made, solution.x, solution.evaluation)
 
 
@@ -701,7 +701,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
     made = source.simulate_synthetic_recording(seed=1)
     moved = replace(made.points[0], t=1.5 + 1.02 * (made.points[0].t - 1.5))
     problem = EstimationProblem(step, [replace(made, points=(moved,))], ["elbow.stiffness"])
-    solution = solve(problem, GaussNewton(), restarts=False)
+    solution = fit_problem(problem, GaussNewton(), restarts=False)
     assert solution.problem.has_process_noise
     (doubt,) = clock_and_noise_issues_from_residuals(solution.problem, solution.x, solution.evaluation)
     assert (doubt.cause, doubt.group) == ("clock_drift", "points_camera")

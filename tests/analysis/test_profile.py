@@ -23,7 +23,7 @@ from yid_ocp.analysis.profile import (
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
 from yid_ocp.parallel import Task, run_tasks
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import load_problem
 
 OPEN = dict.fromkeys("ab", (-math.inf, math.inf))
@@ -281,7 +281,7 @@ def judged_twin(config: Path, seed: int) -> dict[str, Any]:
     made = load_problem(config, ["problem.duration=3.0", f"recordings.estimate=[{exact}]"])
     recording = twin_recording(made, np.array([TRUTH[name] for name in made.unknown_names]), seed)
     problem = EstimationProblem(made.step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 10.0))
-    info = identifiability(problem, solve(problem, GaussNewton()), intervals=list(SEEN))
+    info = identifiability(problem, fit_problem(problem, GaussNewton()), intervals=list(SEEN))
     held = [holds(info.parameters[name].interval, TRUTH[name]) for name in SEEN]
     found = [name for name, entry in info.parameters.items() if entry.verdict == "identifiable"]
     return {"held": held, "identifiable": found}
@@ -303,7 +303,7 @@ def test_coverage_on_a_pendulum(pendulum, twin, record_property):
     for seed in range(TWINS):
         recording = twin(empty, empty.initial_unknowns, 1000 + seed)
         problem = pendulum(recording, {"elbow.stiffness": 3.0, "elbow.damping": 0.1, "elbow.rest": 0.1})
-        info = identifiability(problem, solve(problem, GaussNewton()), intervals="all")
+        info = identifiability(problem, fit_problem(problem, GaussNewton()), intervals="all")
         for name, value in truth.items():
             entry = info.parameters[name]
             profile[name].append(holds(entry.interval, value))

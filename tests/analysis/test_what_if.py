@@ -21,7 +21,7 @@ from yid_ocp.data.recording import PointGroup
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, baxter_foam_y_system, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -268,7 +268,7 @@ def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     assert [group.name for group in recording.points] == ["points_arm"]
     start = dict.fromkeys(TRUTH, 3.0)
     problem = EstimationProblem(compile_step(system, 0.01), [recording], made.free, made.options, start)
-    solution = solve(problem, GaussNewton())
+    solution = fit_problem(problem, GaussNewton())
     assert solution.goodness_of_fit.chi2_per_dof < 1.1
     info = identifiability(problem, solution, intervals="all")
     for name, truth in TRUTH.items():

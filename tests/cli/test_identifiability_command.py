@@ -90,14 +90,14 @@ def test_names_that_are_not_there_are_refused(cli, repository, tmp_path, left_no
 
 
 def test_a_failed_solve_leaves_no_point_to_judge_at(carried_out, repository, monkeypatch):
-    from yid_ocp.solvers import GaussNewton, Status, solve
+    from yid_ocp.solvers import GaussNewton, Status, fit_problem
     from yid_ocp.solvers import base as solvers
 
     def failing(problem, solver, callback=None, limits=None):
-        done = solve(problem, GaussNewton(max_iterations=1))
+        done = fit_problem(problem, GaussNewton(max_iterations=1))
         return replace(done, status=Status.FAILED, message="the rollout failed", evaluation=None)
 
-    monkeypatch.setattr(solvers, "solve", failing)
+    monkeypatch.setattr(solvers, "fit_problem", failing)
     done = carried_out("identifiability", repository / "configs" / "springs_series_ends.yaml", codes=(1,))
     assert "failed: the rollout failed; there is no point to analyse" in done.out
     assert done.result["parameters"] == {}

@@ -16,7 +16,7 @@ from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem.predictions import recording_from_prediction
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.solve import run_solve
@@ -109,7 +109,7 @@ def test_the_world_without_effects_is_estimated_on_its_own_recordings(beam):
         for name in ("loaded", "bare")
     )
     found = _estimated_without(SimpleNamespace(problem=loaded), [e.recording for e in bare.episodes], tuple(TRUTH))
-    expected = solve(bare, GaussNewton())
+    expected = fit_problem(bare, GaussNewton())
     for name, truth in TRUTH.items():
         assert abs(found[name] - truth) < 4 * expected.std[name]
         assert found[name] == pytest.approx(expected.parameters[name].value, abs=0.1 * expected.std[name])

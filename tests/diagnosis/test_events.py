@@ -33,7 +33,7 @@ from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineMotion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -107,7 +107,7 @@ class Twin:
 
     def events(self, *recordings: Recording) -> EventSet:
         problem = self.problem(*recordings)
-        x = solve(problem, GaussNewton()).x
+        x = fit_problem(problem, GaussNewton()).x
         return find_force_and_fault_events(problem, x, problem.evaluate(x), None)
 
 
@@ -320,7 +320,7 @@ def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_fo
     sensors = {"joints.position": SensorOptions(use=False)}
     options = ProblemOptions(initial_state="equilibrium", arm_tracking_feedback="none", sensors=sensors)
     problem = EstimationProblem(step, [made], ["shoulder.damping"], options)
-    x = solve(problem, GaussNewton()).x
+    x = fit_problem(problem, GaussNewton()).x
     evaluation = problem.evaluate(x)
     unknowns = select_and_smooth_unknowns(problem, x, evaluation)
     (event,) = find_force_and_fault_events(problem, x, evaluation, unknowns).disturbances
@@ -332,7 +332,7 @@ def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_fo
 
 def test_after_a_fall_nothing_counts(twin, pushed):
     problem = twin.problem(pushed)
-    x = solve(problem, GaussNewton()).x
+    x = fit_problem(problem, GaussNewton()).x
     events = find_force_and_fault_events(problem, x, problem.evaluate(x), None, Thresholds(max_joint_speed=1.0))
     (fall,) = events.overspeeds
     assert (fall.recording, fall.joint in JOINTS) == ("run_0", True)

@@ -393,7 +393,7 @@ def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, s
         return SimpleNamespace(unknown_names=("k",), x=np.array([value]))
 
     asked = []
-    monkeypatch.setattr(diagnosing, "solve", lambda *given, **how: asked.append(given) or solution(2.0))
+    monkeypatch.setattr(diagnosing, "fit_problem", lambda *given, **how: asked.append(given) or solution(2.0))
     monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
     given = None if known is None else solution(known)
     assert diagnosing.fit_nominal_model("problem", "composed", given) == start

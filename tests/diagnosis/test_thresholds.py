@@ -1,6 +1,5 @@
 """A threshold that is changed changes what it stands for."""
 
-
 import pytest
 
 from yid_ocp.diagnosis.diagnose import diagnose

@@ -36,7 +36,7 @@ from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 
 TIME_STEP, STEPS = 0.01, 200
 WHITE, OFFSET, ANGLE, POINT = 0.05, 0.1, 2e-4, 1e-3
@@ -322,7 +322,7 @@ def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feed
 def test_a_refit_is_as_sure_as_a_solution(step, friction):
     """One deviation for one parameter, whichever command says it; a misfit counts in it."""
     problem = problem_of(step, [recorded(step, 1, friction=friction)])
-    found = solve(problem, GaussNewton())
+    found = fit_problem(problem, GaussNewton())
     effects = make_candidate_effects(step.system, [problem.episodes[0].recording], ["joint_viscous"])
     fit = fit_nominal_model(problem, AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)]), found)
     std = found.parameters["elbow.stiffness"].std

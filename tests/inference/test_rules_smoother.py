@@ -34,7 +34,7 @@ from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 SOURCES = tuple(SmoothedUnknownGroup(*told) for told in (("T1", "force"), ("T2", "force"), ("camera", "bias")))
@@ -358,7 +358,7 @@ def problem_of(system: System, recording: Recording, feedback: Literal["none", "
 
 def said_of(problem: EstimationProblem):
     """What the smoother says about the fit of a problem."""
-    solution = solve(problem, GaussNewton())
+    solution = fit_problem(problem, GaussNewton())
     return select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
 
 

@@ -23,7 +23,7 @@ from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 
 PARENT = tuple(f"p{i}" for i in range(7))
 CHILD = ("p3", "c1", "c2")
@@ -149,10 +149,10 @@ def test_the_values_of_a_twin_are_found_from_its_vertices(real, twin_options, ca
     free = ("parent.bend", "parent.damping", "c.bend")
     problem = EstimationProblem(step, [recording], free, settings)
     before = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)["twin"]
-    solution = solve(problem, GaussNewton())
+    solution = fit_problem(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
     problem = EstimationProblem(step, [recording], free, settings, dict(zip(free, solution.x, strict=True)))
-    solution = solve(problem, GaussNewton())
+    solution = fit_problem(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
     after = real.point_rmse_by_recording(problem, solution.x, cable.unclamped_vertex_names)["twin"]
     assert after < 5e-4

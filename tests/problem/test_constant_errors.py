@@ -16,7 +16,7 @@ from yid_ocp.problem.measurements import (
     whitened_measurement_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, fit_problem
 
 BIAS = {"shoulder": 0.4, "elbow": 0.2}  # [N m]
 OFFSETS = {f"effort_offset@{joint}.offset": std for joint, std in BIAS.items()}
@@ -62,13 +62,13 @@ def test_the_map_is_that_of_generalised_least_squares():
 def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior_would_be(urdf_folder):
     free = ("shoulder.damping", "elbow.mass")
     stated, spelt = (arm(urdf_folder, bias, free, prescribed=tuple(BIAS)) for bias in (BIAS, None))
-    found, other = (solve(problem, GaussNewton(), restarts=False) for problem in (stated, spelt))
+    found, other = (fit_problem(problem, GaussNewton(), restarts=False) for problem in (stated, spelt))
     assert found.cost == pytest.approx(other.cost, rel=1e-9)
     for name in free:
         assert found.parameters[name].value == pytest.approx(other.parameters[name].value, rel=1e-3)
-    shot = solve(stated, MultipleShooting(max_iterations=1), restarts=False)
+    shot = fit_problem(stated, MultipleShooting(max_iterations=1), restarts=False)
     assert "without the constant errors" in shot.message
-    plain = solve(arm(urdf_folder, 0.0, free, prescribed=tuple(BIAS)), GaussNewton(), restarts=False)
+    plain = fit_problem(arm(urdf_folder, 0.0, free, prescribed=tuple(BIAS)), GaussNewton(), restarts=False)
     assert plain.cost > found.cost + 10.0
 
 

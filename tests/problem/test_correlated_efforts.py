@@ -19,7 +19,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
-from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, fit_problem
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 NAN = math.nan
@@ -120,7 +120,7 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
         return
     solvers = [GaussNewton(), SingleShooting()]
     solvers += [] if how else [MultipleShooting(), MultipleShooting(condensing=True)]
-    found = [solve(problem, s, restarts=False) for s in solvers]
+    found = [fit_problem(problem, s, restarts=False) for s in solvers]
     for other in found[1:]:
         assert other.cost == pytest.approx(found[0].cost, rel=1e-6)
         np.testing.assert_allclose(other.x, found[0].x, rtol=1e-3)
@@ -244,7 +244,7 @@ def test_deviations_are_those_of_repeats(efforts_of):
     found, stated = [], []
     for seed in range(REPEATS):
         noise = EFFORT_NOISE * np.random.default_rng(seed).standard_normal(clean.shape)
-        solution = solve(efforts_of(clean + noise, LOW_CUTOFF), GaussNewton())
+        solution = fit_problem(efforts_of(clean + noise, LOW_CUTOFF), GaussNewton())
         found.append([solution.parameters[name].value for name in DAMPING])
         stated.append([solution.parameters[name].std for name in DAMPING])
     error = np.array(found) - list(DAMPING.values())

@@ -15,7 +15,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import load_problem
 
 CONSTANTS = {"shoulder": 0.5, "elbow": -0.2}  # [N m/A]
@@ -60,7 +60,7 @@ def test_damping_is_found_from_currents_of_another_engine(step, made):
     [samples] = problem.episodes[0].measurements
     assert samples.sensor.channel_names == ("motors_left.current.shoulder", "motors_left.current.elbow")
     assert (samples.sensor.unit, samples.sensor.effort_joints) == ("A", PENDULUM)
-    solution = solve(problem, GaussNewton())
+    solution = fit_problem(problem, GaussNewton())
     for name, true in TRUTH.items():
         found = solution.parameters[name]
         assert abs(found.value - true) < 4 * found.std < 0.1
@@ -99,7 +99,7 @@ def test_a_synthetic_recording_holds_currents(step, made):
     assert (motors.name, motors.names) == ("motors_left", PENDULUM)
     assert motors.values_by_quantity["current"].shape == (401, 2)
     again = replace(again, name="arm", joints=replace(again.joints, effort=None))
-    found = solve(problem_of(step, again), GaussNewton()).parameters
+    found = fit_problem(problem_of(step, again), GaussNewton()).parameters
     assert all(abs(found[name].value - true) < 4 * found[name].std for name, true in TRUTH.items())
 
 

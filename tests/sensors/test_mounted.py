@@ -26,7 +26,7 @@ from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
 from yid_ocp.sensors import sensor_function_with_jacobians
 from yid_ocp.sensors.mounted import _Accelerometer, _Gyroscope
 from yid_ocp.sensors.wrist import _WristForceSensor, _WristTorqueSensor
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import load_problem
 
 LINK = """<link name="{}"><inertial><origin xyz="{}"/><mass value="{}"/>
@@ -249,7 +249,7 @@ def test_stiffness_is_found_from_a_wrist_in_mujoco_and_from_a_synthetic_one(
     for recording, truth in ((one, 4.0), (again, 4.5)):
         wrist_alone = {"joints.effort": SensorOptions(use=False)}
         asked = problem(step_of(urdf, time_step=0.005), recording, "T1.bend", sensors=wrist_alone)
-        found = solve(asked, GaussNewton()).parameters["T1.bend"]
+        found = fit_problem(asked, GaussNewton()).parameters["T1.bend"]
         assert abs(found.value - truth) < 4 * found.std < 0.2
 
 

@@ -16,7 +16,7 @@ from yid_ocp.model import Parameters, System
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, fit_problem
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
@@ -40,7 +40,7 @@ def short(make_problem):
 def reference(short):
     """The solution by Gauss-Newton, whose iterates fall and are told."""
     told = []
-    solution = solve(short, GaussNewton(), callback=told.append)
+    solution = fit_problem(short, GaussNewton(), callback=told.append)
     costs = [entry.cost for entry in solution.history]
     assert told == list(solution.history)
     assert all(after <= before * (1 + 1e-12) for before, after in itertools.pairwise(costs))
@@ -61,14 +61,14 @@ OTHERS = [(SingleShooting(), 1e-5), (CONDENSED, 1e-3), (MultipleShooting(condens
 
 @pytest.mark.parametrize(("solver", "rtol"), OTHERS, ids=["single shooting", "every 20 steps", "every 10 steps"])
 def test_other_methods_agree(short, reference, solver, rtol):
-    solution = solve(short, solver)
+    solution = fit_problem(short, solver)
     assert solution.status == Status.CONVERGED, solution.message
     assert within(solution, reference)
     assert solution.cost == pytest.approx(reference.cost, rel=rtol)
 
 
 def test_gauss_newton_recovers_the_truth_of_another_engine(make_problem, recording):
-    solution = solve(make_problem(), GaussNewton())
+    solution = fit_problem(make_problem(), GaussNewton())
     assert solution.status == Status.CONVERGED
     assert 0.9 < solution.goodness_of_fit.chi2_per_dof < 1.2
     for name, entry in solution.parameters.items():
@@ -92,8 +92,8 @@ def one_link_tubes(paper_systems, recording):
 
 
 def test_multiple_shooting_with_a_node_at_every_step_agrees(one_link_tubes):
-    single = solve(one_link_tubes, GaussNewton())
-    solution = solve(one_link_tubes, MultipleShooting())
+    single = fit_problem(one_link_tubes, GaussNewton())
+    solution = fit_problem(one_link_tubes, MultipleShooting())
     assert solution.status == Status.CONVERGED, solution.message
     assert within(solution, single, 0.01)
     assert solution.cost == pytest.approx(single.cost, rel=1e-6)
@@ -118,8 +118,8 @@ def two_arms(paper_systems, clean):
 )
 def test_fifty_variables_from_far_away(two_arms, solver):
     """One start is enough, and weakly informed parameters do not keep the methods busy."""
-    single = solve(two_arms, GaussNewton())
-    solution = solve(two_arms, solver)
+    single = fit_problem(two_arms, GaussNewton())
+    solution = fit_problem(two_arms, solver)
     assert solution.status == Status.CONVERGED, solution.message
     assert "starts" not in solution.message
     assert solution.n_iterations <= 40
@@ -133,22 +133,22 @@ def test_fifty_variables_from_far_away(two_arms, solver):
 
 def test_steepest_descent_lowers_the_papers_cost_and_with_a_memory_returns_the_best_point(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
-    solution = solve(problem, SteepestDescent(max_iterations=60, first_trial_step_rule="spectral"))
+    solution = fit_problem(problem, SteepestDescent(max_iterations=60, first_trial_step_rule="spectral"))
     assert solution.history[-1].cost < 0.05 * solution.history[0].cost
     assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
     patient = SteepestDescent(first_trial_step_rule="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
-    solution = solve(problem, patient)
+    solution = fit_problem(problem, patient)
     costs = [entry.cost for entry in solution.history]
     assert solution.status == Status.CONVERGED
     assert any(after > before for before, after in itertools.pairwise(costs))
     assert solution.cost == pytest.approx(min(costs), rel=1e-12)
-    assert solution.x == pytest.approx(solve(problem, GaussNewton(cost_tolerance=1e-12)).x, rel=1e-3)
+    assert solution.x == pytest.approx(fit_problem(problem, GaussNewton(cost_tolerance=1e-12)).x, rel=1e-3)
 
 
 def test_estimated_start_gives_the_same_optimum_in_both_formulations(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.6, initial_state="estimated")
-    single = solve(problem, GaussNewton())
-    multiple = solve(problem, CONDENSED)
+    single = fit_problem(problem, GaussNewton())
+    multiple = fit_problem(problem, CONDENSED)
     spread = np.sqrt(np.diag(single.covariance))[:2]
     assert np.all(np.abs(single.x[:2] - multiple.x[:2]) <= 0.2 * spread)
 
@@ -161,7 +161,7 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
     step = compile_step_like(problem.step, narrow)
     problem = EstimationProblem(step, [recording], problem.free, problem.options)
     for solver in (GaussNewton(), SingleShooting(), CONDENSED):
-        solution = solve(problem, solver)
+        solution = fit_problem(problem, solver)
         assert solution.x[0] <= 15.0 + 1e-9, solver.name
         assert solution.x[0] == pytest.approx(15.0, abs=1e-2), solver.name
 
@@ -197,7 +197,7 @@ def test_iteration_limit_is_a_status_with_the_best_point(make_problem, pendulum)
     few = [(arm, GaussNewton(max_iterations=1)), (arm, MultipleShooting(condensing=True, max_iterations=2))]
     few += [(pendulum, MultipleShooting(max_iterations=2, ipopt_options={"acceptable_iter": 0}))]
     for problem, solver in few:
-        solution = solve(problem, solver)
+        solution = fit_problem(problem, solver)
         assert solution.status == Status.ITERATION_LIMIT
         assert np.all(np.isfinite(solution.x))
         assert "iterations" in solution.message
@@ -244,8 +244,8 @@ def test_all_noise_has_one_optimum_as_covariance_and_as_unknowns(repository, nam
     """From 3 N m/rad, with 44 000 to 60 000 unknowns; errors of torques are unknowns here, a covariance there."""
     problem = load_problem(repository / "configs" / f"{name}.yaml")
     assert problem.has_process_noise
-    single = solve(problem, GaussNewton())
-    solution = solve(problem, MultipleShooting())
+    single = fit_problem(problem, GaussNewton())
+    solution = fit_problem(problem, MultipleShooting())
     assert solution.status == Status.CONVERGED, solution.message
     assert solution.cost == pytest.approx(single.cost, abs=1.5)
     agree(single, solution, 0.3)
@@ -257,8 +257,8 @@ def test_all_noise_has_one_optimum_as_covariance_and_as_unknowns(repository, nam
 def test_exact_torques_have_one_optimum(paper_systems, clean, name, hessian):
     step = compile_step(paper_systems[name.partition("_")[0]], 0.01)
     problem = EstimationProblem(step, [read_recording(clean / f"{name}_estimate.h5")], FREE)
-    single = solve(problem, GaussNewton())
-    solution = solve(problem, MultipleShooting(hessian=hessian))
+    single = fit_problem(problem, GaussNewton())
+    solution = fit_problem(problem, MultipleShooting(hessian=hessian))
     assert solution.status == Status.CONVERGED, solution.message
     assert solution.cost == pytest.approx(single.cost, abs=0.05)
     agree(single, solution, 0.05)
@@ -269,9 +269,9 @@ def test_two_thousand_steps_of_two_arms_are_solved_in_silence(paper_systems, cle
     step = compile_step(paper_systems["dual"], 0.0025)
     problem = EstimationProblem(step, [read_recording(clean / "dual_arm_vision_estimate.h5")], FREE)
     assert problem.episodes[0].grid.steps == 2000
-    solution = solve(problem, MultipleShooting(), restarts=False)
+    solution = fit_problem(problem, MultipleShooting(), restarts=False)
     assert solution.status == Status.CONVERGED, solution.message
-    reference = solve(problem, GaussNewton(), initial_unknowns=solution.x, restarts=False)
+    reference = fit_problem(problem, GaussNewton(), initial_unknowns=solution.x, restarts=False)
     assert solution.cost == pytest.approx(reference.cost, abs=0.1)
     assert np.all(np.isfinite(solution.x))
     assert capfd.readouterr() == ("", "")

@@ -12,7 +12,7 @@ from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.system import System, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.solvers import GaussNewton, Status, solve
+from yid_ocp.solvers import GaussNewton, Status, fit_problem
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -72,7 +72,7 @@ def test_stiffnesses_are_found_from_starts_far_below_and_above(cable, start):
 
 
 def test_what_is_found_is_true_and_what_the_tips_hardly_see_is_not_called_found(cable):
-    solution = solve(cable(4.5e-4), GaussNewton())
+    solution = fit_problem(cable(4.5e-4), GaussNewton())
     assert solution.goodness_of_fit.explains
     for name, truth in TRUTH.items():
         entry = solution.parameters[name]
@@ -120,7 +120,7 @@ def solved(coarse_recording, links):
     options = ProblemOptions(sensors={"joints.effort": SensorOptions(use=False)})
     start = {"cable.bend": 0.1, "cable.damping": 1e-3}
     problem = EstimationProblem(step, [coarse_recording], tuple(CABLE_TRUTH), options, start)
-    return solve(problem, GaussNewton())
+    return fit_problem(problem, GaussNewton())
 
 
 def test_what_a_chain_too_coarse_gives_is_not_to_be_trusted(coarse_recording):

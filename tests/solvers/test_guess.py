@@ -12,7 +12,7 @@ from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers import GaussNewton, Status, solve
+from yid_ocp.solvers import GaussNewton, Status, fit_problem
 from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, unknowns_with_neutral_effects_activated
 from yid_ocp.solvers.multiple_shooting import _ShootingIntervals
 
@@ -129,7 +129,7 @@ def moved(urdf_folder):
 def test_a_spring_relaxed_elsewhere_is_found_from_its_neutral_value(moved, stiffness, rest_angle):
     problem = moved("joint_spring", {"stiffness": stiffness, "rest_angle": rest_angle}, ("stiffness", "rest_angle"))
     assert problem.initial_unknowns[1] == 0.0
-    solution = solve(problem, GaussNewton())
+    solution = fit_problem(problem, GaussNewton())
     assert solution.status == Status.CONVERGED
     for name, truth in (("stiffness", stiffness), ("rest_angle", rest_angle)):
         entry = solution.parameters[f"joint_spring@elbow.{name}"]
@@ -150,10 +150,10 @@ def test_an_amplitude_seen_at_its_neutral_value_begins_there_and_one_given_at_it
 @pytest.mark.parametrize(("kind", "name"), [("joint_viscous", "b"), ("joint_coulomb", "tau_c")])
 def test_friction_that_is_not_there_is_zero_after_a_few_steps_and_costs_nothing(moved, kind, name):
     problem = moved(kind, {name: 0.0}, (name,))
-    from_zero = solve(problem, GaussNewton())
+    from_zero = fit_problem(problem, GaussNewton())
     guessed = problem.with_parameter_values({f"{kind}@elbow.{name}": 0.5})
     np.testing.assert_array_equal(guessed.positive_unknowns_mask, [True, False])
-    solution = solve(guessed, GaussNewton())
+    solution = fit_problem(guessed, GaussNewton())
     entry = solution.parameters[f"{kind}@elbow.{name}"]
     assert abs(entry.value) < 3 * entry.std
     assert solution.n_evaluations <= from_zero.n_evaluations + 2

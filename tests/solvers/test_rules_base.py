@@ -18,7 +18,7 @@ from yid_ocp.inference.linearized_residual import (
 )
 from yid_ocp.problem.evaluation import soft_logarithm_and_slope
 from yid_ocp.solvers import GaussNewton, base
-from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, solve
+from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, fit_problem
 from yid_ocp.solvers.gradient_methods import _PATIENCE_STEPS
 
 INSIDE = [((1, 1), (3, -4), 8.0), ((1, 1), (5, -1), 5.0)]
@@ -62,7 +62,7 @@ def starts(solver):
 
 def test_a_good_fit_is_not_started_again():
     solver = Steps([[1.0], [2.0]])
-    solution = solve(MadeUp(misfit(lambda x: 4.9)), solver)
+    solution = fit_problem(MadeUp(misfit(lambda x: 4.9)), solver)
     assert solver.runs == [([1.0], 10.0)]
     assert (solution.status, solution.message, solution.solver_name) == (Status.CONVERGED, "run 1", "made_up")
     assert (solution.n_iterations, solution.n_evaluations) == (1, 2)
@@ -81,7 +81,7 @@ def test_a_good_fit_is_not_started_again():
 )
 def test_a_poor_fit_is_started_again_from_multiples_of_the_start(chi2_at, tried, kept, message):
     solver, told = Steps(), []
-    solution = solve(MadeUp(misfit(chi2_at.get)), solver, callback=told.append)
+    solution = fit_problem(MadeUp(misfit(chi2_at.get)), solver, callback=told.append)
     assert starts(solver) == [[x] for x in tried]
     assert (solution.x.tolist(), solution.message) == ([kept], message)
     notes = [f"start {n} of at most 4: initial values x {x:g}" for n, x in enumerate(tried[1:], 2)]
@@ -93,16 +93,16 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start(chi2_at, tried,
 def test_a_start_far_away_is_tried_where_its_prediction_is_better_than_every_fit(far, kept):
     solver = Steps()
     at = {1.0: 9.0, 4.0: 7.0, 2.0: 8.0, 10.0: 8.0, 30.0: 20.0, 100.0: far}
-    assert solve(MadeUp(misfit(at.get)), solver).x.tolist() == [kept]
+    assert fit_problem(MadeUp(misfit(at.get)), solver).x.tolist() == [kept]
     assert starts(solver)[4:] == ([[100.0]] if kept == 100.0 else [])
 
 
 def test_a_fit_is_left_alone_where_that_is_asked_for_or_the_cost_says_nothing_of_noise():
     solver = Steps()
-    assert solve(MadeUp(misfit(lambda x: 9.0)), solver, restarts=False).message == "run 1"
+    assert fit_problem(MadeUp(misfit(lambda x: 9.0)), solver, restarts=False).message == "run 1"
     assert starts(solver) == [[1.0]]
     solver = Steps()
-    assert solve(MadeUp(misfit(lambda x: 99.0), weighting="paper", noise=1.0), solver).message == "run 1"
+    assert fit_problem(MadeUp(misfit(lambda x: 99.0), weighting="paper", noise=1.0), solver).message == "run 1"
     assert len(solver.runs) == 1
 
 
@@ -110,7 +110,7 @@ def test_a_failed_fit_is_started_again_and_loses():
     at = {1.0: None, 4.0: 3.0}
     solver = Steps()
     solver.needs_rollout = False
-    solution = solve(MadeUp(misfit(at.get), count=10), solver)
+    solution = fit_problem(MadeUp(misfit(at.get), count=10), solver)
     assert solution.x.tolist() == [4.0]
     assert solution.evaluation is not None
 
@@ -122,31 +122,31 @@ BOUNDED = [(UPPER, None, [1, 3, 2, 3]), (UPPER, [0.5], [0.5, 2, 1, 3]), (UPPER, 
 @pytest.mark.parametrize(("bounds", "given", "tried"), [*BOUNDED, ({"lower": -5.0}, None, [1] * 4)])
 def test_new_starts_stay_within_bounds_and_move_positive_unknowns_only(bounds, given, tried):
     solver = Steps()
-    solve(MadeUp(misfit(lambda x: 9.0), (1.0,), **bounds), solver, given)
+    fit_problem(MadeUp(misfit(lambda x: 9.0), (1.0,), **bounds), solver, given)
     assert starts(solver) == [[x] for x in tried]
 
 
 def test_a_fit_that_cannot_be_evaluated_has_failed():
     at = {1.0: 2.0}
     problem = MadeUp(misfit(at.get))
-    solution = solve(problem, Steps([[9.0]], [[9.0]], [[9.0]], [[9.0]]))
+    solution = fit_problem(problem, Steps([[9.0]], [[9.0]], [[9.0]], [[9.0]]))
     assert (solution.status, solution.message, solution.evaluation) == (Status.FAILED, "it snaps", None)
     assert solution.cost == math.inf
     assert replace(solution, history=()).n_iterations == 0
     assert math.isnan(solution.goodness_of_fit.chi2_per_dof)
     paper = MadeUp(misfit({1.0: 2.0, 4.0: 2.0}.get), weighting="paper")
     solver = Steps([[9.0]])
-    assert solve(paper, solver).status == Status.CONVERGED
+    assert fit_problem(paper, solver).status == Status.CONVERGED
     assert len(solver.runs) == 2, "the published cost is started again as well where it failed"
 
 
 def test_the_end_is_evaluated_where_the_solver_found_its_equilibria_and_has_deviations():
     problem = MadeUp(misfit(lambda x: 1.0))
-    solve(problem, Steps([[2.0]]))
+    fit_problem(problem, Steps([[2.0]]))
     x, derivatives, warm = next(asked for asked in reversed(problem.asked) if asked[1])
     assert (x.tolist(), derivatives, warm) == ([2.0], True, "warm")
     problem = MadeUp(linear(np.eye(2), [-1.0, -2.0]), (4.0, 50.0), fixed=(7.0,))
-    solution = solve(problem, Steps([[1.0, 2.0]]))
+    solution = fit_problem(problem, Steps([[1.0, 2.0]]))
     assert solution.std == {"k1": pytest.approx(1.0), "k0": pytest.approx(1.0)}
     pytest.importorskip("pandas")
     assert list(solution.parameters_to_dataframe()["lower"]) == pytest.approx([2.0 - 1.96, 1.0 - 1.96, 7.0])
@@ -169,7 +169,7 @@ def test_a_start_that_fails_is_approached_over_longer_and_longer_horizons():
     solver = Steps([[1.5], [2.0]], [[3.0]], [[4.0]], [[5.0]], [[5.0]])
     told = []
     problem = MadeUp(reaching(lambda x: limits.get(x, 0.0)), count=10)
-    solution = solve(problem, solver, callback=told.append)
+    solution = fit_problem(problem, solver, callback=told.append)
     runs = [([1.0], 0.6), ([2.0], 1.2), ([3.0], 2.5), ([4.0], 5.0), ([5.0], 10.0)]
     assert [(start, pytest.approx(duration)) for start, duration in solver.runs] == runs
     notes = ["first 0.6 s", "first 0.6 s", "first 1.2 s", "first 2.5 s", "first 5 s", ""]
@@ -180,7 +180,7 @@ def test_a_start_that_fails_is_approached_over_longer_and_longer_horizons():
 def test_horizons_that_fail_are_skipped_and_the_rest_is_left_out_once_the_whole_holds():
     limits = {1.0: 1.0, 2.0: 10.0}
     solver = Steps([[2.0]], [[2.0]])
-    solve(MadeUp(reaching(lambda x: limits.get(x, 10.0)), count=10), solver)
+    fit_problem(MadeUp(reaching(lambda x: limits.get(x, 10.0)), count=10), solver)
     assert [(start, pytest.approx(duration)) for start, duration in solver.runs] == [([1.0], 0.6), ([2.0], 10.0)]
 
 
@@ -188,7 +188,7 @@ def test_horizons_that_fail_are_skipped_and_the_rest_is_left_out_once_the_whole_
 def test_a_solver_that_needs_no_rollout_is_not_given_shorter_horizons(needs):
     solver = Steps([[1.0]], [[1.0]], [[1.0]], [[1.0]], [[1.0]])
     solver.needs_rollout = needs
-    solution = solve(MadeUp(reaching(lambda x: 0.7), weighting="paper", count=10), solver)
+    solution = fit_problem(MadeUp(reaching(lambda x: 0.7), weighting="paper", count=10), solver)
     whole = [duration for _, duration in solver.runs if duration == 10.0]
     assert len(whole) == 4
     assert (len(solver.runs) > 4) is needs
@@ -226,7 +226,7 @@ def test_weights_are_renewed_after_every_step_and_gains_kept_after_short_ones():
     solver = Carrying([[0.5], [1.0]])
     problem = Disturbed(linear(np.eye(1), [-2.5]))
     told = []
-    solution = solve(problem, solver, callback=told.append, restarts=False)
+    solution = fit_problem(problem, solver, callback=told.append, restarts=False)
     assert [entry.note for entry in told] == ["", "", *(f"weights {k} of at most 16" for k in (2, 3, 4))]
     assert starts(solver) == [[1.0]]
     assert [at[0] for at, _ in problem.frozen] == pytest.approx([1.0, 1.0, 2.0, 2.5])
@@ -255,7 +255,7 @@ def test_smoothed_errors_that_depend_on_the_unknowns_do_not_keep_a_fit_from_its_
         GaussNewton().minimize_cost(Disturbed(overshooting(at), [at]), np.array([at]), None).x[0] for at in (2.4, 2.6)
     ]
     assert ends == pytest.approx([2.6, 2.4], abs=1e-3)
-    solution = solve(problem, GaussNewton(), restarts=False)
+    solution = fit_problem(problem, GaussNewton(), restarts=False)
     assert (solution.status, len(problem.frozen) < 5) == (Status.CONVERGED, True)
     assert solution.x[0] == pytest.approx(2.5, abs=1e-3)
 
@@ -263,7 +263,7 @@ def test_smoothed_errors_that_depend_on_the_unknowns_do_not_keep_a_fit_from_its_
 def test_steps_that_alternate_are_shortened():
     """The derivative lacks what smoothed errors do, so that every whole step is twice the right one."""
     problem = Disturbed(lambda x, duration: (10 * (x - 2.5), np.array([[5.0]])), [2.48])
-    solution = solve(problem, Carrying(), restarts=False)
+    solution = fit_problem(problem, Carrying(), restarts=False)
     assert (solution.status, len(problem.frozen)) == (Status.CONVERGED, 4)
     assert solution.x[0] == pytest.approx(2.5, abs=1e-6)
 
@@ -273,7 +273,7 @@ def test_weights_that_never_settle_are_renewed_a_limited_number_of_times():
         return linear(np.eye(1), [-frozen - 0.5])
 
     problem = Disturbed(moving(1.0), about=moving)
-    solution = solve(problem, Carrying([[1.0]]), restarts=False)
+    solution = fit_problem(problem, Carrying([[1.0]]), restarts=False)
     assert len(problem.frozen) == 16
     assert solution.status == Status.ITERATION_LIMIT
     assert "steps of 0.5 standard deviations after 15 linearizations" in solution.message
@@ -284,7 +284,7 @@ def test_a_long_step_that_raises_the_cost_is_left_to_the_solver():
         return np.array([100 * np.arctan(x[0] - 14)]), np.array([[100 / (1 + (x[0] - 14) ** 2)]])
 
     solver = Carrying([[10.0]], [[13.9]])
-    solution = solve(Disturbed(rows, [10.0]), solver, restarts=False)
+    solution = fit_problem(Disturbed(rows, [10.0]), solver, restarts=False)
     assert starts(solver) == [[10.0], [10.0]]
     assert solution.x[0] == pytest.approx(14.0, abs=1e-3)
 
@@ -295,7 +295,7 @@ def test_a_search_can_be_stopped_between_weights():
             raise base.StopSearch("enough")
 
     problem = Disturbed(linear(np.eye(1), [-9.5]))
-    solution = solve(problem, Carrying([[1.0]]), callback=stop)
+    solution = fit_problem(problem, Carrying([[1.0]]), callback=stop)
     assert (solution.x.tolist(), solution.message) == ([2.0], "enough")
 
 
@@ -308,18 +308,18 @@ def test_beside_noise_that_drives_the_motion_doubtful_estimates_have_another_sta
     """A start four times as large, with weights of its own."""
     there = [[1.0], [target]]
     solver = Carrying(there, [[4.0], [target]])
-    solution = solve(Disturbed(linear(slope * np.eye(1), [-slope * target])), solver)
+    solution = fit_problem(Disturbed(linear(slope * np.eye(1), [-slope * target])), solver)
     assert ([4.0] in [start for start, _ in solver.runs]) is tried
     assert ("best of 2 starts" in solution.message) is tried
     calm = Carrying(there, [[4.0], [target]])
-    solve(MadeUp(linear(slope * np.eye(1), [-slope * target])), calm)
+    fit_problem(MadeUp(linear(slope * np.eye(1), [-slope * target])), calm)
     assert [4.0] not in [start for start, _ in calm.runs]
 
 
 def test_another_start_of_gauss_newton_is_weighed_anew_only_where_it_leads_elsewhere():
     """Weights of the best fit tell that a start four times as large leads to the same minimum."""
     problem = Disturbed(linear(2.0 * np.eye(1), [-5.0]))
-    found = solve(problem, GaussNewton())
+    found = fit_problem(problem, GaussNewton())
     assert "(best of 2 starts)" in found.message
     assert found.x.tolist() == pytest.approx([2.5])
     assert [at[0] for at, _ in problem.frozen] == pytest.approx([1.0, 2.5], rel=1e-3)
@@ -353,7 +353,7 @@ def test_another_start_is_weighed_anew_where_it_gains_more_than_the_solver_can_t
     problem = Disturbed(rows)
     solver = Coarse([[1.0], [2.4]], [[4.0], [other]], [[other]])
     solver.cost_tolerance = tolerance
-    solution = solve(problem, solver)
+    solution = fit_problem(problem, solver)
     assert [at for at, _ in problem.frozen[2:]] == ([[4.0], [other]] if weighed else [])
     assert solution.x.tolist() == [other if weighed else 2.4]
 
@@ -361,7 +361,7 @@ def test_another_start_is_weighed_anew_where_it_gains_more_than_the_solver_can_t
 def test_another_start_is_given_up_as_soon_as_it_is_in_the_bowl_of_the_best_fit():
     """Its end would be reached at 2.5, a standard deviation is 0.5."""
     solver = Coarse([[1.0], [2.5]], [[4.0], [3.6], [3.4], [3.0]])
-    solution = solve(Disturbed(linear(2.0 * np.eye(1), [-5.0])), solver)
+    solution = fit_problem(Disturbed(linear(2.0 * np.eye(1), [-5.0])), solver)
     assert [entry.x[0] for entry in solution.history] == [1.0, 2.5, 2.5, 4.0, 3.6, 3.4]
     assert solution.x.tolist() == [2.5]
 
@@ -375,7 +375,7 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
 
     there = [[1.0], [2.0]]
     solver = Carrying(there, [[2.5], [2.5]])
-    solution = solve(Disturbed(rows), solver)
+    solution = fit_problem(Disturbed(rows), solver)
     assert [2.5] in [start for start, _ in solver.runs]
     assert (solution.x.tolist(), solution.goodness_of_fit.explains) == ([2.5], True)
     assert "(best of 2 starts)" in solution.message
@@ -385,17 +385,17 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
         "start 2 of at most 3: best fit x 1.25",
     }
     poor = Carrying(there, [[2.5], [2.1]], [[3.2], [2.2]])
-    solution = solve(Disturbed(rows), poor)
+    solution = fit_problem(Disturbed(rows), poor)
     assert "(best of 3 starts)" in solution.message
     assert [3.2] in [start for start, _ in poor.runs]
     single = Carrying(there)
-    assert "best of" not in solve(Disturbed(rows), single, restarts=False).message
+    assert "best of" not in fit_problem(Disturbed(rows), single, restarts=False).message
 
 
 def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
     solver = Steps([[1.0], [2.0]], [[3.0]])
     problem = Disturbed(linear(np.eye(1), [-2.0]))
-    solution = solve(problem, solver)
+    solution = fit_problem(problem, solver)
     assert len(solver.runs) == 1
     assert problem.frozen == []
     assert solution.problem is problem
@@ -419,7 +419,7 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
         plain = SimpleNamespace(episodes=("a", "b"), predictor=SimpleNamespace(predict_episode=run), **how)
         return SimpleNamespace(has_process_noise=True, problem_with_sensor_noise_only=lambda: plain)
 
-    fitted = solve(MadeUp(misfit(lambda x: 1.0)), Steps())
+    fitted = fit_problem(MadeUp(misfit(lambda x: 1.0)), Steps())
     assert replace(fitted, evaluation=smoothed, problem=known(True)).episode_predictions == ("plain a", "plain b")
     lost = replace(fitted, evaluation=smoothed, problem=known(False)).episode_predictions
     assert lost == ({"episode": "a"}, "b falls")
@@ -460,9 +460,9 @@ def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypat
     monkeypatch.setattr(base, "_good_fit", lambda *_: True)
     monkeypatch.setattr(base, "_doubtful", lambda *_: np.zeros(1, bool))
     monkeypatch.setattr(base, "_NEARBY_START_FACTORS", ())
-    alone = solve(problem, GaussNewton(max_iterations=40), restarts=False)
+    alone = fit_problem(problem, GaussNewton(max_iterations=40), restarts=False)
     assert alone.x[0] == pytest.approx(ALIAS, rel=0.15), "by itself it stays with the alias"
-    found = solve(problem, GaussNewton(max_iterations=40))
+    found = fit_problem(problem, GaussNewton(max_iterations=40))
     assert found.x[0] == pytest.approx(TRUE, rel=1e-3)
     assert any(step.note.endswith(": another local minimum") for step in found.history)
 
@@ -579,11 +579,11 @@ def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost_and_nothing_w
 
 def test_a_method_that_stops_short_has_not_converged_whatever_it_says():
     problem = MadeUp(linear([[1.0], [1.0]], [-3.0, -3.0]), (1.0,))
-    stopped = solve(problem, Steps([[2.0]]))
+    stopped = fit_problem(problem, Steps([[2.0]]))
     assert stopped.status == Status.STALLED
     assert "a further step would lower the cost (run 1)" in stopped.message
-    assert solve(problem, Steps([[3.0]])).status == Status.CONVERGED
-    limited = solve(problem, Steps([[2.0]], status=Status.ITERATION_LIMIT))
+    assert fit_problem(problem, Steps([[3.0]])).status == Status.CONVERGED
+    limited = fit_problem(problem, Steps([[2.0]], status=Status.ITERATION_LIMIT))
     assert (limited.status, limited.message) == (Status.ITERATION_LIMIT, "run 1")
 
 
@@ -602,7 +602,7 @@ def test_a_horizon_too_short_for_a_filter_is_left_out():
 
     problem.truncated_to_duration = shortened
     solver = Steps([[2.0]], [[2.0]])
-    solution = solve(problem, solver)
+    solution = fit_problem(problem, solver)
     assert [duration for _, duration in solver.runs] == [2.5, 10.0]
     assert solution.status == Status.CONVERGED
 
@@ -615,7 +615,7 @@ def test_another_start_that_cannot_even_begin_loses_nothing():
             return super().minimize_cost(problem, start, callback)
 
     problem = MadeUp(lambda x, duration: (9.0 * (-1.0) ** np.arange(10), np.ones((10, 1))))
-    solution = solve(problem, Fragile())
+    solution = fit_problem(problem, Fragile())
     assert (solution.status, solution.x.tolist()) == (Status.CONVERGED, [1.0])
 
 
@@ -633,7 +633,7 @@ def winding(steepness, pull, wound=40.0, size=0.2):
 def test_steps_that_are_worth_nothing_beside_the_noise_are_an_end():
     """The pull is worth 0.4 of a standard deviation; a hundredth of it is gained in twenty steps."""
     problem = winding(1e4, 0.4, size=1.0)
-    found = solve(problem, GaussNewton(max_iterations=100), initial_unknowns=[0.0, 0.0], restarts=False)
+    found = fit_problem(problem, GaussNewton(max_iterations=100), initial_unknowns=[0.0, 0.0], restarts=False)
     assert found.status == Status.CONVERGED
     assert found.n_iterations == _PATIENCE_STEPS
     assert "moved nothing by a tenth of its standard deviation" in found.message

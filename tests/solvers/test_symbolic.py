@@ -15,7 +15,7 @@ from yid_ocp.inference.whitening import (
     problem_without_input_errors,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, fit_problem
 from yid_ocp.solvers.nonlinear_program import (
     GaussNewtonHessianRidge,
     LocalVariableFunction,
@@ -147,7 +147,7 @@ def test_the_program_and_condensing_have_one_solution(urdf_folder):
     solvers = (condensed, MultipleShooting(ipopt_options=tight), MultipleShooting(hessian="exact", ipopt_options=tight))
     found = [one.minimize_cost(problem, problem.initial_unknowns, None) for one in solvers]
     assert [one.status for one in found] == [Status.CONVERGED] * 3, [one.message for one in found]
-    std = np.sqrt(np.diag(solve(problem, GaussNewton(), initial_unknowns=found[0].x, restarts=False).covariance))
+    std = np.sqrt(np.diag(fit_problem(problem, GaussNewton(), initial_unknowns=found[0].x, restarts=False).covariance))
     for one in found[1:]:
         assert np.all(np.abs(one.x - found[0].x) <= 1e-5 * np.maximum(std, np.abs(one.x)))
         assert one.history[-1].cost == pytest.approx(found[0].history[-1].cost, rel=1e-9)
@@ -159,9 +159,11 @@ def test_the_program_and_condensing_have_one_solution(urdf_folder):
 def test_it_solves_what_gauss_newton_solves(urdf_folder, case):
     """Efforts of prescribed joints, which depend on whole steps, need no elimination here."""
     problem = problem_of(urdf_folder, case)
-    solution = solve(problem, MultipleShooting(hessian="exact", ipopt_options={"acceptable_iter": 0}), restarts=False)
+    solution = fit_problem(
+        problem, MultipleShooting(hessian="exact", ipopt_options={"acceptable_iter": 0}), restarts=False
+    )
     assert solution.status == Status.CONVERGED, solution.message
-    single = solve(problem, GaussNewton(cost_tolerance=1e-12), initial_unknowns=solution.x, restarts=False)
+    single = fit_problem(problem, GaussNewton(cost_tolerance=1e-12), initial_unknowns=solution.x, restarts=False)
     assert single.cost == pytest.approx(solution.cost, rel=1e-7)
     # one parameter alone hardly matters where all is prescribed
     assert (
@@ -249,9 +251,9 @@ def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):
     step = pendulum_step(urdf_folder, driven=("shoulder",))
     problem = EstimationProblem(step, [taken(step, 1)], ("elbow.damping", "elbow.stiffness"), ProblemOptions(**TRACKED))
     assert problem.has_process_noise
-    single = solve(problem, GaussNewton(cost_tolerance=1e-10), restarts=False)
-    solution = solve(problem, MultipleShooting(), restarts=False)
-    left_out = solve(problem, MultipleShooting(condensing=True), restarts=False)
+    single = fit_problem(problem, GaussNewton(cost_tolerance=1e-10), restarts=False)
+    solution = fit_problem(problem, MultipleShooting(), restarts=False)
+    left_out = fit_problem(problem, MultipleShooting(condensing=True), restarts=False)
     assert "without the noise" not in solution.message
     assert "without the noise" in left_out.message
     assert solution.cost == pytest.approx(single.cost, rel=0.02)

@@ -24,7 +24,7 @@ from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneou
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorKindAndPreset, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
@@ -65,7 +65,7 @@ def fitted(
     step = compile_step(system.with_effects([effect]), 0.01, use_compiler=is_compiled)
     free = (*effect.parameters.names, "shoulder.damping", "elbow.damping")
     problem = EstimationProblem(step, [recording], free, ProblemOptions(path_cutoff=20.0))
-    found = solve(problem, GaussNewton(max_iterations=25))
+    found = fit_problem(problem, GaussNewton(max_iterations=25))
     values = dict(zip(found.unknown_names, found.x, strict=True))
     stds = {name: found.std[name] for name in effect.parameters.names}
     return {name: (entry.value, entry.std) for name, entry in effect.parameters_as_reported(values, stds).items()}

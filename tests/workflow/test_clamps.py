@@ -12,7 +12,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.baseline import add_baseline_prior
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, fit_problem
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
@@ -180,6 +180,6 @@ def test_a_program_with_node_states_has_the_same_joint_prior(tmp_path):
     run = settings(tmp_path, None, ("problem.initial_state=equilibrium",))
     known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
     problem = add_baseline_prior(build_problem(run), known)
-    rolled, program = (solve(problem, method) for method in (GaussNewton(), MultipleShooting()))
+    rolled, program = (fit_problem(problem, method) for method in (GaussNewton(), MultipleShooting()))
     assert program.cost == pytest.approx(rolled.cost, rel=1e-6)
     assert program.x == pytest.approx(rolled.x, rel=1e-3)

@@ -330,7 +330,9 @@ def test_an_arm_alone_with_efforts_is_identified_as_written(bench: Path, monkeyp
         assert found[name]["free"], name
         assert abs(found[name]["value"] - value) < max(4 * found[name]["std"], 0.03 * abs(value)), name
     # fits of friction laws leave wrong minima
-    monkeypatch.setattr("yid_ocp.workflow.friction.solve", lambda *_, restarts: pytest.fail(f"restarts: {restarts}"))
+    monkeypatch.setattr(
+        "yid_ocp.workflow.friction.fit_problem", lambda *_, restarts: pytest.fail(f"restarts: {restarts}")
+    )
     with pytest.raises(pytest.fail.Exception, match="restarts: True"):
         main(["friction", "run.yaml", "--out", "laws"])
 

@@ -10,7 +10,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.errors import DataError
-from yid_ocp.solvers import solve
+from yid_ocp.solvers import fit_problem
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import _is_modelled, all_issues_of_one_recording, build_problem
 
@@ -72,7 +72,7 @@ def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
     doubt = Issue("effort_sign", "made up", "not_trusted", 5.0, "", "damaged")
     for severity, verdict in (("warning", "identifiable"), ("not_trusted", "not_trusted")):
         said = problem.with_options(replace(problem.options, data_issues=(replace(doubt, severity=severity),)))
-        solution = solve(said, run.solver)
+        solution = fit_problem(said, run.solver)
         assert solution.goodness_of_fit.explains
         assert solution.goodness_of_fit.data_trusted == (severity == "warning")
         assert solution.parameters["shoulder.stiffness"].verdict == verdict

@@ -228,7 +228,7 @@ def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[Estima
             if std is not None and len(group.t) > 1 and std > 0.5 * median_sample_period(group.t):
                 late[i, group.name] = 0.0, float(std)
     for _ in range(_N_RELINEARIZATIONS if late else 0):
-        fit = solvers.solve(problem, restarts=False, verdicts=False)
+        fit = solvers.fit_problem(problem, restarts=False, verdicts=False)
         if fit.evaluation is None:
             break
         held_out = problem.predict_held_out(fit.x)

@@ -24,7 +24,7 @@ from yid_ocp.inference.whitening import problem_without_input_errors
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
+from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, fit_problem
 from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
 
 _MEMORY_SAMPLING_PERIOD = 0.02
@@ -105,7 +105,7 @@ def compare_methods(
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
             told = listener(solver.name, max(deadline - time.perf_counter(), 0.0) / (len(solvers) - i))
-            solution = solve(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
+            solution = fit_problem(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
         if whole.has_process_noise:
             solution = replace(solution, parameters=mark_free_estimates_not_trusted(solution.parameters))
         taken = time.perf_counter() - wall, time.process_time() - cpu, memory.peak

@@ -47,7 +47,7 @@ def solve(
 ) -> Solution:
     """Solve an estimation problem and return the estimates, uncertainty and verdicts that the command `solve` reports.
 
-    The steps are: the best fit of several starts (`solvers.solve`); a refit without cable memory if the recordings do
+    The steps are: the best fit of several starts (`fit_problem`); a refit without cable memory if the recordings do
     not support it; profile-likelihood intervals of weakly determined parameters; the errors of the discretisations in
     `problem.options.checked_discretisations`, which are added to the standard deviations. Verdicts are `not_trusted` if
     clocks drift, or if a prediction without a model has a smaller error than the model. A search that does not converge
@@ -67,7 +67,7 @@ def solve(
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
     text = f"solving for {len(problem.initial_unknowns)} unknowns by {solver.name}"
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
-    found = solvers.solve(problem, solver, initial_unknowns, callback, limits)
+    found = solvers.fit_problem(problem, solver, initial_unknowns, callback, limits)
     safe = choose_cable_memory_fit(problem, solver, found, limits)
     solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
     checks = replace(solution.checks or EstimateChecksBeyondFit(), cable_memory_message=safe.message)
@@ -201,7 +201,7 @@ def choose_cable_memory_fit(
         return CableMemoryChoice(problem, solution)
     without = problem_without_cable_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
-    other = solvers.solve(without, solver, without.unknown_vector(known).tolist(), limits=limits)
+    other = solvers.fit_problem(without, solver, without.unknown_vector(known).tolist(), limits=limits)
     if other.evaluation is None:
         return CableMemoryChoice(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:

@@ -47,7 +47,7 @@ from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.measurements import ResidualAndJacobian
-from yid_ocp.solvers import GaussNewton, Solution, solve
+from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
 _MIN_FALL_OF_EXCESS = 0.25  # fraction of the excess over noise that a finer discretisation must remove
@@ -382,7 +382,7 @@ def fit_nominal_model(
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
-    solution = solution or solve(problem, GaussNewton(max_iterations=30), verdicts=False)
+    solution = solution or fit_problem(problem, GaussNewton(max_iterations=30), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
 

@@ -112,7 +112,7 @@ class CorrectedInputs:
         return list(zip(later, range(len(driven)), strict=False))
 
 
-class InputCorrectionFunctions:
+class _InputCorrectionFunctions:
     """A set of compiled functions from recorded to true inputs and times, defined by the system's effects.
 
     `names` are the parameters for which derivatives are available. Methods return derivatives by some of them.
@@ -316,7 +316,7 @@ class ModelFunctions:
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:
         self.step = step
         self.parameter_names, self._start_parameters = names, start_parameters
-        self.input_corrections = InputCorrectionFunctions(step.system, names, step.is_compiled)
+        self.input_corrections = _InputCorrectionFunctions(step.system, names, step.is_compiled)
         self._statics = CasadiLockedCache[None, EquilibriumSolver](lambda _: EquilibriumSolver(step))
         self._start_fit = CasadiLockedCache[None, InitialStateFitter](
             lambda _: InitialStateFitter(step, start_parameters)

@@ -1,4 +1,4 @@
-"""The function `solve`, the solver interface, and the solution with its status and history."""
+"""The function `fit_problem`, the solver interface, and the solution with its status and history."""
 
 from __future__ import annotations
 
@@ -274,7 +274,7 @@ _MAX_LINEARIZATIONS, _SHORT_STEP_STDS, _LAST_STEP_STDS, _LEAST_FACTOR, _MIN_STEP
 _SAME_MINIMUM_STDS, _MIN_COST_GAIN_OF_START, _MAX_COST_RATIO_OF_START = 2.0, 0.005, 1.15
 
 
-def solve(
+def fit_problem(
     problem: EstimationProblem,
     solver: Solver | None = None,
     initial_unknowns: Sequence[float] | None = None,

@@ -33,7 +33,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
 from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME
-from yid_ocp.solvers import Solution, solve
+from yid_ocp.solvers import Solution, fit_problem
 from yid_ocp.solvers.base import Iterate
 from yid_ocp.workflow import prediction_outputs, run_history, run_inputs
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
@@ -82,7 +82,7 @@ def run_diagnose(
             if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
                 # in units of noise, the solver would reject any fit and restart
                 logged.begin_stage("solving the nominal model", 5.0, 16.0)
-                nominal = solve(problem, run.solver, callback=logged.report_iterate)
+                nominal = fit_problem(problem, run.solver, callback=logged.report_iterate)
             finding = diagnose(
                 _with_noise_only_stds(problem, run),
                 run.diagnosis.candidates,

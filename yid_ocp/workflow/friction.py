@@ -13,7 +13,7 @@ from yid_ocp.display import Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import Solution, Status, solve
+from yid_ocp.solvers import Solution, Status, fit_problem
 from yid_ocp.workflow.build import friction_joint_names, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
@@ -45,7 +45,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         problems = friction_law_comparison.problems_with_common_samples(problems)
         for (law, settings), problem in zip(by_law.items(), problems, strict=True):
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
-            solution = solve(problem, run.solver, restarts=not problem.system.driven)
+            solution = fit_problem(problem, run.solver, restarts=not problem.system.driven)
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
                 continue

@@ -72,7 +72,7 @@ def solve_and_decide_cable_memory(
     """Fit the problem with the run's solver, for a cable with or without its shape memory, and return the choice."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
-    found = solvers.solve(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
+    found = solvers.fit_problem(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
     return estimation.choose_cable_memory_fit(problem, run.solver, found, limits)
 
 
