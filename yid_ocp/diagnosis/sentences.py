@@ -196,15 +196,16 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
-    """An effect with its estimates, and a warning if one is far outside its expected range."""
-    values, odd = [], ""
+    """An effect with its estimates, and warnings if one is far outside its expected range or no size is determined."""
+    values, odd, neutral = [], "", effect.neutral_values
     for name, r in effect.parameters_as_reported(fit.values, fit.std).items():
         known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
     for name in fit.implausible_parameters(effect, limits):
         low, high = effect.prior_ranges[name]
         odd = f" (far outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
-    return f"{effect.label} with {', '.join(values)}{odd}"
+    is_unsure = all(abs(fit.values[n] - neutral[n]) <= fit.std.get(n, 0.0) for n in effect.amplitude_parameter_names)
+    return f"{effect.label} with {', '.join(values)}{odd}{' (its size is not determined by these data)' * is_unsure}"
 
 
 def _remains(result: DiagnosisResult) -> list[str]:
