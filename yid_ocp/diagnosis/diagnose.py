@@ -50,7 +50,6 @@ from yid_ocp.problem.measurements import ResidualAndJacobian
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
-_MIN_FALL_OF_EXCESS = 0.25  # fraction of the excess over noise that a finer discretisation must remove
 _MIN_FORCE_EVENT_GAP_FRACTION = 0.1  # of the gap that force events must remove
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
@@ -165,13 +164,13 @@ def _examined(
 def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined | None:
     """The nominal model, examined again at half the time step or without the error of the links.
 
-    None if neither lowers r'r of a fit by half of what a candidate would (`gap`), by a quarter of its excess over
-    noise, and significantly, or if the data lack the error of the links already.
+    None if neither lowers r'r of a fit significantly, and by half of what a candidate would (`gap`), or if the data
+    lack the error of the links already.
     """
     if seen.is_corrected_for_links:
         return None
-    excess, fall = 2 * fit.cost - fit.residual_count, _fall_at_half_time_step(seen.search, fit, seen.events)
-    least = max(gap / 2, _MIN_FALL_OF_EXCESS * excess, 2 * seen.search.thresholds.min_log_bayes_factor)
+    fall = _fall_at_half_time_step(seen.search, fit, seen.events)
+    least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
     if fall > least:
         return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
     return _without_error_of_links(seen, fit, least)
