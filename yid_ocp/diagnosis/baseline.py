@@ -178,8 +178,9 @@ def problem_with_earlier_runs(
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
         baseline = EarlierRunsBaseline.from_run_estimates(runs, ())
     known = baseline.combined_estimates
-    has_prior = bool(problem.options.multivariate_prior.parameter_names)
-    return problem if known is None or has_prior else add_baseline_prior(problem, known), baseline
+    if known is not None and not problem.options.multivariate_prior.parameter_names:
+        problem = add_baseline_prior(problem, known)
+    return problem, baseline
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:

@@ -296,7 +296,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_from_baseline(nominal, limits))
     judged = judge(search, evidence)
     # what is left beside an effect may be the error of the discretisation
-    for entry in judged.selected_effects[-2:][:1]:
+    is_in_time = time.perf_counter() < search.deadline  # a search that begins anew would find nothing
+    for entry in judged.selected_effects[-2:][:is_in_time]:
         own = entry.refitted_model
         scores = search.record.screenings.get(f"beside {hypotheses.join_effect_labels(own.effects)}")
         fit = scores and refit_with_effects(search.problem, own.effects, own.values)
