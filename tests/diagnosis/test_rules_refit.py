@@ -390,7 +390,7 @@ def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting)
 )
 def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, solved):
     def solution(value):
-        return SimpleNamespace(unknown_names=("k",), x=np.array([value]))
+        return SimpleNamespace(unknown_names=("k",), x=np.array([value]), problem=None)
 
     asked = []
     monkeypatch.setattr(diagnosing, "fit_problem", lambda *given, **how: asked.append(given) or solution(2.0))

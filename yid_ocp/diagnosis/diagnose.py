@@ -256,8 +256,10 @@ def _happened(
     """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.unknowns
     guesses = fit.evaluation.equilibrium_guesses
-    judged = problem_with_whitening_at(own, x, guesses)
-    residual = judged.evaluate(x, False, guesses)
+    judged, residual = fit.problem, fit.evaluation
+    if any(a.measurements is not b.measurements for a, b in zip(judged.episodes, own.episodes, strict=True)):
+        judged = problem_with_whitening_at(own, x, guesses)
+        residual = judged.evaluate(x, False, guesses)
     if not residual.ok:
         return NO_EVENTS, None
     test = _null_test(judged, residual.residual, len(fit.values), limits)
@@ -384,6 +386,10 @@ def fit_nominal_model(
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
     solution = solution or fit_problem(problem, GaussNewton(max_iterations=30), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
+    if solution.problem is not None and composed.problem.has_process_noise:
+        pairs = zip(composed.problem.episodes, solution.problem.episodes, strict=True)
+        episodes = [replace(episode, input_errors=own.input_errors) for episode, own in pairs]
+        composed = replace(composed, problem=composed.problem.with_episodes(episodes, composed.problem.held_out))
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
 
 

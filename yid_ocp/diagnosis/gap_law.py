@@ -183,7 +183,7 @@ def _refitted_families(
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
     composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_FRACTIONS_BEFORE_FAILURE[0])
-    composed = composed.with_whitening_linearized_at(last.values)
+    composed = composed.with_whitening_linearized_at(last.values, last.effects)
     before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
     if before is None:
         return None, []

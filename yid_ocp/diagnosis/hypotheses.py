@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import Progress
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
@@ -192,15 +192,23 @@ class AllCandidatesProblem:
             largest[segment.name] = max(float(np.abs(state[:, index]).max()) for state in states)
         return tuple(effect.with_prior_ranges_for_largest_angles(largest) for effect in self.candidate_effects)
 
-    def with_whitening_linearized_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
-        """Return the problem whitened by sensor and input noise, with filters linearised at the parameters `values`."""
+    def with_whitening_linearized_at(
+        self, values: Mapping[str, float], effects: Sequence[EffectBase] = ()
+    ) -> AllCandidatesProblem:
+        """Return the problem whitened by sensor and input noise, with filters linearised at the parameters `values`.
+
+        `effects` are those that are not neutral at `values`.
+        """
         if not self.problem.has_process_noise:
             return self
+        # filters of the nominal step are those of all candidates, which are neutral
+        made = (self if effects else self.restricted_to_effects(())).problem
         # filters are linearised about the estimated torques, so these must be known first
-        x, errors = self.problem.unknown_vector(values), (episode.input_errors for episode in self.problem.episodes)
+        x, errors = made.unknown_vector(values), (episode.input_errors for episode in made.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
-        made = problem_with_whitening_at(self.problem, x, rounds=1 if known else 2)
-        return replace(self, problem=problem_with_held_out_kalman_whitening(made, x))
+        made = problem_with_held_out_kalman_whitening(problem_with_whitening_at(made, x, rounds=1 if known else 2), x)
+        made = problem_with_reestimated_held_out_torque_biases(problem_relinearized_at_torque_bias(made, x, x), x, x)
+        return replace(self, problem=_with_filters_of_part(self.problem, made))
 
     def with_time_step(self, time_step: float, with_held_out: bool = True) -> AllCandidatesProblem:
         """Return the problem with another time step [s] and untruncated recordings, whitened by sensor noise alone."""
@@ -283,13 +291,38 @@ def compose_candidates(
     return replace(composed, candidate_effects=tuple(_exclude_candidates(composed.candidate_effects, leave_out)))
 
 
+def _states_of_part(whole: System, part: System) -> tuple[IntArray, IntArray]:
+    """Return the indices in `whole` of the states, and of the coordinates, of a system with some of its effects."""
+    n, hidden = whole.n_coordinates, [*whole.effect_internal_coordinate_symbols]
+    joints = np.array([whole.mechanism.joint_index(name) for name in part.mechanism.joint_names], np.int64)
+    inner = np.array([2 * n + hidden.index(name) for name in part.effect_internal_coordinate_symbols], np.int64)
+    return np.concatenate([joints, n + joints, inner]), joints
+
+
+def _with_filters_of_part(problem: EstimationProblem, part: EstimationProblem) -> EstimationProblem:
+    """Return the problem with input errors and filters of the same problem on a step of fewer effects."""
+    kept, joints = _states_of_part(problem.system, part.system)
+
+    def placed(episode: Episode, own: Episode) -> Episode:
+        guess = own.equilibrium_guess
+        if guess is not None:
+            guess = np.zeros(problem.system.n_coordinates)
+            guess[joints] = own.equilibrium_guess
+        return replace(episode, input_errors=own.input_errors, equilibrium_guess=guess)
+
+    def masked(own: ProcessNoiseWhitener | None) -> ProcessNoiseWhitener | None:
+        if not isinstance(own, WhiteningFilter):
+            return own
+        return replace(own, state_mask=np.isin(np.arange(problem.step.sizes["nx"]), kept[own.state_mask]))
+
+    episodes, held_out = map(placed, problem.episodes, part.episodes), map(placed, problem.held_out, part.held_out)
+    made = (list(map(masked, own)) for own in (part.whitening_filters, part.held_out_whitening_filters))
+    return problem.with_episodes(list(episodes), list(held_out), *made)
+
+
 def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFunctions) -> EstimationProblem | None:
     """Return the problem on a step of fewer effects. None if its whitening filters have states that the step lacks."""
-    whole, part, n = problem.system, functions.step.system, problem.system.n_coordinates
-    joints = np.array([whole.mechanism.joint_index(name) for name in part.mechanism.joint_names], np.int64)
-    hidden = [*whole.effect_internal_coordinate_symbols]
-    inner = np.array([2 * n + hidden.index(name) for name in part.effect_internal_coordinate_symbols], np.int64)
-    kept = np.concatenate([joints, n + joints, inner])
+    kept, joints = _states_of_part(problem.system, functions.step.system)
     filters = [own for own in (*problem.whitening_filters, *problem.held_out_whitening_filters) if own is not None]
     if any(isinstance(own, WhiteningFilter) and np.delete(own.state_mask, kept).any() for own in filters):
         return None

@@ -225,7 +225,7 @@ class RefitContext:
         # parameters shared by both sets of recordings, without initial states
         names = (*problem.free, *(name for effect in fit.effects for name in effect.parameters.names))
         start = {name: fit.values[name] for name in fit.values.keys() & names}
-        whitened = turned.with_whitening_linearized_at(fit.values)
+        whitened = turned.with_whitening_linearized_at(fit.values, fit.effects)
         return refit_with_effects(whitened, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
