@@ -205,12 +205,16 @@ class _State:
     """Result for all recordings at given variances: also `shift` of the scaled free parameters, covariance `spread`."""
 
     filtered: tuple[_Filtered, ...]
-    recordings: tuple[_Smoothed, ...]
     shift: Array
     spread: Array
     log_evidence: float
     # largest log evidence with one more group, and the group's variance
     larger: dict[SmoothedUnknownGroup, tuple[float, float]] = field(default_factory=dict)
+
+    @cached_property
+    def recordings(self) -> tuple[_Smoothed, ...]:
+        """Smoothed recordings, without those whose filter is ill-conditioned."""
+        return tuple(map_in_threads(_backwards, [done for done in self.filtered if done.updates]))
 
     def largest_evidences(self, sources: _Groups) -> list[tuple[float, float]]:
         """Result of `_largest_evidence` for each of several groups, added alone to the groups of these variances."""
@@ -220,17 +224,15 @@ class _State:
 
 
 def _run(models: _Models, variance: _Variances) -> _State:
-    """Smooth all recordings at given variances. `recordings` is incomplete if a filter is ill-conditioned."""
+    """Filter all recordings at given variances."""
 
-    def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
-        done = _forwards(model, model.prior_variances_of_unknowns(variance), True)
-        return done, _backwards(done) if done.updates else None
+    def run(model: LinearResidualModel) -> _Filtered:
+        return _forwards(model, model.prior_variances_of_unknowns(variance), True)
 
-    filtered, smoothed = zip(*map_in_threads(run, models), strict=True)
+    filtered = tuple(map_in_threads(run, models))
     products = np.sum([done.products for done in filtered], axis=0)
     evidence, shift, information = _judged(products, sum(done.log_determinant for done in filtered))
-    known = tuple(done for done in smoothed if done is not None)
-    return _State(filtered, known, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
+    return _State(filtered, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
 
 
 def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
