@@ -144,6 +144,7 @@ def _examined(
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
+    composed = replace(composed, changes_by_encoder_noise={})
     nominal = replace(nominal, held_out_loss=held_out_loss(own, nominal.unknowns, nominal.evaluation, spread))
     try:
         screened = screen_candidates(composed, (), nominal.values)

@@ -120,6 +120,7 @@ _FLAT_RAMP_FRACTION = 0.5  # fraction of a flat-topped pulse's duration in which
 _MAX_PROFILES = 12  # largest number of pulses and similar profiles in one history
 MAX_EVENT_TIME_FRACTION = 1 / 3
 """Fraction of the time above which short forces are not events, because model error dominates."""
+_SAMPLES_PER_BLOCK = 4096  # of profiles that are filtered at once
 _MIN_PROMINENCE_RATIO = 1.5  # smallest ratio of a pulse's size to the median size at all times; above that of a sine
 _MAX_PULSE_RANGE_RATIO = 1.5  # largest ratio of a pulse to the range of the history around it
 
@@ -237,10 +238,12 @@ class _Filter:
         count = last - first
         column = np.repeat(np.arange(len(count)), count)
         row = np.arange(len(column)) - np.repeat(np.cumsum(count) - count - first, count)
-        return scipy.sparse.csc_array((self._seen(windows[column], t[row]), (row, column)), shape=(len(t), len(count)))
+        parts = np.array_split(np.arange(len(row)), len(row) // _SAMPLES_PER_BLOCK + 1)
+        seen = np.concatenate([self._seen(windows[column[part]], t[row[part]]) for part in parts])
+        return scipy.sparse.csc_array((seen, (row, column)), shape=(len(t), len(count)))
 
     def _seen(self, windows: _Windows, t: Array) -> Array:
-        return sum((w * windows.at(t - d) for d, w in zip(self.delay, self.weight, strict=True)), np.zeros(()))
+        return np.asarray(windows[..., None].at(t[..., None] - self.delay) @ self.weight)
 
 
 @dataclass(frozen=True)

@@ -109,8 +109,10 @@ def linearize_candidates(
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
     redrawn = [null_test.episodes_with_added_path_noise(placed, rng) for _ in draws]
+    # changes by encoder noise hardly depend on the effects in the model
+    known = {} if problem.changes_by_encoder_noise is None else problem.changes_by_encoder_noise
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
-    for shapes in itertools.zip_longest(*map(_shape_grid, tried)):
+    for point, shapes in enumerate(itertools.zip_longest(*map(_shape_grid, tried))):
         chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]
         amplitudes = [name for effect, _ in chosen for name in effect.amplitude_parameter_names]
         trial = placed.with_free_parameters_without_recompiling((*placed.free, *amplitudes))
@@ -123,15 +125,21 @@ def linearize_candidates(
         places = [trial.unknown_names.index(name) for name in amplitudes]
         basis = _basis(np.delete(jacobian, places, axis=1))
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
-        errors, shifts = [], []
-        for again in (trial.with_episodes(episodes, ()) for episodes in redrawn):
-            outcome = again.evaluate(again.unknown_vector(values))
-            if outcome.ok:
-                other, slopes = residual_and_jacobian_without_weak_priors(again, outcome)
-                change = (slopes - jacobian)[:, places]
-                errors.append((other - data)[rows.data] * ~is_in_scatter)
-                shifts.append(change - basis @ (basis.T @ change))
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
+        if point not in known:
+            known[point] = []
+            for again in (trial.with_episodes(episodes, ()) for episodes in redrawn):
+                outcome = again.evaluate(again.unknown_vector(values))
+                if outcome.ok:
+                    other, slopes = residual_and_jacobian_without_weak_priors(again, outcome)
+                    changes = np.split((slopes - jacobian)[rows.data][:, places], edges, axis=1)
+                    by_label = {effect.label: own for (effect, _), own in zip(chosen, changes, strict=True)}
+                    known[point].append(((other - data)[rows.data] * ~is_in_scatter, by_label))
+        errors, shifts = [error for error, _ in known[point]], []
+        for _, by_label in known[point]:
+            change = np.zeros_like(moved)
+            change[rows.data] = np.hstack([by_label[effect.label] for effect, _ in chosen])
+            shifts.append(change - basis @ (basis.T @ change))
         parts = zip(*(np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, *shifts)), strict=True)
         for (effect, shape), (columns, *shifted) in zip(chosen, parts, strict=True):
             driven = columns[rows.data].T @ scatter
