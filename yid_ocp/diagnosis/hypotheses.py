@@ -133,7 +133,7 @@ class AllCandidatesProblem:
     # functions of the nominal system with some candidates, by their labels and the time step [s]
     functions_of_some: CasadiLockedCache[tuple[tuple[str, ...], float], ModelFunctions] | None = None
     held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
-    # of screenings that share them, by point of the shape grid: changes of residual and, by label, signatures (n, k)
+    # of screenings that share them, by point of the shape grid: changes of residual and, by unknown, Jacobian (n,)
     changes_by_encoder_noise: dict[int, list[tuple[Array, dict[str, Array]]]] | None = None
 
     @staticmethod

@@ -123,7 +123,7 @@ def linearize_candidates(
         warm = evaluation.equilibrium_guesses
         data, jacobian = residual_and_jacobian_without_weak_priors(trial, evaluation)
         places = [trial.unknown_names.index(name) for name in amplitudes]
-        basis = _basis(np.delete(jacobian, places, axis=1))
+        basis, follow = _basis_and_coefficients(np.delete(jacobian, places, axis=1), jacobian[:, places])
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
         if point not in known:
@@ -132,14 +132,16 @@ def linearize_candidates(
                 outcome = again.evaluate(again.unknown_vector(values))
                 if outcome.ok:
                     other, slopes = residual_and_jacobian_without_weak_priors(again, outcome)
-                    changes = np.split((slopes - jacobian)[rows.data][:, places], edges, axis=1)
-                    by_label = {effect.label: own for (effect, _), own in zip(chosen, changes, strict=True)}
-                    known[point].append(((other - data)[rows.data] * ~is_in_scatter, by_label))
-        errors, shifts = [error for error, _ in known[point]], []
-        for _, by_label in known[point]:
-            change = np.zeros_like(moved)
-            change[rows.data] = np.hstack([by_label[effect.label] for effect, _ in chosen])
-            shifts.append(change - basis @ (basis.T @ change))
+                    by_name = dict(zip(trial.unknown_names, (slopes - jacobian)[rows.data].T, strict=True))
+                    known[point].append(((other - data)[rows.data] * ~is_in_scatter, by_name))
+        errors, shifts = [], []
+        for (_, first), (error, own) in zip(known[0], known[point], strict=False):
+            change = np.stack([(first | own).get(name, np.zeros_like(error)) for name in trial.unknown_names], axis=1)
+            # the part of a signature that free parameters explain changes with their own signatures
+            shift = np.zeros_like(moved)
+            shift[rows.data] = change[:, places] - np.delete(change, places, axis=1) @ follow
+            shifts.append(shift - basis @ (basis.T @ shift))
+            errors.append(error)
         parts = zip(*(np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, *shifts)), strict=True)
         for (effect, shape), (columns, *shifted) in zip(chosen, parts, strict=True):
             driven = columns[rows.data].T @ scatter
@@ -154,11 +156,17 @@ def linearize_candidates(
     return ProjectedCandidatesLinearization(residual, tuple(signatures))
 
 
-def _basis(matrix: Array) -> Array:
-    """Orthonormal basis of the columns, without linearly dependent columns."""
+def _basis_and_coefficients(matrix: Array, columns: Array) -> tuple[Array, Array]:
+    """Orthonormal basis of the columns of a matrix (n, m), and the coefficients (m, k) of their fit to other columns.
+
+    Linearly dependent columns are left out of the basis.
+    """
     size = np.linalg.norm(matrix, axis=0)
-    u, singular, _ = np.linalg.svd(matrix[:, size > 0] / size[size > 0], full_matrices=False)
-    return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
+    scale = np.where(size > 0, size, 1.0)
+    u, singular, vt = np.linalg.svd(matrix / scale, full_matrices=False)
+    kept = singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)
+    basis = np.asarray(u[:, kept])
+    return basis, (vt[kept].T / singular[kept]) @ (basis.T @ columns) / scale[:, None]
 
 
 def _candidate_detectable_amplitudes(point: ProjectedCandidatesLinearization) -> tuple[CandidateDetectability, ...]:
