@@ -168,6 +168,21 @@ def test_a_gear_does_not_give_way_to_the_noise_of_an_effort_that_is_compared(urd
     assert np.mean(np.square(sizes)) < 2.0
 
 
+def test_a_gear_gives_way_to_its_load_and_not_to_the_noise_of_encoders(urdf_folder):
+    """Loads that follow from noisy angles are differentiated twice, and again where the gear gives way to them."""
+    name, true, path = "series_elasticity@elbow.compliance", 0.02, motion()
+    step = pendulum_step(urdf_folder, [("series_elasticity", "elbow", {"compliance": 0.0})], prescribed=JOINTS)
+    effort, sizes = needed(pendulum_step(urdf_folder, prescribed=JOINTS), path), []
+    for seed in range(4):
+        noise = np.random.default_rng(seed).standard_normal((2, *path.shape))
+        seen, read = path + true * effort * [0, 1] + 2e-4 * noise[0], effort + 0.02 * noise[1]
+        given = {"angle": 2e-4, "std": 0.02, "free": (name,), "cutoff": 15.0, "values": {name: true}}
+        found = (problem := arm(step, seen, read, **given)).evaluate(problem.initial_unknowns)
+        slope = found.jacobian[:, 0]
+        sizes.append(1 - slope @ found.residual / (slope @ slope) / true)
+    assert np.mean(sizes) == pytest.approx(1.0, abs=0.1)
+
+
 def test_dry_friction_needs_no_time_to_turn(urdf_folder):
     """Measured efforts are smoothed: a prediction that is not has other steps where the motion turns."""
     friction = [("joint_coulomb", "elbow", {"tau_c": 0.4})]

@@ -26,6 +26,8 @@ from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
+_LOAD_CUTOFF_FRACTION = 0.4
+"""Fraction of the filter's cutoff above which loads of a model are noise: that of its encoders, differentiated twice."""
 _MIN_PATH_CUTOFF, _MAX_CUTOFF_OVER_RATE = 10.0, 0.2  # [Hz], and as a fraction of the sample rate
 _NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion in a frequency band
 
@@ -134,7 +136,7 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
         hint = "write the attribute in all recordings, or remove it from all and set parameters `*.servo_gain_factor`"
         where = f"recording '{silent[0]}': joints, attribute proportional_gain"
         raise DataError(what, where=where, allowed="the gain in all recordings, or in none", hint=hint)
-    return found
+    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
 
 
 def _courses(
@@ -221,13 +223,14 @@ def smoothed_joint_efforts(
 
 
 def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Remove effort noise from gear loads: return the model's loads plus the slow part of measured minus model.
+    """Remove noise from gear loads: return the model's loads plus the slow part of measured minus model, low-passed.
 
     `measured` and `model` are smoothed loads (N + 1, k). Before the first and after the last of `nodes` (M,), their
     difference is taken as constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
     """
     gap = (measured - model)[np.clip(np.arange(len(model)), nodes.min(), nodes.max())]
-    return measured - gap + ZeroPhaseLowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
+    found = measured - gap + ZeroPhaseLowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
+    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
 
 
 def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
@@ -263,7 +266,7 @@ def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> di
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):
             found.setdefault(" and ".join(missing), []).append(kind)
-    return found
+    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
 
 
 def prescribed_coordinates_at_nodes(
