@@ -136,7 +136,7 @@ def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recordi
         hint = "write the attribute in all recordings, or remove it from all and set parameters `*.servo_gain_factor`"
         where = f"recording '{silent[0]}': joints, attribute proportional_gain"
         raise DataError(what, where=where, allowed="the gain in all recordings, or in none", hint=hint)
-    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
+    return found
 
 
 def _courses(
@@ -230,7 +230,7 @@ def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: A
     """
     gap = (measured - model)[np.clip(np.arange(len(model)), nodes.min(), nodes.max())]
     found = measured - gap + ZeroPhaseLowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
-    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
+    return found
 
 
 def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
