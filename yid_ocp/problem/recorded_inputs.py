@@ -230,7 +230,7 @@ def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: A
     """
     gap = (measured - model)[np.clip(np.arange(len(model)), nodes.min(), nodes.max())]
     found = measured - gap + ZeroPhaseLowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
-    return found
+    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
 
 
 def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
@@ -266,7 +266,7 @@ def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> di
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):
             found.setdefault(" and ".join(missing), []).append(kind)
-    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
+    return found
 
 
 def prescribed_coordinates_at_nodes(
