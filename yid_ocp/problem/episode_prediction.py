@@ -30,7 +30,7 @@ from yid_ocp.problem.model_functions import (
     second_difference_acceleration_adjoint,
 )
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.recorded_inputs import denoised_gear_loads, mean_step_input_delay_derivative, mean_step_inputs
+from yid_ocp.problem.recorded_inputs import mean_step_input_delay_derivative, mean_step_inputs
 from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
@@ -485,15 +485,8 @@ class _Trajectory:
     by_multipliers: Array | None
 
 
-def episode_at_equilibrium_with_denoised_gear_loads(
-    predictor: EpisodePredictor, episode: Episode, theta: Array
-) -> Episode:
-    """Return an episode that starts at the equilibrium near its first points, with gear loads without effort noise."""
-    return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
-
-
-def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Episode with a guess of the equilibrium near its first points: that of least energy at `theta` if it is near."""
+def episode_with_equilibrium_guess(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """Return an episode with a guess of the equilibrium near its first points: that of least energy if it is near."""
     fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
     early = None if fitted or not predictor.system.grasps else _until_first_points(episode)
     if early is None:
@@ -543,24 +536,6 @@ def _first_points_error(predictor: EpisodePredictor, early: Episode, theta: Arra
     pairs = zip(early.measurements, found.predicted_outputs, strict=True)
     squares = [samples.whitened_residual(read)[samples.positive_weight_mask] ** 2 for samples, read in pairs]
     return float(np.sqrt(np.mean(np.concatenate(squares))))
-
-
-def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """The episode with the model's gear loads of joints whose efforts are compared (`denoised_gear_loads`)."""
-    compared = [s for s in episode.measurements if s.sensor.effort_joints]
-    corrections = predictor.model_functions.input_corrections
-    if not compared or not corrections.angles_depend_on_effort:
-        return episode
-    result = predictor.predict_episode(episode, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
-    if isinstance(result, str):
-        return episode
-    load, own = episode.joint_loads.copy(), predictor.rollout_node_values(result.rollout).load
-    for samples in compared:
-        at = [corrections.joint_names.index(joint) for joint in samples.sensor.effort_joints]
-        column = [predictor.system.mechanism.joint_index(joint) for joint in samples.sensor.effort_joints]
-        cutoff = predictor.options.path_cutoff
-        load[:, at] = denoised_gear_loads(load[:, at], own[:, column], samples.node, episode.grid.node_times, cutoff)
-    return replace(episode, joint_loads=load)
 
 
 def sensor_not_predictable_at_nodes_error(group: str) -> SolverError:

@@ -40,6 +40,10 @@ from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_ef
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors import joints as joint_sensors
 
+# Efforts of joints moved as measured are noisy and compared with predictions, so gears give way to slow parts of them
+# only: below this fraction of the cutoff of the path, whose accelerations would contain the noise of faster parts.
+_GEAR_LOAD_CUTOFF_FRACTION = 0.25
+
 
 @dataclass(frozen=True)
 class EpisodePrediction:
@@ -245,7 +249,9 @@ def prepare_episode(
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))
     if functions.input_corrections.angles_depend_on_effort:
-        load = smoothed_joint_efforts(recording, known, grid, low_pass)
+        slower = ZeroPhaseLowPassFilter(_GEAR_LOAD_CUTOFF_FRACTION * options.path_cutoff)
+        parts = (system.driven, low_pass), (system.prescribed, slower)
+        load = np.hstack([smoothed_joint_efforts(recording, names, grid, own) for names, own in parts if names])
     known_parameters = options.parameters_by_recording.get(recording.name, {})
     start = errors = None
     if (state := options.known_initial_states.get(recording.name)) is not None:

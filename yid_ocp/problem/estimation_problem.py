@@ -16,7 +16,7 @@ from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
-from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_at_equilibrium_with_denoised_gear_loads
+from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_equilibrium_guess
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
@@ -116,7 +116,7 @@ class EstimationProblem(ReprMixin):
         episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
-        finish = partial(episode_at_equilibrium_with_denoised_gear_loads, self.predictor, theta=theta)
+        finish = partial(episode_with_equilibrium_guess, self.predictor, theta=theta)
         ready, other = (tuple(map(finish, group)) for group in (fitted, others))
         check_unique_recording_names([episode.name for episode in ready])
         check_no_known_value_of_free_parameters((*ready, *other), free)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.interpolate
 import scipy.special
 
-from yid_ocp.arrays import Array, BoolArray, IntArray
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period, seen_noise_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
@@ -24,10 +24,6 @@ from yid_ocp.sensors.base import channel_kinds_of_sensor_group
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
-_SLOW_LOAD_CUTOFF_FRACTION = 0.1
-"""Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
-_LOAD_CUTOFF_FRACTION = 0.4
-"""Fraction of the filter's cutoff above which loads of a model are noise: that of its encoders, differentiated twice."""
 _MIN_PATH_CUTOFF, _MAX_CUTOFF_OVER_RATE = 10.0, 0.2  # [Hz], and as a fraction of the sample rate
 _NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion in a frequency band
 
@@ -220,17 +216,6 @@ def smoothed_joint_efforts(
     # the mean of an interval belongs to its centre
     late = 0.0 if joints.effort_sampling_kind_or_default == "sample" else median_sample_period(joints.t) / 2
     return np.stack([np.interp(grid.node_times, joints.t + late, column) for column in effort.T], axis=1)
-
-
-def denoised_gear_loads(measured: Array, model: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Remove noise from gear loads: return the model's loads plus the slow part of measured minus model, low-passed.
-
-    `measured` and `model` are smoothed loads (N + 1, k). Before the first and after the last of `nodes` (M,), their
-    difference is taken as constant. `cutoff` [Hz] is the cutoff frequency of the filter of paths and efforts.
-    """
-    gap = (measured - model)[np.clip(np.arange(len(model)), nodes.min(), nodes.max())]
-    found = measured - gap + ZeroPhaseLowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
-    return ZeroPhaseLowPassFilter(_LOAD_CUTOFF_FRACTION * cutoff)(times, found)
 
 
 def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
