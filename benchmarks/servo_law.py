@@ -75,7 +75,7 @@ def left_out_errors(
     room, zeros = (high - low) / (N_KNOTS - 3), np.zeros(N_KNOTS)
     knots = np.linspace(low - room / 2, high + room / 2, N_KNOTS)
     law = torque_law_from_tables(JOINT, base.system, [TorqueLawTable(quantity, knots, zeros, zeros)], TORQUE_STD)
-    names, known = law.parameters.names, base.named_values(solution.x)
+    names, known = law.parameters.names, base.unknowns.named_values(solution.x)
     step = compile_step_like(base.step, base.system.with_effects([law]))
     nominal = dict(zip(base.system.parameters.names, map(float, base.theta), strict=True))
     recordings = [episode.recording for episode in base.episodes]

@@ -10,7 +10,7 @@ from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualVectorLayout
-from yid_ocp.problem.options import MultivariateGaussianPrior
+from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers.base import Iterate, SolverResult, Status
 
 
@@ -55,18 +55,7 @@ class MadeUp:
         self.shared_parameters, self.local_parameters = self.unknown_names, ()
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.unknown_scales = np.abs(self.initial_unknowns) if scales is None else np.array(scales, float)
-        self.options = SimpleNamespace(
-            has_no_data_issue_above_warning=True,
-            weighting=weighting,
-            prior_stds=dict(priors or {}),
-            known_initial_states={},
-            parameters_by_recording={},
-            initial_state="equilibrium",
-            data_issues=(),
-            stated_std_factor=1.0,
-            path_cutoff=np.inf,
-            multivariate_prior=MultivariateGaussianPrior(),
-        )
+        self.options = ProblemOptions(weighting=weighting, prior_stds=dict(priors or {}), path_cutoff=np.inf)
         self.has_process_noise = False
         values = [*self.initial_unknowns, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
@@ -114,10 +103,13 @@ class MadeUp:
         cost = 0.5 * float(residual @ residual)
         return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
 
-    def truncated_to_duration(self, duration: float) -> MadeUp:
+    def with_episodes(self, episodes: Sequence[SimpleNamespace], held_out: Sequence[SimpleNamespace]) -> MadeUp:
+        return self
+
+    def with_options(self, options: ProblemOptions) -> MadeUp:
         lower, upper = self.bounds
         bounds = {"lower": lower[0], "upper": upper[0]}
-        return MadeUp(self._rows, self.initial_unknowns, **bounds, duration=duration, count=self._count)
+        return MadeUp(self._rows, self.initial_unknowns, **bounds, duration=options.duration, count=self._count)
 
 
 class Steps:

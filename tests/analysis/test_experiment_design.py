@@ -287,7 +287,7 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
     builder, made = built(held_tube, "weld")
     (grasp,), free = made.problem.system.grasps, builder.position_sensitivities_of_variant(frozenset())
     assert grasp.kind == "weld"
-    start = free.problem.initial_state_and_derivative(
+    start = free.problem.predictor.initial_state_and_derivative(
         free.problem.episodes[0], *free.problem.unpack_episode_unknowns(free.x, 0)
     )
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
@@ -491,7 +491,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
     effort = recording.joints.effort.copy()
     effort[: len(errors.torque_noise)] -= errors.recorded_minus_true_torque
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
-    values = noisy.named_values(noisy.initial_unknowns)
+    values = noisy.unknowns.named_values(noisy.initial_unknowns)
     problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, values)
     weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
     jacobian = residual_and_jacobian_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]

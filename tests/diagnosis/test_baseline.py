@@ -51,7 +51,7 @@ def swing(folder, name, seed, effects="[]"):
     run = load_config(folder / "beam.yaml", (f"model.effects={effects}",))
     problem = build_problem(run)
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
-    values = problem.named_values(problem.unknown_vector({**TRUTH, **start}))
+    values = problem.unknowns.named_values(problem.unknown_vector({**TRUTH, **start}))
     theta, offset = problem.unpack_episode_unknowns(problem.unknown_vector(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)

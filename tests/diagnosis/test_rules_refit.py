@@ -49,6 +49,8 @@ class Problem:
     def problem(self):
         return self
 
+    unknowns = problem
+
     def with_nominal_and_effects_free(self, effects):
         self.freed = tuple(effects)
         return self
@@ -321,17 +323,19 @@ def predicting(monkeypatch):
 
     monkeypatch.setattr(module, "rmse_unit_and_count_by_channel", channel_errors)
 
-    def rows(i, there, result):
+    def rows(there, whitening, result):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)
         residual = np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs])
         return SimpleNamespace(residual=residual, jacobian=np.full((len(residual), 2), [1.0, 7.0]))
 
-    usual = {"whitened_held_out_residual_and_jacobian": rows, "has_process_noise": False, "options": ProblemOptions()}
+    monkeypatch.setattr(module, "whitened_prediction_residual", rows)
+    usual = {"has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": ("k",), "unknown_names": (), "initial_unknowns": np.zeros(0)}
     monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, evaluation: evaluation)
 
     def made(*pairs):
-        return SimpleNamespace(held_out=[e for e, _ in pairs], predict_held_out=lambda x, _: list(pairs), **usual), told
+        own = {"held_out": [e for e, _ in pairs], "held_out_whitening_filters": [None] * len(pairs)}
+        return SimpleNamespace(predict_held_out=lambda x, _: list(pairs), **own, **usual), told
 
     return made
 

@@ -36,6 +36,7 @@ from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.evaluation import whitened_prediction_residual
 from yid_ocp.solvers import GaussNewton, fit_problem
 
 TIME_STEP, STEPS = 0.01, 200
@@ -102,6 +103,10 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     )
 
 
+def held_out_residual(problem, episode, result):
+    return whitened_prediction_residual(episode, problem.held_out_whitening_filters[0], result).residual
+
+
 @cases("held_out", {"held_out": True, "in_blocks": False})
 def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out):
     """Weights are frozen once, about torques that an offset among the effects must not move."""
@@ -123,7 +128,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
     pairs = ((moved, x), (wide, frozen))
     predicted = ((p, p.predict_held_out(at)[0]) for p, at in pairs)
-    own, nominal = (p.whitened_held_out_residual_and_jacobian(0, *found).residual for p, found in predicted)
+    own, nominal = (held_out_residual(p, *found) for p, found in predicted)
     assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
     # and to first order the rows are those of a filter that is worked out there
     again = problem_with_whitening_at(moved, x)
@@ -149,7 +154,7 @@ def test_other_candidates_are_left_out_of_refits(step):
         own = hypotheses.relinearize_held_out_filters(own, [friction], at)
         x = own.unknown_vector(at)
         evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
-        rows = own.whitened_held_out_residual_and_jacobian(0, *held).residual
+        rows = held_out_residual(own, *held)
         found.append((own.unknown_names, evaluation.residual, evaluation.jacobian, rows))
     names, values = zip(*((own[0], own[1:]) for own in found), strict=True)
     assert names[0] == names[1]
@@ -187,7 +192,7 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
     spread = noise_only_covariance_sqrt(fit.problem, fit.evaluation)
     off = fit.problem.unknown_vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
-    moved = replace(fit, values=fit.problem.named_values(off))
+    moved = replace(fit, values=fit.problem.unknowns.named_values(off))
     assert _held_out_null_test_and_spread(moved)[0].p_value < 1e-12
     less = replace(fit.evaluation, jacobian=fit.evaluation.jacobian / 50)
     test, _ = _held_out_null_test_and_spread(replace(moved, evaluation=less))

@@ -17,6 +17,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, fit_problem
@@ -313,6 +314,6 @@ def test_friction_that_holds_a_held_out_arm_is_estimated_from_its_first_efforts(
     still = np.tile([0.3, 0.2], (301, 1))
     problem = arm(step, still, needed(step, still) + np.array([0.0, 0.6 * friction["tau_c"]]))
     held = problem.with_episodes(problem.episodes, problem.episodes)
-    [(episode, _, offset)] = held.held_out_prediction_inputs(problem.initial_unknowns)
+    [(episode, _, offset)] = held_out_prediction_inputs(held, problem.initial_unknowns)
     assert episode.measurements[0].node[0] * 0.01 > 0.2
     assert offset == pytest.approx([0.6], abs=0.01)

@@ -14,6 +14,7 @@ from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import mass_matrix_diagonal_at_zero, truncate_episode
+from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
 from yid_ocp.problem.evaluation import (
     ResidualVectorLayout,
     UnknownVectorLayout,
@@ -56,7 +57,9 @@ def test_blocks_and_values_find_their_places():
     block = np.arange(10.0).reshape(2, 5)
     wide = LAYOUT.scatter_to_unknown_columns(block, 1)
     np.testing.assert_array_equal(wide[1], [5, 6, 0, 0, 0, 7, 8, 9])
-    np.testing.assert_array_equal(LAYOUT.pack_same_for_all_recordings([1, 2], [3], [4, 5]), [1, 2, 3, 4, 5, 3, 4, 5])
+    np.testing.assert_array_equal(
+        LAYOUT.pack_same_for_all_recordings({"a": 1, "b": 2, "l": 3}.get, np.array([4, 5])), [1, 2, 3, 4, 5, 3, 4, 5]
+    )
 
 
 def test_a_recording_has_its_own_values_and_start(make):
@@ -74,7 +77,10 @@ def test_a_recording_has_its_own_values_and_start(make):
 
 def test_start_bounds_and_values_by_name(make):
     problem = make(initial_state="estimated", seeds=(1,))
-    assert problem.named_values(problem.initial_unknowns) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0)}
+    assert problem.unknowns.named_values(problem.initial_unknowns) == {
+        **START,
+        **dict.fromkeys(problem.unknown_names[3:], 0.0),
+    }
     lower, upper = problem.bounds
     assert lower[0] == 0.0
     assert upper[0] == math.inf
@@ -82,7 +88,7 @@ def test_start_bounds_and_values_by_name(make):
     np.testing.assert_array_equal(upper[3:], np.inf)
     found = problem.unknown_vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
     changed = {"elbow.stiffness": 9.0, "shoulder.stiffness": 0.0, "start.q.elbow[run_1]": 0.5}
-    assert problem.named_values(found) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0), **changed}
+    assert problem.unknowns.named_values(found) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0), **changed}
 
 
 def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, free_step):
@@ -95,21 +101,21 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     # two rods: 1/3 m l^2 and more about the shoulder
     assert inertia == pytest.approx([0.0208 + 0.25**2 + 0.008 + 0.6 * 0.7**2, 0.008 + 0.6 * 0.2**2], rel=1e-9)
     expected = [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]]
-    np.testing.assert_allclose(problem.initial_state_prior_std, expected, rtol=1e-9)
+    np.testing.assert_allclose(problem.priors.initial_state_stds, expected, rtol=1e-9)
     found = mass_matrix_diagonal_at_zero(free_step, theta, ("elbow", "shoulder"))
     np.testing.assert_allclose(found, inertia[::-1], rtol=1e-9)
     assert problem.unknown_names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
     assert problem.predictor.estimated_initial_state_entries == (0, 1, 2, 3)
     problem = make()
     assert problem.predictor.estimated_initial_state_entries == ()
-    assert problem.initial_state_prior_std.shape == (0,)
+    assert problem.priors.initial_state_stds.shape == (0,)
     assert problem.unknown_names == FREE
 
 
 def test_stated_priors_are_gaussian_about_the_start(make):
     problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_geometric_std=0.0)
     x = np.array([7.0, 4.0, 0.14])
-    residual, rows = problem.prior_residual_and_jacobian(x)
+    residual, rows = problem.priors.residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [2.0, 2.0])
     np.testing.assert_allclose(rows, [[0.0, 2.0, 0.0], [0.0, 0.0, 50.0]])
     assert problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start == 2
@@ -119,14 +125,14 @@ def test_stated_priors_are_gaussian_about_the_start(make):
 def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
     problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_geometric_std=10.0)
     x = np.array([7.0, 30.0, 0.5])
-    residual, rows = problem.prior_residual_and_jacobian(x)
+    residual, rows = problem.priors.residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [0.5, 1.0])
     np.testing.assert_allclose(rows, [[0.5, 0.0, 0.0], [0.0, 1 / (math.log(10.0) * 30.0), 0.0]])
     assert problem.positive_unknowns_mask.tolist() == [True, True, False]
     rows_of, at = problem.residual_rows, problem.residual_rows.data.stop + 1
     assert (rows_of.weak_priors, rows_of.slice_without_weak_priors) == (slice(at, at + 1), slice(0, at))
     # at its bound the row is one that a step can follow: a thousandth of the start has its value but for 0.65
-    low, slope = problem.prior_residual_and_jacobian(np.array([7.0, 0.0, 0.5]))
+    low, slope = problem.priors.residual_and_jacobian(np.array([7.0, 0.0, 0.5]))
     assert low[1] == pytest.approx(-3.0 - 1.5 / math.log(10.0))
     assert slope[1, 1] == pytest.approx(2000.0 / (math.log(10.0) * 3.0))
 
@@ -146,17 +152,17 @@ def test_the_weak_priors_logarithm_ends_smoothly_where_the_ratio_is_small():
 )
 def test_some_problems_have_no_weak_prior(make, options):
     problem = make(**options)
-    residual, rows = problem.prior_residual_and_jacobian(problem.initial_unknowns)
+    residual, rows = problem.priors.residual_and_jacobian(problem.initial_unknowns)
     assert residual.shape == (0,)
     assert rows.shape == (0, 3)
-    assert make(weak_prior_geometric_std=1.1).prior_residual_and_jacobian(problem.initial_unknowns)[0].shape == (2,)
+    assert make(weak_prior_geometric_std=1.1).priors.residual_and_jacobian(problem.initial_unknowns)[0].shape == (2,)
 
 
 def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(make):
     values = {"shoulder.stiffness": 0.0, "elbow.stiffness": 0.0, "elbow.rest": 0.0}
     problem = make(values=values, prior_stds={"elbow.stiffness": 0.25}, initial_state="estimated", seeds=(1,))
     np.testing.assert_allclose(problem.unknown_scales[:2], [1.0, 0.25])
-    np.testing.assert_allclose(problem.unknown_scales[3:], problem.initial_state_prior_std)
+    np.testing.assert_allclose(problem.unknown_scales[3:], problem.priors.initial_state_stds)
     lower, upper = problem.bounds
     width = upper[2] - lower[2]
     assert problem.unknown_scales[2] == pytest.approx(0.1 * width if math.isfinite(width) else 1.0)
@@ -229,7 +235,8 @@ def test_costs_and_derivatives_that_are_not_finite_are_failures(make, monkeypatc
     assert (failing.ok, failing.cost, failing.jacobian) == (False, math.inf, None)
     assert failing.message == "the cost is not finite"
     problem = make(free=("elbow.rest",))
-    monkeypatch.setattr(problem, "prior_residual_and_jacobian", lambda x: (np.zeros(1), np.full((1, 1), np.inf)))
+    steep = SimpleNamespace(residual_and_jacobian=lambda x: (np.zeros(1), np.full((1, 1), np.inf)))
+    monkeypatch.setattr(problem, "priors", steep)
     failing = problem.evaluate(problem.initial_unknowns)
     assert (failing.ok, failing.cost, failing.jacobian) == (False, math.inf, None)
     assert failing.message == "the derivatives are not finite"
@@ -276,7 +283,7 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
     short = truncate_episode(problem.held_out[1], 20)
     theta, _ = problem.unpack_episode_unknowns(x, 0)
 
-    std = problem.initial_state_prior_std
+    std = problem.priors.initial_state_stds
 
     def rows(offset):
         result = problem.predictor.predict_episode(short, theta, offset, False)
@@ -284,7 +291,7 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
         return np.concatenate([*(samples.whitened_residual(y).ravel() for samples, y in pairs), offset / std])
 
     best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=std, xtol=1e-12, ftol=1e-14)
-    found = problem.held_out_prediction_inputs(x)[1][2]
+    found = held_out_prediction_inputs(problem, x)[1][2]
     np.testing.assert_allclose(found / std, best.x / std, atol=2e-3)
 
 
@@ -295,9 +302,11 @@ def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, hel
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
     for i, (episode, result) in enumerate(found):
         theta = problem.system.parameters.vector({"elbow.stiffness": 4.0, "elbow.rest": 0.1})
-        expected = problem.predictor.predict_episode(episode, theta, problem.held_out_prediction_inputs(x)[i][2], False)
+        expected = problem.predictor.predict_episode(
+            episode, theta, held_out_prediction_inputs(problem, x)[i][2], False
+        )
         np.testing.assert_allclose(result.predicted_outputs[0], expected.predicted_outputs[0], atol=1e-12)
-        assert np.any(problem.held_out_prediction_inputs(x)[i][2])
+        assert np.any(held_out_prediction_inputs(problem, x)[i][2])
 
 
 def test_a_held_out_part_of_a_recording_shares_its_start_and_local_parameters(make):
@@ -305,7 +314,7 @@ def test_a_held_out_part_of_a_recording_shares_its_start_and_local_parameters(ma
     part = replace(problem.episodes[1], initial_state_shared_with=1)
     split = problem.with_episodes(problem.episodes, [part])
     x = problem.unknown_vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
-    assert split.held_out_prediction_inputs(x)[0][2].tolist() == problem.unpack_episode_unknowns(x, 1)[1].tolist()
+    assert held_out_prediction_inputs(split, x)[0][2].tolist() == problem.unpack_episode_unknowns(x, 1)[1].tolist()
     np.testing.assert_array_equal(
         split.predict_held_out(x)[0][1].predicted_outputs[0],
         problem.evaluate(x, False).episode_predictions[1].predicted_outputs[0],
@@ -320,10 +329,10 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
         changed[first:] += 0.3
         moved = replace(episode, measurements=(replace(episode.measurements[0], value=changed),))
         other = problem.with_episodes(problem.episodes, [moved])
-        offsets = [one.held_out_prediction_inputs(x)[0][2] for one in (problem, other)]
+        offsets = [held_out_prediction_inputs(one, x)[0][2] for one in (problem, other)]
         assert np.allclose(*offsets, atol=1e-12) is same
     # a start at rest needs none
-    assert make(held_out=held).held_out_prediction_inputs(np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
+    assert held_out_prediction_inputs(make(held_out=held), np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
 
 
 def test_problems_that_free_other_parameters_share_all_else(make):
@@ -347,7 +356,7 @@ def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
         held_out=held, values={"elbow.damping": 0.7}, prior_stds={"elbow.rest": 0.1}, local_parameters=("elbow.rest",)
     )
     index = problem.system.parameters.index
-    shorter = problem.truncated_to_duration(0.1)
+    shorter = problem.with_episodes(problem.episodes, ()).with_options(replace(problem.options, duration=0.1))
     assert (shorter.episodes[0].grid.steps, shorter.held_out, shorter.free) == (10, (), FREE)
     assert shorter.theta[index("elbow.damping")] == 0.7
     changed = problem.with_options(replace(problem.options, weak_prior_geometric_std=3.0))

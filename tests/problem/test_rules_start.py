@@ -207,7 +207,7 @@ def test_known_starts_and_values_are_taken_as_they_are(step):
     theta = problem.predictor.theta_with_episode_values(problem.episodes[0], problem.theta)
     assert theta[problem.system.parameters.index("elbow.rest")] == 0.5
     assert problem.theta[problem.system.parameters.index("elbow.rest")] == 0.1
-    start = problem.initial_state_and_derivative(problem.episodes[0], problem.theta)
+    start = problem.predictor.initial_state_and_derivative(problem.episodes[0], problem.theta)
     np.testing.assert_array_equal(start.state, state)
     assert (start.state_sensitivity.shape, start.equilibrium, start.failure_message) == ((4, 1), None, "")
     assert not start.state_sensitivity.any()
@@ -223,7 +223,7 @@ def test_an_estimated_start_is_offset_from_a_known_one(step):
     offset = np.array([0.01, 0.02, 0.003, 0.004])
     rollout = problem.evaluate(np.concatenate([[3.0], offset]), False).episode_predictions[0].rollout
     np.testing.assert_allclose(rollout.state[0], state + offset)
-    start = problem.initial_state_and_derivative(problem.episodes[0], problem.theta, offset)
+    start = problem.predictor.initial_state_and_derivative(problem.episodes[0], problem.theta, offset)
     np.testing.assert_allclose(start.state, state + offset)
     np.testing.assert_array_equal(start.state_sensitivity, np.hstack([np.zeros((4, 1)), np.eye(4)]))
 
@@ -232,7 +232,7 @@ def test_a_start_at_rest_that_does_not_exist_is_said(step):
     problem = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
     theta = problem.system.parameters.vector() * 1.0
     theta[problem.system.parameters.index("elbow.rest")] = 1e8
-    start = problem.initial_state_and_derivative(problem.episodes[0], theta)
+    start = problem.predictor.initial_state_and_derivative(problem.episodes[0], theta)
     assert start.failure_message.startswith("run_4: no equilibrium")
     assert start.state_sensitivity.shape == (4, 1)
     assert not start.equilibrium.is_converged

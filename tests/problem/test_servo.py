@@ -175,7 +175,7 @@ def test_what_it_is_is_found_again(step) -> None:
     wrong = {"shoulder.servo_gain": 90.0, "shoulder.servo_damping": 2.0, "shoulder.servo_delay": 0.0}
     problem = problem_of(step, made, names, wrong)
     solution = GaussNewton().minimize_cost(problem, problem.initial_unknowns, None)
-    for name, value in problem.named_values(solution.x).items():
+    for name, value in problem.unknowns.named_values(solution.x).items():
         assert value == pytest.approx(VALUES[name], rel=1e-3, abs=1e-5), name
 
 

@@ -593,14 +593,14 @@ def failing_beyond(limit):
 
 def test_a_horizon_too_short_for_a_filter_is_left_out():
     problem = MadeUp(failing_beyond(3.0), count=10)
-    whole = problem.truncated_to_duration
+    prepared = problem.with_options
 
-    def shortened(duration):
-        if duration < 2.0:
+    def shortened(options):
+        if options.duration < 2.0:
             raise DataError("0.6 s of efforts are too short for a low-pass filter of 8 Hz")
-        return whole(duration)
+        return prepared(options)
 
-    problem.truncated_to_duration = shortened
+    problem.with_options = shortened
     solver = Steps([[2.0]], [[2.0]])
     solution = fit_problem(problem, solver)
     assert [duration for _, duration in solver.runs] == [2.5, 10.0]

@@ -131,7 +131,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
         # the program holds the first state where the problem holds its offset from rest, which moves with theta
         count = len(problem.shared_parameters)
         for i, episode in enumerate(problem.episodes):
-            by = problem.initial_state_and_derivative(
+            by = problem.predictor.initial_state_and_derivative(
                 episode, problem.unpack_episode_unknowns(x, i)[0]
             ).state_sensitivity[rows]
             at = problem.unknowns.unknown_indices_affecting_recording(i)[len(problem.unknowns.free_parameter_names) :]

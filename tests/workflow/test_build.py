@@ -327,7 +327,7 @@ def test_a_real_geared_servo_is_predicted(fitted) -> None:
     assert np.mean([rmse(*held_out) for held_out in problem.predict_held_out(x)]) < 0.035  # [rad]
     told = zip(problem.episodes, problem.evaluate(x, False).episode_predictions, strict=True)
     assert max(rmse(*drop) for drop in told if drop[0].name.startswith("drop")) < 0.030
-    inertia = 0.49 * 0.1**2 + problem.named_values(x)["rotor_inertia@joint.armature"]
+    inertia = 0.49 * 0.1**2 + problem.unknowns.named_values(x)["rotor_inertia@joint.armature"]
     assert 0.0064 < inertia < 0.0073
 
 

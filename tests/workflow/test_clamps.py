@@ -111,7 +111,7 @@ def test_a_baseline_is_a_joint_prior_about_its_values(run, tmp_path):
     assert problem.initial_unknowns[at] == pytest.approx([0.018, 4e-5])
     moved = problem.initial_unknowns.copy()
     moved[at] += [3e-4, -1e-6]
-    residual, rows = problem.prior_residual_and_jacobian(moved)
+    residual, rows = problem.priors.residual_and_jacobian(moved)
     apart = moved[at] - problem.initial_unknowns[at]
     assert residual @ residual == pytest.approx(apart @ np.linalg.solve(known.covariance, apart), rel=1e-9)
     assert rows @ (moved - problem.initial_unknowns) == pytest.approx(residual, rel=1e-9)
@@ -124,7 +124,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
         add_baseline_prior(build_problem(run), known)
     problem = add_baseline_prior(build_problem(run_history.settings_with_baseline_effects(run, (known,))), known)
     assert "kelvin_voigt@beam.tau" in problem.free
-    assert problem.named_values(problem.initial_unknowns)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
+    assert problem.unknowns.named_values(problem.initial_unknowns)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize(

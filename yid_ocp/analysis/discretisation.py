@@ -58,7 +58,7 @@ class _FinerDiscretisationProblem:
 
     def _unknowns(self, names: Sequence[str], x: Array) -> Array:
         """Return the fine unknowns for coarse unknowns `x`, within bounds. Divided links share their link's angle."""
-        made, at = self.problem.initial_unknowns, {name: i for i, name in enumerate(self.problem.unknown_names)}
+        made, at = self.problem.initial_unknowns.copy(), {name: i for i, name in enumerate(self.problem.unknown_names)}
         for name, value in zip(names, x, strict=True):
             base, bracket, recording = name.partition("[")
             joint = base.rpartition(".")[2] if base.startswith(INITIAL_STATE_UNKNOWN_PREFIX) else ""
@@ -166,7 +166,8 @@ def problem_corrected_for_few_links(
     """
     if problem.has_process_noise or not (problem.options.divided_links_model and problem.system.segment_layouts):
         return None
-    guesses, before, own = at_x.equilibrium_guesses, at_x.residual, problem.unknown_vector(fitted.named_values(x))
+    guesses, before = at_x.equilibrium_guesses, at_x.residual
+    own = problem.unknown_vector(fitted.unknowns.named_values(x))
     try:
         refined, coarse = _refined_problem(problem, "links"), problem.evaluate(own, False, guesses)
         point, finer = refined._unknowns(problem.unknown_names, own), refined.problem

@@ -27,6 +27,7 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
+from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_and_count_by_channel
@@ -303,7 +304,7 @@ def _predict_held_out_with_expected_errors(
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
     pairs: list[PredictedEpisodeOrFailure] = []
     expected: dict[str, dict[str, float]] = {}
-    for episode, theta, offset in problem.held_out_prediction_inputs(x):
+    for episode, theta, offset in held_out_prediction_inputs(problem, x):
         outcome = predict(episode, theta, offset, False)
         pairs.append((episode, outcome))
         if isinstance(outcome, str):

@@ -376,7 +376,8 @@ class ExperimentVariantSensitivityBuilder:
             raise failed_rollout_error(layout)
         problem, n = layout.problem, system.n_coordinates
         theta, offset = problem.unpack_episode_unknowns(layout.x, 0)
-        start = problem.initial_state_and_derivative(problem.episodes[0], theta, offset)
+        theta = problem.predictor.theta_with_episode_values(problem.episodes[0], theta)
+        start = problem.predictor.initial_state_and_derivative(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise failed_rollout_error(start.failure_message)
         q, parameters = ca.SX.sym("q", n), problem.system.parameters

@@ -64,7 +64,8 @@ def cross_validate_over_motion_kinds(
     errors: dict[str, float] = {}
     used = (e.measurements for e in problem.episodes)
     is_whitened = {own[i].sensor.unit for own in used for i in _indices_of_sensors_of_friction(own)} != {"rad"}
-    pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
+    pairs = list(zip(problem.episodes, problem.whitening_filters, strict=True))
+    known = problem.unknowns.named_values(solution.x)
     for own in kinds.values():
         inside, outside = ([pair for pair in pairs if (pair[0].name in own) == out] for out in (False, True))
         (episodes, filters), (left, left_filters) = zip(*inside, strict=True), zip(*outside, strict=True)

@@ -285,4 +285,4 @@ def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared
         what = "the nominal model cannot be fitted to the recordings without the effects"
         allowed, hint = "recordings that the nominal model can follow", "check recordings.without_effect"
         raise SolverError(f"{what}: {outcome.message}", where="recordings", allowed=allowed, hint=hint)
-    return {name: problem.named_values(outcome.x)[name] for name in shared}
+    return {name: problem.unknowns.named_values(outcome.x)[name] for name in shared}

@@ -46,6 +46,7 @@ from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.evaluation import whitened_prediction_residual
 from yid_ocp.problem.measurements import ResidualAndJacobian
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
@@ -408,11 +409,11 @@ def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestRes
 
 def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool = False) -> list[ResidualAndJacobian]:
     """Whitened residual of each held-out recording. Raises `SolverError` if one cannot be predicted."""
-    found = []
-    for i, (episode, result) in enumerate(problem.predict_held_out(x, derivatives)):
+    found, pairs = [], zip(problem.predict_held_out(x, derivatives), problem.held_out_whitening_filters, strict=True)
+    for (episode, result), whitening in pairs:
         if isinstance(result, str):
             raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
-        found.append(problem.whitened_held_out_residual_and_jacobian(i, episode, result))
+        found.append(whitened_prediction_residual(episode, whitening, result))
     return found
 
 

@@ -32,7 +32,7 @@ from yid_ocp.inference.whitening import (
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, whitened_prediction_residual
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
@@ -288,12 +288,12 @@ def refit_with_effects(
     own, outcome, finish = min(runs, key=lambda run: run[-1].cost)
     if not finish.ok:
         return None
-    values = own.named_values(outcome.x)
+    values = own.unknowns.named_values(outcome.x)
     own = problem.relinearize_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
     ranges = ((name, *ends) for effect in effects for name, ends in effect.prior_ranges.items())
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
-    sizes = own.named_values(np.linalg.norm(factor, axis=1))
+    sizes = own.unknowns.named_values(np.linalg.norm(factor, axis=1))
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
     found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
     store.put(name, found)
@@ -355,7 +355,7 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
 
 def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt:
     """The end of a run, linearised about the torques there."""
-    values = problem.with_nominal_and_effects_free(effects).named_values(outcome.x)
+    values = problem.with_nominal_and_effects_free(effects).unknowns.named_values(outcome.x)
     placed = problem.with_effects_and_relinearized_filters(effects, values)
     return placed, outcome, placed.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses)
 
@@ -443,7 +443,7 @@ def held_out_loss(
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
     factor = noise_only_covariance_sqrt(problem, evaluation)[: len(problem.shared_parameters)]
     found, residuals, errors, numbered, count = problem.predict_held_out(x, True), [], [], [], 0
-    for i, (episode, result) in enumerate(found):
+    for (episode, result), whitening in zip(found, problem.held_out_whitening_filters, strict=True):
         blocks = []
         for samples in episode.measurements:
             used, times = samples.positive_weight_mask, times_since_recording_start(episode, samples)
@@ -455,7 +455,7 @@ def held_out_loss(
         residuals.append(np.full(len(block), np.inf))
         errors.append(np.zeros((len(block), factor.shape[1])))
         if not isinstance(result, str):
-            part = problem.whitened_held_out_residual_and_jacobian(i, episode, result)
+            part = whitened_prediction_residual(episode, whitening, result)
             residuals[-1], errors[-1] = part.residual, np.asarray(part.jacobian)[:, : len(factor)] @ factor
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
 

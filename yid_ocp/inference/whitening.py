@@ -49,6 +49,7 @@ from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel
+from yid_ocp.problem.estimation_problem import held_out_parameter_vector, held_out_prediction_inputs
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import subtract_estimated_bias_and_clock_errors
 
@@ -363,7 +364,7 @@ def problem_with_held_out_kalman_whitening(
     recording whose rollout fails is weighted by sensor noise only.
     """
     x, episodes, made = np.asarray(x, float), [], []
-    known = zip(problem.held_out_whitening_filters, problem.held_out_prediction_inputs(x), strict=True)
+    known = zip(problem.held_out_whitening_filters, held_out_prediction_inputs(problem, x), strict=True)
     for held, (before, (own, theta, offset)) in zip(problem.held_out, known, strict=True):
         whitening, at = _own_filter(before), (theta, offset)
         result = problem.predictor.predict_episode(own, *at, False) if own.input_errors else None
@@ -387,8 +388,8 @@ def problem_with_reestimated_held_out_torque_biases(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
     """Return a problem with held-out whitening filters at the torque offsets of `x`, and the gains at `frozen`."""
-    pairs = zip(problem.held_out_prediction_inputs(x), problem.held_out, strict=True)
-    at = [(*own, problem.held_out_parameter_vector(frozen, held)) for own, held in pairs]
+    pairs = zip(held_out_prediction_inputs(problem, x), problem.held_out, strict=True)
+    at = [(*own, held_out_parameter_vector(problem, frozen, held)) for own, held in pairs]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
     return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
 

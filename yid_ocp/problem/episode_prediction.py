@@ -106,17 +106,19 @@ class EpisodePredictor:
         self,
         episode: Episode,
         theta: Array,
-        offset: Array,
-        names: tuple[str, ...],
+        offset: Array | float = 0.0,
+        names: tuple[str, ...] | None = None,
         guess: Array | None = None,
         inputs: CorrectedInputs | None = None,
     ) -> InitialStateWithSensitivity:
         """Return the initial state of an episode and its derivatives with respect to `names` and `offset`.
 
-        `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `guess`
-        (n,) is a configuration near the equilibrium (default: `Episode.equilibrium_guess`, else of least energy).
-        `inputs` are the corrected inputs of `theta` and `names`, if known.
+        `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `names`
+        are parameters (default: the free ones). `guess` (n,) is a configuration near the equilibrium (default:
+        `Episode.equilibrium_guess`, else of least energy). `inputs` are the corrected inputs of `theta` and `names`, if
+        known.
         """
+        names = self.unknowns.free_parameter_names if names is None else names
         nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_entries)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0

@@ -10,17 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.arrays import Array, BoolArray, IntArray
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
-from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_equilibrium_guess
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
-    InitialStateWithSensitivity,
     PredictedEpisodeOrFailure,
     mass_matrix_diagonal_at_zero,
     prepare_episode,
@@ -29,6 +27,7 @@ from yid_ocp.problem.episodes import (
 from yid_ocp.problem.evaluation import (
     EquilibriumGuesses,
     Evaluation,
+    PriorResiduals,
     ProcessNoiseWhitener,
     ResidualVectorLayout,
     UnknownVectorLayout,
@@ -37,13 +36,14 @@ from yid_ocp.problem.evaluation import (
     check_no_known_value_of_free_parameters,
     check_unique_recording_names,
     estimated_initial_state_names,
+    initial_unknowns_and_bounds,
     max_abs_initial_internal_state_offsets,
-    soft_logarithm_and_slope,
-    stated_prior_jacobian,
+    positive_unknowns_mask,
     stated_prior_stds_of_unknowns,
+    stated_rms_noise_of_data_residuals,
     whitened_prediction_residual,
 )
-from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_sqrt_weights
+from yid_ocp.problem.measurements import huber_loss_and_sqrt_weights
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
@@ -85,8 +85,22 @@ class EstimationProblem(ReprMixin):
         Free parameters with one value for all recordings, and with one value per recording.
     theta : ndarray, shape (ntheta,)
         Initial values of free parameters and values of fixed parameters.
+    initial_unknowns : ndarray, shape (nx,)
+        Initial unknown vector: initial parameter values, and zero offsets of initial states.
+    bounds : tuple of ndarray, shape (nx,)
+        Lower and upper bounds of the unknown vector.
+    unknown_scales : ndarray, shape (nx,)
+        Typical sizes of unknowns: |initial value|; if it is 0, the prior's std; else a tenth of the range.
+    positive_unknowns_mask : ndarray of bool, shape (nx,)
+        Nonnegative unknowns that start above zero, except amplitudes that may become zero.
     unknowns, residual_rows : UnknownVectorLayout, ResidualVectorLayout
         Layouts of the unknown vector and of the residual.
+    priors : PriorResiduals
+        Priors of the unknowns.
+    stated_rms_noise_of_data_residuals : float
+        RMS noise of all data residuals: 1 for whitened residuals, else the noise of the points [m].
+    has_process_noise : bool
+        Whether errors of recorded torques or angles are treated as process noise in at least one recording.
     whitening_filters, held_out_whitening_filters : tuple of ProcessNoiseWhitener or None
         Filter that whitens each recording's residual, or None if sensor noise is the only noise.
     """
@@ -145,13 +159,20 @@ class EstimationProblem(ReprMixin):
         self.unknowns = UnknownVectorLayout(self.shared_parameters, self.local_parameters, starts, tuple(names))
         self.unknown_names = self.unknowns.unknown_names
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
+        start, low, high = initial_unknowns_and_bounds(self.unknowns, self.system, theta)
         inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
-        self._prior_std = stated_prior_stds_of_unknowns(self.unknowns, options, model_functions.step.system, inertia)
-        has_weak_priors = options.weighting != "paper" and options.weak_prior_geometric_std > 1
-        weak = self.positive_unknowns_mask & ~np.isfinite(self._prior_std) & has_weak_priors
-        self._weak: IntArray = np.flatnonzero(weak)
-        self._stated = stated_prior_jacobian(self.unknowns, options, self._prior_std)
-        self.residual_rows = ResidualVectorLayout.from_episodes(episodes, len(self._stated), len(self._weak))
+        stds = stated_prior_stds_of_unknowns(self.unknowns, options, self.system, inertia)
+        range_or_prior = np.where(np.isfinite(stds), stds, 0.1 * np.where(np.isfinite(high - low), high - low, 10.0))
+        self.initial_unknowns, self.bounds = start, (low, high)
+        self.unknown_scales = np.where(start != 0, np.abs(start), range_or_prior)
+        self.positive_unknowns_mask = positive = positive_unknowns_mask(self.unknowns, self.system, low, start)
+        for constant in (start, low, high, self.unknown_scales, positive):
+            constant.setflags(write=False)
+        self.priors = PriorResiduals.from_options(self.unknowns, options, start, stds, positive)
+        counts = len(self.priors.stated_jacobian), len(self.priors.weak)
+        self.residual_rows = ResidualVectorLayout.from_episodes(episodes, *counts)
+        self.stated_rms_noise_of_data_residuals = stated_rms_noise_of_data_residuals(episodes, options)
+        self.has_process_noise = any(episode.input_errors is not None for episode in episodes)
 
     def _changed(self, **changes: Any) -> EstimationProblem:
         """Changed copy of the problem that shares the compiled functions and the prepared episodes."""
@@ -170,77 +191,14 @@ class EstimationProblem(ReprMixin):
         rows += [(name, *(f"{value:.4g}" for value in own)) for name, *own in table]
         return ReprTexts(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
 
-    @property
-    def initial_unknowns(self) -> Array:
-        """The initial unknown vector (nx,): initial parameter values, and zero offsets of initial states."""
-        index, parts = self.system.parameters.index, (self.shared_parameters, self.local_parameters)
-        shared, local = ([self.theta[index(name)] for name in part] for part in parts)
-        offset = np.zeros(len(self.unknowns.initial_state_names))
-        return self.unknowns.pack_same_for_all_recordings(shared, local, offset)
-
-    @property
-    def bounds(self) -> tuple[Array, Array]:
-        """The lower and upper bounds of the unknown vector, (nx,) each."""
-        parts = (self.shared_parameters, self.local_parameters)
-        (low, high), (own_low, own_high) = (self.system.parameters.lower_and_upper_bounds(part) for part in parts)
-        wide = max_abs_initial_internal_state_offsets(self.system, self.unknowns.initial_state_names)
-        pack = self.unknowns.pack_same_for_all_recordings
-        return pack(low, own_low, -wide), pack(high, own_high, wide)
-
-    @property
-    def unknown_scales(self) -> Array:
-        """Typical sizes (nx,) of unknowns: |initial value|; if it is 0, the prior's std; else a tenth of the range."""
-        lower, upper = self.bounds
-        size = np.abs(self.initial_unknowns)
-        width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
-        return np.where(size > 0, size, np.where(np.isfinite(self._prior_std), self._prior_std, 0.1 * width))
-
-    @property
-    def positive_unknowns_mask(self) -> BoolArray:
-        """The mask (nx,) of nonnegative unknowns that start above zero, except amplitudes that may become zero.
-
-        An amplitude may become zero unless its effect has shape parameters, which would then lose their influence.
-        """
-        effects = [e for e in self.system.effects if isinstance(e, EffectBase) and not e.shape_parameter_names]
-        vanishing = {name for e in effects for name in e.amplitude_parameter_names if e.neutral_values[name] == 0}
-        parts = (self.shared_parameters, self.local_parameters)
-        shared, local = ([float(name in vanishing) for name in part] for part in parts)
-        offset = np.zeros(len(self.unknowns.initial_state_names))
-        may_vanish = self.unknowns.pack_same_for_all_recordings(shared, local, offset) > 0
-        return (self.bounds[0] >= 0) & (self.initial_unknowns > 0) & ~may_vanish
-
-    @property
-    def stated_rms_noise_of_data_residuals(self) -> float:
-        """The RMS noise of all data residuals: 1 for whitened residuals, else the noise of the points [m]."""
-        if self.options.weighting != "paper":
-            return 1.0
-        found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
-        return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
-
-    @property
-    def initial_state_prior_std(self) -> Array:
-        """The prior standard deviations of estimated initial state components, ordered as `initial_state_names`."""
-        at = len(self.unknowns.free_parameter_names)
-        return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
-
-    @property
-    def are_input_corrections_neutral_and_fixed(self) -> bool:
-        """Whether all effects on recorded inputs, times and tracked references are neutral and fixed."""
-        neutral_and_fixed = self.predictor.are_input_corrections_neutral_and_fixed
-        return all(neutral_and_fixed(episode, self.theta) for episode in self.episodes)
-
     def unpack_episode_unknowns(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""
         return self.unknowns.unpack_episode_unknowns(x, episode, self.theta, self.system)
 
     def unknown_vector(self, values: Mapping[str, float]) -> Array:
         """Return a copy (nx,) of the initial unknown vector with the named `values`, clipped to the bounds."""
-        start = self.named_values(self.initial_unknowns)
-        return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
-
-    def named_values(self, x: Array) -> dict[str, float]:
-        """Return the values of the unknown vector `x` by unknown name."""
-        return dict(zip(self.unknown_names, map(float, x), strict=True))
+        start = zip(self.unknown_names, self.initial_unknowns, strict=True)
+        return np.clip([values.get(name, value) for name, value in start], *self.bounds)
 
     def evaluate(
         self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
@@ -267,7 +225,7 @@ class EstimationProblem(ReprMixin):
             if part.jacobian is not None:
                 jacobians.append(self.unknowns.scatter_to_unknown_columns(part.jacobian, i))
         done = tuple(replace(result, output_sensitivities=None, torque_correction_sensitivity=None) for result in done)
-        prior, prior_jacobian = self.prior_residual_and_jacobian(x)
+        prior, prior_jacobian = self.priors.residual_and_jacobian(x)
         residual = np.concatenate([*residuals, prior])
         cost += 0.5 * float(prior @ prior)
         jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
@@ -304,64 +262,18 @@ class EstimationProblem(ReprMixin):
             theta, offset = self.unpack_episode_unknowns(x, i)
             own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, theta, offset, pulls)
             gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
-        prior, prior_jacobian = self.prior_residual_and_jacobian(x)
+        prior, prior_jacobian = self.priors.residual_and_jacobian(x)
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
-    def prior_residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Return the residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
-        stated, weak, start = self._stated, self._weak, self.initial_unknowns
-        rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
-        spread = np.log(max(self.options.weak_prior_geometric_std, 1.0 + 1e-9))
-        value, slope = soft_logarithm_and_slope(x[weak] / start[weak])
-        rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
-        return np.concatenate([stated @ (x - start), value / spread]), rows
-
-    def initial_state_and_derivative(
-        self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
-    ) -> InitialStateWithSensitivity:
-        """Return an episode's initial state and its derivatives by the free parameters and the equilibrium offset.
-
-        `guess` (n,) is a configuration near the equilibrium.
-        """
-        own = self.predictor.theta_with_episode_values(episode, theta)
-        none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
-        names = self.unknowns.free_parameter_names
-        return self.predictor.initial_state_and_derivative(episode, own, none, names, guess)
-
     def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[PredictedEpisodeOrFailure]:
-        """Predict the held-out recordings with the parameters of `held_out_parameter_vector`.
+        """Predict the held-out recordings from the inputs of `held_out_prediction_inputs`.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
         prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free
         parameters (at a fixed initial state) and to an offset of the initial state.
         """
         predict = self.predictor.predict_episode
-        return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
-
-    def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """Return the inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
-        x, found = np.asarray(x, float), []
-        for held in self.held_out:
-            theta, shared = self.held_out_parameter_vector(x, held), held.initial_state_shared_with
-            if shared is not None:
-                episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
-                found.append((episode, theta, self.unpack_episode_unknowns(x, shared)[1]))
-                continue
-            episode = self.predictor.episode_with_fitted_initial_state(held, theta)
-            std = self.initial_state_prior_std
-            found.append((episode, theta, _estimated_initial_state_offset(self.predictor, episode, theta, std)))
-        return found
-
-    def held_out_parameter_vector(self, x: Array, held: Episode) -> Array:
-        """Return the parameter vector theta (ntheta,) of a held-out recording, with the shared parameters in `x`.
-
-        Local parameters have the values in `x` if `held` is part of an estimation recording, else initial values.
-        """
-        whole = held.initial_state_shared_with
-        theta, _ = self.unpack_episode_unknowns(x, whole or 0)
-        for name in self.local_parameters if whole is None else ():
-            theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
-        return theta
+        return [(asked[0], predict(*asked, derivatives)) for asked in held_out_prediction_inputs(self, x)]
 
     def simulate_synthetic_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
@@ -409,21 +321,6 @@ class EstimationProblem(ReprMixin):
         changes = {"episodes": episodes, "held_out": held_out, **filters}
         return self._changed(**{name: tuple(value) for name, value in changes.items()})
 
-    @property
-    def has_process_noise(self) -> bool:
-        """Whether errors of recorded torques or angles are treated as process noise in at least one recording."""
-        return any(episode.input_errors is not None for episode in self.episodes)
-
-    def whitened_held_out_residual_and_jacobian(
-        self, i: int, episode: Episode, result: EpisodePrediction
-    ) -> ResidualAndJacobian:
-        """Return the whitened residual of held-out recording `i`, without robust loss, for its prediction `result`."""
-        return whitened_prediction_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
-
-    def truncated_to_duration(self, duration: float) -> EstimationProblem:
-        """Return a problem with only the first `duration` [s] of each recording, without held-out recordings."""
-        return self._prepared(options=replace(self.options, duration=duration), held_out=())
-
     def with_time_step(self, time_step: float) -> EstimationProblem:
         """Return a problem with another time step [s], without whitening filters and held-out recordings.
 
@@ -443,17 +340,40 @@ class EstimationProblem(ReprMixin):
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
         """Return a problem with other options, prepared anew from its recordings."""
-        return self._prepared(options=options)
+        known = dict(zip(self.system.parameters.names, self.theta, strict=True))
+        estimated, held_out = ([episode.recording for episode in group] for group in (self.episodes, self.held_out))
+        return EstimationProblem(self.step, estimated, self.free, options, known, held_out)
 
     def with_multivariate_prior(self, prior: MultivariateGaussianPrior) -> EstimationProblem:
         """Return a problem with another multivariate prior. Filters are kept."""
         return self._changed(options=replace(self.options, multivariate_prior=prior))
 
-    def _prepared(self, **changes: Any) -> EstimationProblem:
-        known = dict(zip(self.system.parameters.names, self.theta, strict=True))
-        estimated, held_out = ([episode.recording for episode in group] for group in (self.episodes, self.held_out))
-        same = {"recordings": estimated, "free": self.free, "options": self.options, "held_out": held_out}
-        return EstimationProblem(self.step, values=known, **{**same, **changes})
+
+def held_out_prediction_inputs(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
+    """Return the inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
+    x, predictor, found = np.asarray(x, float), problem.predictor, []
+    for held in problem.held_out:
+        theta, shared = held_out_parameter_vector(problem, x, held), held.initial_state_shared_with
+        if shared is not None:
+            episode = replace(held, fixed_initial_state=problem.episodes[shared].fixed_initial_state)
+            found.append((episode, theta, problem.unpack_episode_unknowns(x, shared)[1]))
+            continue
+        episode = predictor.episode_with_fitted_initial_state(held, theta)
+        std = problem.priors.initial_state_stds
+        found.append((episode, theta, _estimated_initial_state_offset(predictor, episode, theta, std)))
+    return found
+
+
+def held_out_parameter_vector(problem: EstimationProblem, x: Array, held: Episode) -> Array:
+    """Return the parameter vector theta (ntheta,) of a held-out recording, with the shared parameters in `x`.
+
+    Local parameters have the values in `x` if `held` is part of an estimation recording, else initial values.
+    """
+    whole, index = held.initial_state_shared_with, problem.system.parameters.index
+    theta, _ = problem.unpack_episode_unknowns(x, whole or 0)
+    for name in problem.local_parameters if whole is None else ():
+        theta[index(name)] = problem.theta[index(name)]
+    return theta
 
 
 def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episode, theta: Array, std: Array) -> Array:

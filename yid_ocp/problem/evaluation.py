@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from yid_ocp.arrays import Array, IntArray
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
@@ -118,7 +118,7 @@ def _sensor_whitened_residual(
 
 
 def whitened_prediction_residual(
-    episode: Episode, whitening: ProcessNoiseWhitener | None, result: EpisodePrediction, threshold: float
+    episode: Episode, whitening: ProcessNoiseWhitener | None, result: EpisodePrediction, threshold: float = np.inf
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
@@ -142,6 +142,14 @@ def whitened_prediction_residual(
     cost, factor = huber_loss_and_sqrt_weights(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
+
+
+def stated_rms_noise_of_data_residuals(episodes: Sequence[Episode], options: ProblemOptions) -> float:
+    """Return the RMS noise of all data residuals: 1 for whitened residuals, else the noise of the points [m]."""
+    if options.weighting != "paper":
+        return 1.0
+    found = [s.std[np.isfinite(s.std)] for episode in episodes for s in episode.measurements]
+    return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
 
 INITIAL_STATE_UNKNOWN_PREFIX = "start."
@@ -191,11 +199,35 @@ class UnknownVectorLayout:
             result[system.parameters.index(name)] = value
         return result, own[len(self.free_parameter_names) :]
 
-    def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
+    def pack_same_for_all_recordings(self, value_by_name: Callable[[str], float], start: Array) -> Array:
         """Return the unknown vector (nx,) in which all recordings have the same local parameters and state offset."""
-        parts = [np.asarray(shared, float)]
-        parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
-        return np.concatenate(parts)
+        shared, local = (list(map(value_by_name, part)) for part in (self.shared_parameters, self.local_parameters))
+        return np.array([*shared, *([*local, *start] * len(self.recording_names))], dtype=float)
+
+    def named_values(self, x: Array) -> dict[str, float]:
+        """Return the values of the unknown vector `x` by unknown name."""
+        return dict(zip(self.unknown_names, map(float, x), strict=True))
+
+
+def initial_unknowns_and_bounds(
+    unknowns: UnknownVectorLayout, system: System, theta: Array
+) -> tuple[Array, Array, Array]:
+    """Return the initial unknown vector and its lower and upper bounds, (nx,) each. Initial states have offset zero."""
+    parameters, pack = system.parameters, unknowns.pack_same_for_all_recordings
+    wide = max_abs_initial_internal_state_offsets(system, unknowns.initial_state_names)
+    start = pack(lambda name: theta[parameters.index(name)], np.zeros(len(wide)))
+    return start, pack(lambda name: parameters[name].lower, -wide), pack(lambda name: parameters[name].upper, wide)
+
+
+def positive_unknowns_mask(unknowns: UnknownVectorLayout, system: System, lower: Array, start: Array) -> BoolArray:
+    """Return the mask (nx,) of nonnegative unknowns that start above zero, except amplitudes that may become zero.
+
+    An amplitude may become zero unless its effect has shape parameters, which would then lose their influence.
+    """
+    effects = [e for e in system.effects if isinstance(e, EffectBase) and not e.shape_parameter_names]
+    vanishing = {name for e in effects for name in e.amplitude_parameter_names if e.neutral_values[name] == 0}
+    offset = np.zeros(len(unknowns.initial_state_names))
+    return (lower >= 0) & (start > 0) & (unknowns.pack_same_for_all_recordings(vanishing.__contains__, offset) == 0)
 
 
 def stated_prior_stds_of_unknowns(
@@ -224,8 +256,8 @@ def stated_prior_stds_of_unknowns(
     return np.array(stds)
 
 
-def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Return the Jacobian P (k, nx) of the stated priors' whitened residual P (x - x0); x0: the initial unknowns."""
+def _stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
+    """Jacobian P (k, nx) of the stated priors' whitened residual P (x - x0); x0: the initial unknowns."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -235,6 +267,36 @@ def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions
         # C = L L', so that L^-1 d has unit covariance
         rows[len(alone) :, at] = np.linalg.inv(np.linalg.cholesky(joint.covariance))
     return rows
+
+
+@dataclass(frozen=True)
+class PriorResiduals:
+    """The whitened residuals of stated Gaussian priors, and of weak log-normal priors of positive unknowns."""
+
+    initial_unknowns: Array  # (nx,)
+    stated_jacobian: Array  # (k, nx)
+    initial_state_stds: Array  # of the estimated initial state components, ordered as `initial_state_names`
+    weak: IntArray  # indices of unknowns with a weak prior
+    weak_log_std: float
+
+    @staticmethod
+    def from_options(
+        unknowns: UnknownVectorLayout, options: ProblemOptions, start: Array, stds: Array, positive: BoolArray
+    ) -> PriorResiduals:
+        """Build the priors about `start`. Positive unknowns without a stated prior get the weak one of the options."""
+        has_weak_priors = options.weighting != "paper" and options.weak_prior_geometric_std > 1
+        weak = np.flatnonzero(positive & ~np.isfinite(stds) & has_weak_priors)
+        at, spread = len(unknowns.free_parameter_names), np.log(max(options.weak_prior_geometric_std, 1.0 + 1e-9))
+        own = stds[at : at + len(unknowns.initial_state_names)]
+        return PriorResiduals(start, _stated_prior_jacobian(unknowns, options, stds), own, weak, float(spread))
+
+    def residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Return the residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
+        stated, weak, start = self.stated_jacobian, self.weak, self.initial_unknowns
+        rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
+        value, slope = soft_logarithm_and_slope(x[weak] / start[weak])
+        rows[len(stated) + np.arange(len(weak)), weak] = slope / (self.weak_log_std * start[weak])
+        return np.concatenate([stated @ (x - start), value / self.weak_log_std]), rows
 
 
 def estimated_initial_state_names(

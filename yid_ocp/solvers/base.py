@@ -480,7 +480,8 @@ def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: It
         for fraction in _HORIZON_FRACTIONS:
             note = f"first {fraction * longest:.3g} s"
             try:
-                shorter = problem.truncated_to_duration(fraction * longest)
+                options = replace(problem.options, duration=fraction * longest)
+                shorter = problem.with_episodes(problem.episodes, ()).with_options(options)
                 if not shorter.evaluate(x, derivatives=False).ok:
                     continue
                 part = _minimize_cost(solver, shorter, x, _noting(callback, note))

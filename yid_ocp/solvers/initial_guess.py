@@ -71,7 +71,7 @@ def guess_unknowns_and_node_states(
         for i, episode in enumerate(problem.episodes):
             shared, _ = problem.unpack_episode_unknowns(moved, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
-            begins.append(problem.initial_state_and_derivative(episode, theta))
+            begins.append(problem.predictor.initial_state_and_derivative(episode, theta))
             found: list[tuple[Array, Array]] = []
             if not begins[-1].failure_message:
                 found += _tracked(problem, episode, nodes[i], theta, begins[-1].state)

@@ -358,8 +358,9 @@ class _ShootingIntervals:
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are searched near those of the problem's initial values, at any point
         x = problem.initial_unknowns
-        thetas = (problem.unpack_episode_unknowns(x, i)[0] for i in range(len(problem.episodes)))
-        starts = map(problem.initial_state_and_derivative, problem.episodes, thetas)
+        predictor, own = problem.predictor, enumerate(problem.episodes)
+        thetas = (predictor.theta_with_episode_values(e, problem.unpack_episode_unknowns(x, i)[0]) for i, e in own)
+        starts = map(predictor.initial_state_and_derivative, problem.episodes, thetas)
         found = [None if start.failure_message else start.equilibrium for start in starts]
         n = problem.step.sizes["n"]
         self.equilibrium_guesses = tuple(None if rest is None else rest.state[:n] for rest in found)
@@ -388,12 +389,12 @@ class _ShootingIntervals:
 
     def linearize(self, x: Array, nodes: list[Array]) -> _Linearization | str:
         """Residual and derivatives at a point, or the message of a failed rollout."""
-        problem = self.problem
+        problem, predictor = self.problem, self.problem.predictor
         cost, defect, residuals, jacobians, changes, slopes = 0.0, 0.0, [], [], [], []
         for i, episode in enumerate(problem.episodes):
             theta, offset = problem.unpack_episode_unknowns(x, i)
-            theta = problem.predictor.theta_with_episode_values(episode, theta)
-            start = problem.initial_state_and_derivative(episode, theta, offset, self.equilibrium_guesses[i])
+            theta = predictor.theta_with_episode_values(episode, theta)
+            start = predictor.initial_state_and_derivative(episode, theta, offset, guess=self.equilibrium_guesses[i])
             condensed = start.failure_message or self._condensed(i, theta, start, nodes[i])
             if isinstance(condensed, str):
                 return condensed
@@ -401,14 +402,14 @@ class _ShootingIntervals:
             defect = max(defect, largest)
             slopes.append((by_x, by_defect))
             for samples in episode.measurements:
-                read = problem.predictor.readings_and_sensitivities(samples, trajectory, by_unknowns, theta)
+                read = predictor.readings_and_sensitivities(samples, trajectory, by_unknowns, theta)
                 part = samples.residual_and_jacobian(*read, problem.options.huber_threshold)
                 assert part.jacobian is not None
                 cost += part.cost
                 residuals.append(part.residual)
                 jacobians.append(problem.unknowns.scatter_to_unknown_columns(part.jacobian[:, :-1], i))
                 changes.append(part.jacobian[:, -1])
-        prior, by_x_prior = problem.prior_residual_and_jacobian(x)
+        prior, by_x_prior = problem.priors.residual_and_jacobian(x)
         residual, jacobian = np.concatenate([*residuals, prior]), np.vstack([*jacobians, by_x_prior])
         change = np.concatenate([*changes, np.zeros(len(prior))])
         return _Linearization(cost + 0.5 * float(prior @ prior), defect, residual, jacobian, change, tuple(slopes))

@@ -95,7 +95,8 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
     """Check that no effect changes recorded inputs or times, as node-state solvers require. Raises `SolverError`."""
-    if not problem.are_input_corrections_neutral_and_fixed:
+    neutral = problem.predictor.are_input_corrections_neutral_and_fixed
+    if not all(neutral(episode, problem.theta) for episode in problem.episodes):
         names = ", ".join(f"{effect.kind}@{effect.location}" for effect in problem.system.effects)
         message = f"an effect changes recorded inputs, times or the reference of the tracking filter (one of {names})"
         allowed, hint = "effects on mechanics or sensor readings", "set solver.name: gauss_newton, or remove the effect"
@@ -107,7 +108,8 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
     x = problem.initial_unknowns.copy()
     shared, own = len(problem.shared_parameters), len(problem.local_parameters)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
-    rows = list(problem.predictor.estimated_initial_state_entries)
+    predictor, n = problem.predictor, problem.step.sizes["n"]
+    rows = list(predictor.estimated_initial_state_entries)
     for i, episode in enumerate(problem.episodes):
         columns = problem.unknowns.unknown_indices_affecting_recording(i)[shared:]
         if own:
@@ -115,8 +117,8 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
         if rows:
             blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
             first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
-            theta, _ = problem.unpack_episode_unknowns(x, i)
-            begin = problem.initial_state_and_derivative(episode, theta, guess=first[: problem.step.sizes["n"]])
+            theta = predictor.theta_with_episode_values(episode, problem.unpack_episode_unknowns(x, i)[0])
+            begin = predictor.initial_state_and_derivative(episode, theta, guess=first[:n])
             x[columns[own:]] = (first - begin.state)[rows]
     return x
 
@@ -393,7 +395,7 @@ class _Maker:
         if not loose:
             return term, []
         offset = LocalVariableFunction("offset", inputs, ca.densify((first - state)[loose]))
-        weights = 1.0 / problem.initial_state_prior_std
+        weights = 1.0 / problem.priors.initial_state_stds
         weight = self._p.append_block(f"weight.start[{name}]", weights, [rows[k] for k in loose])
         named = tuple(f"offset.{rows[k]}" for k in loose)
         free = MappedFunctionTerm(f"offset[{name}]", named, offset, at, data, shared)
@@ -473,7 +475,7 @@ class _Maker:
     def _priors(self, columns: dict[int, int]) -> list[ResidualTerm]:
         """Stated priors of parameters, and the weak ones."""
         problem = self._problem
-        _, slopes = problem.prior_residual_and_jacobian(problem.initial_unknowns)
+        _, slopes = problem.priors.residual_and_jacobian(problem.initial_unknowns)
         v, about = ca.SX.sym("v"), ca.SX.sym("about")
         ratio = v / about
         below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO

@@ -194,7 +194,7 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
     names = (*system.driven, *system.prescribed)
     posture = dict(zip(names, map(float, episode.initial_known_coordinates), strict=True))
     theta = problem.predictor.theta_with_episode_values(episode, problem.theta)
-    start = problem.initial_state_and_derivative(episode, theta)
+    start = problem.predictor.initial_state_and_derivative(episode, theta)
     near = None if start.failure_message else start.state[: system.n_coordinates]
     return min_gap_by_grasp_at_robot_posture(system, posture, theta, near)
 
