@@ -261,7 +261,7 @@ def test_the_papers_cost_and_a_failed_fit_have_no_intervals():
     assert solution_with_profile_intervals(problem, fitted) is fitted
     fitted = replace(fitted, evaluation=problem.evaluate(problem.initial_unknowns))
     assert solution_with_profile_intervals(problem, fitted).parameters["a"].interval is not None
-    problem.options.weighting = "paper"
+    problem.options = replace(problem.options, weighting="paper")
     assert solution_with_profile_intervals(problem, fitted) is fitted
 
 

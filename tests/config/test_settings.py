@@ -11,10 +11,11 @@ from ruamel.yaml import YAML
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
-from yid_ocp.config.settings import DiagnosisSettings, ProblemSettings, config_yaml_with_defaults
+from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
-from yid_ocp.model.objects.cable import CableOptions, ClampedCable
+from yid_ocp.model.objects import OBJECT_KINDS
+from yid_ocp.model.objects.cable import CableOptions
 from yid_ocp.problem import ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton
 
@@ -140,8 +141,9 @@ def test_sections_are_what_their_users_take(written):
 
 
 def test_no_section_repeats_the_options_of_another_package():
-    problem, diagnosis = (ProblemSettings, ProblemOptions), (DiagnosisSettings, Thresholds)
-    for section, options in (problem, diagnosis, (ClampedCable, CableOptions)):
+    run = RunSettings()
+    sections = type(run.problem), type(run.diagnosis), OBJECT_KINDS["cable"]
+    for section, options in zip(sections, (ProblemOptions, Thresholds, CableOptions), strict=True):
         assert not set(section.__annotations__) & {field.name for field in dataclasses.fields(options)}
 
 

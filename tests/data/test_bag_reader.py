@@ -15,7 +15,7 @@ from recording_examples import joints_of
 from ros_bags import BAG_KINDS, SECOND, START, Bag
 
 from yid_ocp.data.readers import preview_file, read_any
-from yid_ocp.data.readers.bags import OpenBag, read_bag
+from yid_ocp.data.readers.bags import OpenBag
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
@@ -124,7 +124,7 @@ def test_bag_order_and_sets_of_joints_may_change(tmp_path: Path) -> None:
     second = joint_state(("b", "a"), START + SECOND, position=[4.0, 3.0])
     path = write_bag(tmp_path, "bag", [("/joint_states", START, arm), ("/joint_states", START + SECOND, second)])
     assert np.array_equal(joints_of(read_any(path, joints=["a", "b"])).position, [[1, 2], [3, 4]])
-    assert np.array_equal(np.sort(joints_of(read_bag(path)).position), [[1, 2], [3, 4]])
+    assert np.array_equal(np.sort(joints_of(read_any(path)).position), [[1, 2], [3, 4]])
     gripper = joint_state(("finger",), START, position=[0.5])
     (tmp_path / "other").mkdir()
     path = write_bag(tmp_path / "other", "bag", [("/joint_states", START, arm), ("/joint_states", START, gripper)])
@@ -150,7 +150,7 @@ def two_arms(rate: int = 200, effort: bool = True) -> Messages:
 
 def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", two_arms())
-    recording = read_bag(path)
+    recording = read_any(path)
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     # the faster topic is the clock, from where the slower one has samples on both sides
@@ -176,7 +176,7 @@ def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
 
 def test_a_gap_of_one_topic_stays_a_gap_and_commands_are_held_until_the_next(tmp_path: Path) -> None:
     lost = [m for m in two_arms() if m[0] != "/left" or not 5 <= round(100 * (m[1] - START) / SECOND) < 15]
-    joints = joints_of(read_bag(write_bag(tmp_path, "db3", lost)))
+    joints = joints_of(read_any(write_bag(tmp_path, "db3", lost)))
     assert not ((joints.t > 0.041) & (joints.t < 0.149)).any()
     assert np.allclose(joints.position[:, 0], joints.t)
     messages = list(two_arms())
@@ -217,7 +217,7 @@ def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
     assert any("orientations of /tf:middle, /vrpn/hand/pose" in note for note in recording.notes)
     write_recording(recording, tmp_path / "all.h5")
     assert read_any(tmp_path / "all.h5").notes == recording.notes
-    by_itself = read_bag(path)
+    by_itself = read_any(path)
     assert by_itself.points[0].names == ("hand", "tip")
     assert any(note.startswith("/tf was left out") for note in by_itself.notes)
 
@@ -309,7 +309,7 @@ def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
     joints = joints_of(read_any(path, joints=["b=elbow", "a"]))
     assert set(joints.names) == {"elbow", "a"}
     assert np.allclose(joints.position[:, joints.names.index("elbow")], joints.t - 0.005)
-    efforts = joints_of(read_bag(path)).values_by_channel["effort"]
+    efforts = joints_of(read_any(path)).values_by_channel["effort"]
     options: dict[str, Any] = {"torque_constants": {"*": 0.1, "b": 0.2}, "gear_ratios": {"b": 50.0}}
     torques = joints_of(read_any(path, units={"effort": "mA"}, **options)).values_by_channel["effort"]
     assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
@@ -322,15 +322,15 @@ def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
 def test_bag_without_stamps_uses_the_time_of_recording(stamps: tuple[int, int], tmp_path: Path) -> None:
     states = [joint_state(("a",), stamp, position=[1.0]) for stamp in stamps]
     path = write_bag(tmp_path, "mcap", [("/j", START + k * SECOND, state) for k, state in enumerate(states)])
-    assert np.array_equal(joints_of(read_bag(path)).t, [0.0, 1.0])
-    assert f"{stamps.count(0)} of 2 messages have no stamp" in read_bag(path).notes[-1]
+    assert np.array_equal(joints_of(read_any(path)).t, [0.0, 1.0])
+    assert f"{stamps.count(0)} of 2 messages have no stamp" in read_any(path).notes[-1]
 
 
 def test_bag_without_definitions_of_its_messages(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "db3", arm_and_camera())
     with contextlib.closing(sqlite3.connect(path)) as database, database:
         database.execute("DELETE FROM message_definitions")
-    recording = read_bag(path)
+    recording = read_any(path)
     assert recording.joint_names == ("a", "b")
     assert recording.point_names == ("w_T1", "w_T2")
 
@@ -381,7 +381,7 @@ def test_truncated_bags(kind: str, share: float, tmp_path: Path) -> None:
     contents = path.read_bytes()
     path.write_bytes(contents[: int(share * len(contents))])
     with pytest.raises(DataError, match="the bag cannot be read") as caught:
-        read_bag(path)
+        read_any(path)
     assert caught.value.where == str(path)
 
 

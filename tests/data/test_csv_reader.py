@@ -13,7 +13,6 @@ from recording_examples import joints_of, table
 from yid_ocp.data import readers
 from yid_ocp.data.foreign_formats import column_meanings
 from yid_ocp.data.readers import READERS, preview_file, read_any
-from yid_ocp.data.readers.csv import CsvOptions, read_csv
 from yid_ocp.data.recording import JointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
@@ -49,7 +48,7 @@ def test_csv_columns_of_sensors_on_links(tmp_path: Path) -> None:
     rows = ["0.0,0.1,1,2,3,,,", "0.5,0.2,,,,0.1,0.2,0.3", "1.0,0.3,4,5,6,0.4,0.5,0.6"]
     (tmp_path / "run.csv").write_text("\n".join([header, *rows]))
     columns = {f"w{i + 1}": f"angular_velocity_{axis}:imu_link" for i, axis in enumerate("xyz")}
-    recording = read_csv(tmp_path / "run.csv", CsvOptions(column_meanings=columns))
+    recording = read_any(tmp_path / "run.csv", column_meanings=columns)
     imu, wrist = sorted(recording.channel_groups, key=lambda g: g.name)
     assert (imu.name, imu.names, wrist.name, wrist.names) == ("imu", ("imu_link",), "wrist", ("ft",))
     np.testing.assert_allclose(wrist.t, [0.0, 1.0])
@@ -57,7 +56,7 @@ def test_csv_columns_of_sensors_on_links(tmp_path: Path) -> None:
     np.testing.assert_allclose(imu.t, [0.5, 1.0])
     np.testing.assert_allclose(imu.values_by_quantity["angular_velocity"][1, 0], [0.4, 0.5, 0.6])
     with pytest.raises(DataError, match="no column for force_z of 'ft'"):
-        read_csv(tmp_path / "run.csv", CsvOptions(column_meanings={**columns, "ft_force_z": "skip"}))
+        read_any(tmp_path / "run.csv", column_meanings={**columns, "ft_force_z": "skip"})
 
 
 def test_csv_units_are_converted(tmp_path: Path) -> None:
@@ -88,15 +87,15 @@ def test_csv_columns_given_chosen_and_renamed(tmp_path: Path) -> None:
 
 def test_csv_clocks_of_joints_and_points(tmp_path: Path) -> None:
     # the first line tells Excel the delimiter
-    recording = read_csv(table(tmp_path, "sep=,\nt,q_a,p_x,p_y,p_z\n0,1,,,\n1,2,1,1,1\n2,,2,2,2\n3,3,,,\n"))
+    recording = read_any(table(tmp_path, "sep=,\nt,q_a,p_x,p_y,p_z\n0,1,,,\n1,2,1,1,1\n2,,2,2,2\n3,3,,,\n"))
     assert np.array_equal(joints_of(recording).t, [0, 1, 3])
     assert np.array_equal(recording.points[0].t, [1, 2])
     # of points alone frames without any stay
-    recording = read_csv(table(tmp_path, "t,p_x,p_y,p_z\n0,1,1,1\n1,,,\n"))
+    recording = read_any(table(tmp_path, "t,p_x,p_y,p_z\n0,1,1,1\n1,,,\n"))
     assert np.array_equal(recording.points[0].t, [0, 1])
     assert np.isnan(recording.points[0].position[1]).all()
     # joints named after axes are no points
-    recording = read_csv(table(tmp_path, "t,q_T1_x,q_T1_y,q_T1_z\n0,1,2,3\n"))
+    recording = read_any(table(tmp_path, "t,q_T1_x,q_T1_y,q_T1_z\n0,1,2,3\n"))
     assert (recording.joint_names, recording.points) == (("T1_x", "T1_y", "T1_z"), ())
 
 
@@ -151,13 +150,14 @@ def test_csv_errors(case: str, tmp_path: Path) -> None:
 def test_csv_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
-    absent = tmp_path / "absent.csv"
-    for file, message in ((path, "table in UTF-8"), (tmp_path, "this is a folder"), (absent, "no such file")):
+    absent, folder = tmp_path / "absent.csv", tmp_path / "folder.csv"
+    folder.mkdir()
+    for file, message in ((path, "table in UTF-8"), (folder, "this is a folder"), (absent, "no such file")):
         with pytest.raises(DataError, match=message):
-            read_csv(file)
+            read_any(file)
     monkeypatch.setattr("csv.reader", Mock(side_effect=OSError(5, "any words")))
     with pytest.raises(DataError, match=r"cannot be read \(Input/output error\)(.|\n)*try: copy it again"):
-        read_csv(path)
+        read_any(path)
 
 
 def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monkeypatch):
@@ -166,11 +166,11 @@ def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monk
     file.write_text("t,q_a\n" + "".join(f"{i},{i}\n" for i in range(9)))
     for module in ("files", "data.readers.csv"):
         monkeypatch.setattr(f"yid_ocp.{module}.MAX_INPUT_NUMBERS", 10 * (2 + 16))
-    for read in (read_csv, preview_file):
+    for read in (read_any, preview_file):
         read(file)
     with file.open("a") as more:
         more.write("9,9\n")
-    for read in (read_csv, preview_file):
+    for read in (read_any, preview_file):
         with pytest.raises(DataError, match="more than allowed"):
             read(file)
 
@@ -178,14 +178,14 @@ def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monk
 def test_too_many_columns_and_a_line_without_end_are_refused_before_the_work(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text(",".join(["t", *(f"q_{i}" for i in range(20_000))]) + "\n" + ",".join(["0"] * 20_001) + "\n")
-    for read in (read_csv, preview_file):
+    for read in (read_any, preview_file):
         with pytest.raises(DataError, match="20001 columns"):
             read(path)
     path.write_text(",".join(["t", *(f"q_{i}" for i in range(4_999))]) + "\n" + ",".join(["0"] * 5_000) + "\n")
-    assert len(read_csv(path).joint_names) == 4_999
+    assert len(read_any(path).joint_names) == 4_999
     path.write_text("t,q_a\n" + "0," * 2_000_000)
     with pytest.raises(DataError, match="more than 1048576 characters"):
-        read_csv(path)
+        read_any(path)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_too_many_columns_and_a_line_without_end_are_refused_before_the_work(tmp
 )
 def test_a_preview_of_what_is_no_table_is_refused_as_reading_it_is(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_bytes(content)
-    for read in (read_csv, preview_file):
+    for read in (read_any, preview_file):
         with pytest.raises(DataError):
             read(tmp_path / "run.csv")
 
@@ -226,7 +226,7 @@ def test_patterns_of_columns(tmp_path: Path) -> None:
 def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
     path = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,3\n3,4,5\n4\n5,6\n6,7\n7,8\n")
     with pytest.raises(DataError, match="'fast'") as caught:
-        read_csv(path)
+        read_any(path)
     assert caught.value.where.endswith("line 3")
     recording = read_any(path, skip_bad_lines=True)
     assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
@@ -282,7 +282,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     # a name that says nothing is not guessed
     path.write_text("t,j0\n0,1\n1,2\n", encoding="utf-8")
     with pytest.raises(DataError, match="meaning of column 'j0' is not known"):
-        read_csv(path)
+        read_any(path)
 
 
 @pytest.mark.parametrize(
@@ -312,7 +312,7 @@ def test_columns_are_understood_as_loggers_and_mocap_call_them(header: str, mean
 
 def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -> None:
     path = table(tmp_path, "Time [ms],q1_deg,tip_x [mm],tip_y [mm],tip_z [mm]\n0,90,100,200,300\n10,45,100,200,300\n")
-    recording = read_csv(path)
+    recording = read_any(path)
     assert joints_of(recording).t == pytest.approx([0, 0.01])
     assert joints_of(recording).position[:, 0] == pytest.approx(np.radians([90, 45]))
     assert recording.points[0].position[0, 0] == pytest.approx([0.1, 0.2, 0.3])
@@ -320,12 +320,12 @@ def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -
     # units in a row of their own, numbers of the rows, and a row that a spreadsheet left
     path = table(tmp_path, ",Time,q1,p_x,p_y,p_z\n,(ms),°,mm,mm,mm\n0,0,90,100,200,300\n1,10,45,100,200,300\n,,,,,\n")
     assert preview_file(path).reader_options == {}
-    assert read_csv(path).points[0].position[1, 0] == pytest.approx([0.1, 0.2, 0.3])
-    assert joints_of(read_csv(path)).position[:, 0] == pytest.approx(np.radians([90, 45]))
+    assert read_any(path).points[0].position[1, 0] == pytest.approx([0.1, 0.2, 0.3])
+    assert joints_of(read_any(path)).position[:, 0] == pytest.approx(np.radians([90, 45]))
     # a slide in millimetres, and torques of a wrist sensor
     header = ",".join(["t", "q_slide [mm]", *(f"ft_torque_{axis} [Nm]" for axis in "xyz")])
     path = table(tmp_path, f"{header}\n0,90,1,2,3\n1,91,1,2,3\n")
-    assert joints_of(read_csv(path)).position[0, 0] == pytest.approx(0.09)
+    assert joints_of(read_any(path)).position[0, 0] == pytest.approx(0.09)
 
 
 RIGID = "Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error"

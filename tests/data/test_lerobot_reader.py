@@ -11,7 +11,6 @@ import pytest
 from recording_examples import joints_of
 
 from yid_ocp.data.readers import preview_file, read_any
-from yid_ocp.data.readers.lerobot import read_lerobot_episode
 from yid_ocp.errors import DataError
 
 NAMES = ["shoulder_pan.pos", "elbow_flex.pos", "gripper.pos"]
@@ -72,13 +71,13 @@ def test_state_and_action_of_an_episode(version: str, tmp_path: Path) -> None:
 def test_names_of_older_datasets(names: Any, tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v2.0", names)
     expected = ("a", "b", "c") if names else ("joint_0", "joint_1", "joint_2")
-    assert read_lerobot_episode(path, units={"position": "deg", "position_command": "deg"}).joint_names == expected
+    assert read_any(path, units={"position": "deg", "position_command": "deg"}).joint_names == expected
 
 
 def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0", ["a.pos", "a.vel", "a.current"])
     units = {"position": "deg", "position_command": "deg", "effort": "mA"}
-    joints = joints_of(read_lerobot_episode(path, units=units, torque_constants={"a": 2.0}, gear_ratios={"a": 100.0}))
+    joints = joints_of(read_any(path, units=units, torque_constants={"a": 2.0}, gear_ratios={"a": 100.0}))
     assert joints.names == ("a",)
     assert np.array_equal(joints.values_by_channel["velocity"][:, 0], [1, 11, 21, 31])
     assert np.allclose(joints.values_by_channel["effort"][:, 0], 0.2 * np.array([2, 12, 22, 32]))
@@ -147,7 +146,7 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
 def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0", **more)
     with pytest.raises(DataError, match=message) as caught:
-        read_lerobot_episode(path, **options)
+        read_any(path, **options)
     assert "arm" in caught.value.where
 
 
@@ -163,7 +162,7 @@ def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_pa
 )  # fmt: skip
 def test_metadata_of_other_types_is_refused(more: Any, tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1", **more)
-    for read in (read_lerobot_episode, preview_file):
+    for read in (read_any, preview_file):
         with pytest.raises(DataError) as caught:
             read(path)
         assert "info.json" in caught.value.where
@@ -178,7 +177,7 @@ def test_frame_numbers_that_are_none_are_refused(column: list[Any], tmp_path: Pa
     table = {"observation.state": [[1.0, 2, 3]] * 2, "action": [[1.0, 2, 3]] * 2, "episode_index": [0, 0]}
     parquet.write_table(pyarrow.table({**table, "frame_index": column}), path / FIRST)
     with pytest.raises(DataError):
-        read_lerobot_episode(path)
+        read_any(path)
 
 
 @pytest.mark.parametrize("name", ["frame_index", "observation.state", "action"])
@@ -192,18 +191,18 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
     text = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * len(table[name])), ["x" * 1_000_000])
     parquet.write_table(pyarrow.table({**table, name: text}), path / FIRST, store_schema=False)
     with pytest.raises(DataError, match=f"the column {name} contains string instead of numbers"):
-        read_lerobot_episode(path)
+        read_any(path)
 
 
 def test_a_table_too_large_or_damaged_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists
     with pytest.raises(DataError, match="more than allowed"):
-        read_lerobot_episode(path)
+        read_any(path)
     (path / FIRST).write_bytes(b"PAR1 and no more")
     with pytest.raises(DataError, match="table of the episode cannot be read"):
-        read_lerobot_episode(path)
+        read_any(path)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(DataError, match="needs pyarrow") as caught:
-        read_lerobot_episode(path)
+        read_any(path)
     assert caught.value.hint == "pip install 'yid-ocp[lerobot]'"

@@ -10,7 +10,7 @@ from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, _estimated_without, add_baseline_prior
+from yid_ocp.diagnosis.baseline import _estimated_without, problem_with_earlier_runs
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -125,8 +125,8 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     std = alone.std["beam.bend"] * times
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
-    both = refit_with_effects(AllCandidatesProblem(add_baseline_prior(problem, known), (), False), (), {})
-    baseline = EarlierRunsBaseline.from_run_estimates([known], ())
+    together, baseline = problem_with_earlier_runs(problem, known)
+    both = refit_with_effects(AllCandidatesProblem(together, (), False), (), {})
     [shift] = baseline.parameter_shifts_of_fit(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:

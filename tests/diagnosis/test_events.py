@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.events import (
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceHistory
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import times_since_recording_start
-from yid_ocp.inference.smoother import select_and_smooth_unknowns
+from yid_ocp.inference.smoother import smooth_unknowns_about_fit
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
@@ -322,7 +322,7 @@ def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_fo
     problem = EstimationProblem(step, [made], ["shoulder.damping"], options)
     x = fit_problem(problem, GaussNewton()).x
     evaluation = problem.evaluate(x)
-    unknowns = select_and_smooth_unknowns(problem, x, evaluation)
+    unknowns = smooth_unknowns_about_fit(problem, x, evaluation)
     (event,) = find_force_and_fault_events(problem, x, evaluation, unknowns).disturbances
     assert (event.kind, event.location, event.channel, event.unit) == ("force", "elbow", "elbow", "N m")
     assert (event.start_time, event.end_time) == pytest.approx((push.start, push.end), abs=0.15)

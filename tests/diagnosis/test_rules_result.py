@@ -2,14 +2,14 @@
 
 import math
 from dataclasses import replace
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import factories as f
 import pytest
 
 from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text
-from yid_ocp.diagnosis.verdict import UnknownVerdictReason
+from yid_ocp.diagnosis.verdict import Judgement
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel
 
 FRICTION, OFFSET = f.effect("friction@elbow"), f.effect("offset@wrist", f.amplitude(lower=-9.0))
@@ -137,7 +137,7 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
 
 
 def test_every_reason_has_a_sentence_of_its_own():
-    reasons = [reason for reason in get_args(UnknownVerdictReason) if reason]
+    reasons = [reason for reason in get_args(get_type_hints(Judgement)["unknown_reason"]) if reason]
     assert len({diagnosis_summary_text(f.finding("unknown", unknown_reason=reason)) for reason in reasons}) == len(
         reasons
     )

@@ -18,7 +18,6 @@ from mcap_ros2.decoder import DecoderFactory
 
 from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.data.readers import read_any
-from yid_ocp.data.readers.csv import read_csv
 from yid_ocp.errors import OutputError
 from yid_ocp.export.signals import (
     RosTopicTimeSeries,
@@ -187,7 +186,7 @@ def test_csv_round_trip(position: np.ndarray, points: np.ndarray, hidden: np.nda
     with tempfile.TemporaryDirectory() as folder:
         files = export_recording_csv_files(Recording(joints, (camera,)), Path(folder) / "new" / "tables")
         assert [file.name for file in files] == ["joints.csv", "points_camera.csv"]
-        back, (points_back,) = read_csv(files[0]).joints, read_csv(files[1]).points
+        back, (points_back,) = read_any(files[0]).joints, read_any(files[1]).points
     assert (back.names, points_back.names) == (joints.names, camera.names)
     assert list(back.values_by_channel) == ["position", "effort"]
     for own, read_back in ((joints, back), (camera, points_back)):

@@ -17,7 +17,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.inference import smoother, smoother_model
 from yid_ocp.inference.smoother import (
     gap_locations_by_smoother_evidence,
-    select_and_smooth_unknowns,
+    smooth_unknowns_about_fit,
     z_scores_of_smoothed_unknowns,
 )
 from yid_ocp.inference.smoother_model import (
@@ -141,7 +141,7 @@ class Dense:
 def smoothed(monkeypatch, models, **limits):
     """The smoother on linear models as they are."""
     monkeypatch.setattr(smoother, "residual_models_with_smoother_unknowns", lambda *_: tuple(models))
-    return smoother.select_and_smooth_unknowns(SimpleNamespace(), np.zeros(0), None, **limits)
+    return smooth_unknowns_about_fit(SimpleNamespace(has_process_noise=False, episodes=()), np.zeros(0), None, **limits)
 
 
 NOTHING = dict.fromkeys(SOURCES, 0.0)
@@ -359,7 +359,7 @@ def problem_of(system: System, recording: Recording, feedback: Literal["none", "
 def said_of(problem: EstimationProblem):
     """What the smoother says about the fit of a problem."""
     solution = fit_problem(problem, GaussNewton())
-    return select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
+    return smooth_unknowns_about_fit(problem, np.array(solution.x), solution.evaluation)
 
 
 @pytest.mark.parametrize("feedback", ["none", "lqr"])

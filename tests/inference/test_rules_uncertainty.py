@@ -286,7 +286,7 @@ def test_scores_are_numbers_where_unknowns_are_seen_only_together(seed):
 def test_a_prior_counts_as_stated_where_a_part_of_all_stated_deviations_is_noise():
     share, slopes = 0.1, np.array([[0.0, 2.0], [0.0, -2.0], [1 / (0.5 * 0.1), 0.0]])  # the prior of the first is 0.5
     problem = MadeUp(linear(slopes, [3.0, 4.0, 0.0]), (1.0, 1.0), stated=1)
-    problem.options.stated_std_factor = share
+    problem.options = replace(problem.options, stated_std_factor=share)
     found = problem.evaluate([0.0, 0.0])
     covariance, chi2 = unknowns_covariance_and_reduced_chi2(problem, found)
     assert covariance[1, 1] == pytest.approx(chi2 / 8)

@@ -21,9 +21,8 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, System, flexible_object, forward_kinematics
 from yid_ocp.model.flexible import edge_to_edge_transport_rotations
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import init_object_templates
+from yid_ocp.model.objects.base import OBJECT_KINDS, ObjectBuilder, init_object_templates
 from yid_ocp.model.objects.foam_y import foam_y_object, foam_y_segments
-from yid_ocp.model.objects.tapered_rod import TaperedRod
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.workflow.build import build_system, divided_joint_parameter_scale
 
@@ -221,9 +220,9 @@ def test_a_share_of_the_weight_leaves_the_inertia_whole():
 LENGTH, MASS, BEND, TIP_MASS, GRAVITY = 1.2, 0.05, 40.0, 0.02, 9.81
 
 
-def rod(links: int, tip_radius: float = 0.003) -> TaperedRod:
+def rod(links: int, tip_radius: float = 0.003) -> ObjectBuilder:
     sizes = {"length": LENGTH, "mass": MASS, "base_radius": 0.006, "tip_radius": tip_radius}
-    return TaperedRod(**sizes, links=links, joint_axes="x", gravity_fraction=0.0)
+    return OBJECT_KINDS["tapered_rod"](**sizes, links=links, joint_axes="x", gravity_fraction=0.0)
 
 
 def test_mass_and_centre_are_those_of_a_frustum() -> None:

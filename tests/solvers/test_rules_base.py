@@ -16,7 +16,7 @@ from yid_ocp.inference.linearized_residual import (
     projected_gradient_norm,
     size_limited_damped_step,
 )
-from yid_ocp.problem.evaluation import soft_logarithm_and_slope
+from yid_ocp.problem.evaluation import PriorResiduals
 from yid_ocp.solvers import GaussNewton, base
 from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, fit_problem
 from yid_ocp.solvers.gradient_methods import _PATIENCE_STEPS
@@ -471,11 +471,10 @@ def with_weak_prior(target, std=0.1, start=3.0):
     """One stiffness that the data want at a value, with the weak prior of a problem."""
 
     def rows(x, duration):
-        value, slope = soft_logarithm_and_slope(x / start)
-        spread = math.log(10.0)
-        residual = np.concatenate([(x - target) / std, value / spread])
-        return residual, np.array([[1 / std], [slope[0] / (spread * start)]])
+        value, slope = weak.residual_and_jacobian(x)
+        return np.concatenate([(x - target) / std, value]), np.array([[1 / std], slope[0]])
 
+    weak = PriorResiduals(np.array([start]), np.zeros((0, 1)), np.zeros(0), np.arange(1), math.log(10.0))
     return MadeUp(rows, (start,), weak=1)
 
 

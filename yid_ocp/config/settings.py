@@ -64,7 +64,7 @@ class _FrameSettings(MountSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GraspSettings:
+class _GraspSettings:
     """A grasp, which connects a frame of the object to a frame of the robot by a constraint."""
 
     holder_frame: Annotated[str, OptionInfo("frame of the robot")]
@@ -169,7 +169,7 @@ class _ModelSettings:
     object: Annotated[
         ObjectBuilder | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
     ] = None
-    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("grasps by name: left, right, gripper")] = field(
+    grasp: Annotated[Mapping[str, _GraspSettings], OptionInfo("grasps by name: left, right, gripper")] = field(
         default_factory=dict
     )
     joint_springs: Annotated[Mapping[str, _JointSpringSettings], OptionInfo("springs by joint of the robot")] = field(
@@ -268,7 +268,7 @@ class ParameterSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProblemSettings(ProblemOptions):
+class _ProblemSettings(ProblemOptions):
     """Settings of the estimation problem: residuals, initial state and time discretisation."""
 
     time_step: Annotated[
@@ -288,7 +288,7 @@ class ProblemSettings(ProblemOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiagnosisSettings(Thresholds):
+class _DiagnosisSettings(Thresholds):
     """The candidate effects and thresholds for the diagnosis of the sim-to-real gap."""
 
     candidates: Annotated[
@@ -428,12 +428,14 @@ class RunSettings:
     parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("parameters by name or pattern")] = field(
         default_factory=dict
     )
-    problem: Annotated[ProblemSettings, OptionInfo("the estimation problem")] = ProblemSettings()
+    problem: Annotated[_ProblemSettings, OptionInfo("the estimation problem")] = _ProblemSettings()
     solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("method that minimises the cost")] = (
         field(default_factory=GaussNewton)
     )
     compare: Annotated[_CompareSettings, OptionInfo("methods that `compare` runs")] = _CompareSettings()
-    diagnosis: Annotated[DiagnosisSettings, OptionInfo("candidates and thresholds of `diagnose`")] = DiagnosisSettings()
+    diagnosis: Annotated[_DiagnosisSettings, OptionInfo("candidates and thresholds of `diagnose`")] = (
+        _DiagnosisSettings()
+    )
     track: Annotated[_TrackSettings, OptionInfo("tracking of points in a camera's frames")] = _TrackSettings()
     plan: Annotated[_PlanSettings, OptionInfo("the motion that `plan` computes")] = _PlanSettings()
     virtual_arm: Annotated[VirtualArmImperfections, OptionInfo("properties of the virtual arms of `blind`")] = field(

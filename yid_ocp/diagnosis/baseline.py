@@ -69,7 +69,7 @@ class ParameterShiftsSinceBaseline:
         return {"parameters": {entry.name: attributes_to_dict(entry, _SHIFT) for entry in self.parameter_shifts}}
 
 
-def add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
+def _add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
     """Free the parameters that earlier runs estimated, and use these estimates as a joint Gaussian prior.
 
     Raises `ConfigError` if the model lacks a parameter or effect of the baseline, or if a parameter differs between
@@ -179,7 +179,7 @@ def problem_with_earlier_runs(
         baseline = EarlierRunsBaseline.from_run_estimates(runs, ())
     known = baseline.combined_estimates
     if known is not None and not problem.options.multivariate_prior.parameter_names:
-        problem = add_baseline_prior(problem, known)
+        problem = _add_baseline_prior(problem, known)
     return problem, baseline
 
 

@@ -87,8 +87,8 @@ def diagnose(
         Default: the package's log.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
         Estimates of earlier runs of the same model (`read_estimates`), used as priors unless the problem already has
-        them (`add_baseline_prior`): changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference
-        recordings made without the sought effects, which are predicted with the found effects removed.
+        them: changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference recordings made without
+        the sought effects, which are predicted with the found effects removed.
 
     Returns
     -------

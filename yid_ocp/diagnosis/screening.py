@@ -284,7 +284,7 @@ ScoredCandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], flo
 
 
 @dataclass(frozen=True)
-class LinearModelOfAllCandidates:
+class _JointScoreModel:
     """A linear model of how the amplitudes of all candidates change the residual, each at one shape value."""
 
     effects: tuple[EffectBase, ...]
@@ -315,7 +315,7 @@ class LinearModelOfAllCandidates:
 
 def _make_joint_score_model(
     point: ProjectedCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
-) -> LinearModelOfAllCandidates:
+) -> _JointScoreModel:
     """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
     kept = []
@@ -325,10 +325,10 @@ def _make_joint_score_model(
     every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
     effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
     bias = np.concatenate([np.zeros(0), *(s.score_bias for s in kept)])
-    return LinearModelOfAllCandidates(effects, shapes, every.T @ every, bias - every.T @ point.projected_residual)
+    return _JointScoreModel(effects, shapes, every.T @ every, bias - every.T @ point.projected_residual)
 
 
-def _confusability_matrix(everything: LinearModelOfAllCandidates) -> ConfusabilityMatrix:
+def _confusability_matrix(everything: _JointScoreModel) -> ConfusabilityMatrix:
     """Fractions of signatures that candidates explain of each other, with amplitudes scaled by prior range."""
     ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_parameter_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
@@ -351,7 +351,7 @@ class ScreeningResult:
     detectability: tuple[CandidateDetectability, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
-    joint_score_model: LinearModelOfAllCandidates
+    joint_score_model: _JointScoreModel
 
     @property
     def largest_predicted_chi2_decrease(self) -> float:
@@ -360,7 +360,7 @@ class ScreeningResult:
 
 
 EMPTY_SCREENING_RESULT = ScreeningResult(
-    (), (), ConfusabilityMatrix((), np.zeros((0, 0))), LinearModelOfAllCandidates((), (), np.zeros((0, 0)), np.zeros(0))
+    (), (), ConfusabilityMatrix((), np.zeros((0, 0))), _JointScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
 )
 """Screening where the model cannot be simulated: no candidate is known there."""
 

@@ -16,7 +16,7 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
 from yid_ocp.problem.options import ExcessResidualCriteria
 
-UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
+_UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
 
 _LOGISTIC_OFFSET, _LOGISTIC_SLOPE = -0.2, 0.8  # of the log odds over the logarithm of what is unexplained
@@ -94,7 +94,7 @@ class Judgement:
     """The verdict of a diagnosis and the effects that it selects, with the statistics that support them."""
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
-    unknown_reason: UnknownVerdictReason
+    unknown_reason: _UnknownVerdictReason
     single_effect_models: tuple[RefitStatistics, ...]  # refits of the first round, best first
     selected_effects: tuple[SelectedEffect, ...]
     explained_fraction: float  # decrease of r'r by the effects over its excess over noise
@@ -152,17 +152,17 @@ class Judgement:
         return 1.0 - (1.0 - limits.min_explained_fraction) ** len(independent)
 
 
-def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) -> tuple[str, UnknownVerdictReason]:
+def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) -> tuple[str, _UnknownVerdictReason]:
     """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`.
 
     A gap that is seen only along a candidate's signature counts only with an accepted effect.
     """
-    reasons: dict[UnknownVerdictReason, bool] = {
+    reasons: dict[_UnknownVerdictReason, bool] = {
         "none": not said.selected_effects,
         "little": said._largest_explained_fraction < said.required_total_explained_fraction(limits),
         "stand_in": bool(said.failed_transfer_checks),
     }
-    reason: UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
+    reason: _UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
     if not suffice:
         return "insufficient_data", ""
     if reason:

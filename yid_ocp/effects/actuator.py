@@ -108,7 +108,7 @@ class _SeriesElasticity(_DistortedReading):
 
 
 @EFFECTS.register("backlash")
-class Backlash(_DistortedReading):
+class _Backlash(_DistortedReading):
     """The backlash of a gear with its encoder on the motor side, so that the measured angle depends on the effort.
 
     A position servo controls the measured angle, so its torque depends on the play z between motor and joint. For a

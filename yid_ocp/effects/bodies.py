@@ -134,7 +134,7 @@ class _PointMass(EffectBase):
 
 
 @EFFECTS.register("payload")
-class Payload(EffectBase):
+class _Payload(EffectBase):
     """A point mass fixed to a frame, with first moments m = (mx, my, mz) about the frame. A negative mass removes mass.
 
     Let the bodies that move with the joint have mass M, centre C, and second-moment matrix Sigma, the integral of r r'
@@ -209,13 +209,13 @@ class Payload(EffectBase):
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
-    """Ratio of limited to given first moments; see `Payload`."""
+    """Ratio of limited to given first moments; see `_Payload`."""
     most = (_MAX_PAYLOAD_DISTANCE * mass) ** 2 + (_MAX_COM_SHIFT * max(own, 1.0)) ** 2
     return (1 + (ca.dot(moment, moment) / most) ** 4) ** (-1 / 8)
 
 
 def _spread(mass: ca.SX, first: ca.SX, link: _CarriedBody) -> ca.SX:
-    """Factor of e e' in K, 1/mass for a point; see `Payload`."""
+    """Factor of e e' in K, 1/mass for a point; see `_Payload`."""
     far = ca.dot(first, first) / _POINT_INERTIA_DISTANCE**2
     inverse = mass**3 / (mass**4 + far**2 + _POINT_INERTIA_MIN_MASS**4)
     if link.mass == 0:

@@ -127,7 +127,7 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
 
 
 def export_recording_csv_files(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write each group of a recording as a table `GROUP.csv` with all digits, which `read_csv` can read.
+    """Write each group of a recording as a table `GROUP.csv` with all digits, which `read_any` can read.
 
     The tables omit standard deviations, the kind of effort, sensor, frame, pose and clock. The cells of an unseen point
     are empty. Returns the written files, joints first. Raises `OutputError` if a file exists or cannot be written.

@@ -339,8 +339,8 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
     return -float(outcome.fun), 10.0 ** float(outcome.x)
 
 
-def select_and_smooth_unknowns(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float = DEFAULT_MIN_LOG_BAYES_FACTOR
+def _select_and_smooth_unknowns(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float
 ) -> SmoothedUnknownsResult:
     """Select groups of unknown forces, offsets and biases that raise the log evidence at a fit `x`, and estimate them.
 
@@ -373,9 +373,12 @@ def select_and_smooth_unknowns(
 
 
 def smooth_unknowns_about_fit(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float = DEFAULT_MIN_LOG_BAYES_FACTOR
 ) -> SmoothedUnknownsResult:
-    """Run `select_and_smooth_unknowns` with torque noise in the unknown forces, and constant sensor errors removed."""
+    """Select and estimate unknown forces, offsets and biases that raise the log evidence at `x` by more than `least`.
+
+    Torque noise is part of the unknown forces, and constant sensor errors are removed first.
+    """
     if problem.has_process_noise:
         problem = problem_with_sensor_noise_only(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
@@ -386,7 +389,7 @@ def smooth_unknowns_about_fit(
         ]
         problem = problem.with_episodes(less, ())
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
-    return select_and_smooth_unknowns(problem, x, evaluation, least)
+    return _select_and_smooth_unknowns(problem, x, evaluation, least)
 
 
 def force_log_likelihood_coefficients(

@@ -294,7 +294,7 @@ class PriorResiduals:
         """Return the residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
         stated, weak, start = self.stated_jacobian, self.weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
-        value, slope = soft_logarithm_and_slope(x[weak] / start[weak])
+        value, slope = _soft_logarithm_and_slope(x[weak] / start[weak])
         rows[len(stated) + np.arange(len(weak)), weak] = slope / (self.weak_log_std * start[weak])
         return np.concatenate([stated @ (x - start), value / self.weak_log_std]), rows
 
@@ -374,7 +374,7 @@ def check_initial_values_and_bounds(system: System, free: Sequence[str], theta: 
             raise ConfigError(what, where=f"parameters.{name}.bounds", allowed="lower below upper", hint=hint)
 
 
-def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
+def _soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
     """Return the logarithm of a ratio and its derivative, continued by a parabola below `SOFT_LOGARITHM_MIN_RATIO`."""
     below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
     small = below < 0

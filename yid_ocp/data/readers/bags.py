@@ -143,8 +143,8 @@ class _Contents:
 
 
 @dataclass(frozen=True)
-class BagOptions(base.JointPointAndUnitOptions):
-    """Options of `read_bag`: topics, joints and points, with their names in the recording, and units.
+class _BagOptions(base.JointPointAndUnitOptions):
+    """Options of bags: topics, joints and points, with their names in the recording, and units.
 
     Messages that lack one of the `joints` are skipped. `joints` is required if the messages of a topic differ in their
     joints. The keys of `point_names` are topics, or `TOPIC:CHILD` for a frame of `/tf`. By default, all topics of
@@ -162,11 +162,11 @@ class BagOptions(base.JointPointAndUnitOptions):
     description: str = ""  # what was recorded
 
 
-_DEFAULTS = BagOptions()
+_DEFAULTS = _BagOptions()
 
 
-def read_bag(
-    path: str | os.PathLike[str], options: BagOptions = _DEFAULTS, progress: Progress = NULL_PROGRESS
+def _read_bag(
+    path: str | os.PathLike[str], options: _BagOptions = _DEFAULTS, progress: Progress = NULL_PROGRESS
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
@@ -246,7 +246,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
 
 
 for _kind in (".bag", ".mcap", ".db3", "folder"):
-    base.READERS.register(_kind)(read_bag)
+    base.READERS.register(_kind)(_read_bag)
     base.FILE_PREVIEWERS.register(_kind)(_preview_bag)
 
 
@@ -391,7 +391,7 @@ class _States(NamedTuple):
     command: bool = False
 
 
-def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
+def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
     topics, command = options.joint_topics, options.command_topic
     default = [bag.topic_of_fields] if bag.topic_of_fields else _default_joint_topics(bag.file)
     known = list(dict.fromkeys([*bag.file.topic_names_of_types(*_JOINT_TYPES), *default]))

@@ -35,7 +35,7 @@ class _Markers(NamedTuple):
 
 
 @base.READERS.register(".c3d")
-def read_c3d(
+def _read_c3d(
     path: str | os.PathLike[str],
     *,
     point_names: Mapping[str, str] | None = None,

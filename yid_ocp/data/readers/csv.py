@@ -42,10 +42,10 @@ _LISTED = 5  # numbers of bad lines in a note
 
 
 @dataclass(frozen=True)
-class CsvOptions(base.JointPointAndUnitOptions):
-    """Options of `read_csv`: meaning of columns, columns to keep, delimiter, header and clock.
+class _CsvOptions(base.JointPointAndUnitOptions):
+    """Options of CSV files: meaning of columns, columns to keep, delimiter, header and clock.
 
-    `column_meanings` maps names of columns that `read_csv` does not recognise to meanings: `t`, `channel:joint`,
+    `column_meanings` maps names of columns that are not recognised to meanings: `t`, `channel:joint`,
     `axis:point`, or `skip`. A `*` in a name matches any text, and this text replaces the `*` in the meaning. Example:
     `*_pos` with the meaning `position:*`.
     """
@@ -60,10 +60,10 @@ class CsvOptions(base.JointPointAndUnitOptions):
     description: str = ""  # what was recorded
 
 
-_DEFAULTS = CsvOptions()
+_DEFAULTS = _CsvOptions()
 
 
-def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> Recording:
+def _read_csv(path: str | os.PathLike[str], options: _CsvOptions = _DEFAULTS) -> Recording:
     """Read a recording from a CSV table with one row per time. Its points become one group `points`.
 
     Columns are recognised by name, optionally with a unit (`time [ms]`, `q1_deg`):
@@ -109,7 +109,7 @@ def _delimiter(path: Path) -> str:
     return next((mark for mark in "\t; " if mark in first[0].strip()), ",") if len(first) == 1 else ","
 
 
-def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
+def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: _CsvOptions = _DEFAULTS) -> Recording:
     """Recording with the joints, points and other sensors of the table, in the units of the table."""
     t = table[:, meanings.index(("t", ""))]
     found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNEL_UNITS]
@@ -174,7 +174,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     names = [cell.strip() for cell in next(lines, (1, []))[1]]
     head = next(lines, None)
     if len(names) < 2 or head is None:  # the error of reading such a file
-        _read_table(path, CsvOptions(delimiter=delimiter))
+        _read_table(path, _CsvOptions(delimiter=delimiter))
     n_lines, numbers, blank = 0, array("d"), bytearray()
     first_lines = [head] if head else []
     if all(_is_number(cell) for cell in names):
@@ -227,7 +227,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
 
 
 for _suffix in (".csv", ".tsv", ".txt"):
-    base.READERS.register(_suffix)(read_csv)
+    base.READERS.register(_suffix)(_read_csv)
     base.FILE_PREVIEWERS.register(_suffix)(_preview_csv)
 
 _ALLOWED = "one header row with names such as t, q_<joint>, effort_<joint>, <point>_x"
@@ -283,7 +283,7 @@ def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
 
 
 def _read_table(
-    path: Path, options: CsvOptions
+    path: Path, options: _CsvOptions
 ) -> tuple[list[tuple[str, str]], dict[str, str], Array, tuple[str, ...]]:
     """Meanings of the columns that have one, units in the header, values (rows, columns), and notes on bad lines."""
     lines = _table_rows(path, options.delimiter or _delimiter(path))
@@ -319,7 +319,7 @@ def _read_table(
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
-def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> None:
+def _check_header(header: Sequence[str], path: Path, options: _CsvOptions) -> None:
     if not any(header):
         raise DataError("the table is empty", where=str(path), allowed=_ALLOWED, hint="export it again")
     if options.has_header and all(_is_number(cell) for cell in header):

@@ -58,7 +58,7 @@ class _Dataset(NamedTuple):
 
 
 @base.READERS.register("LeRobot dataset")
-def read_lerobot_episode(
+def _read_lerobot_episode(
     path: str | os.PathLike[str],
     *,
     episode: int = 0,

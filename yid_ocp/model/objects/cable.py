@@ -252,7 +252,7 @@ def _segments(
 
 @OBJECT_KINDS.register("cable")
 @dataclass(frozen=True, kw_only=True)
-class ClampedCable(CableOptions, ObjectBuilder):
+class _ClampedCable(CableOptions, ObjectBuilder):
     """A cable (with branches or without) between two clamps that follow measured points, without a robot."""
 
     settings_examples: ClassVar[Mapping[str, str]] = {

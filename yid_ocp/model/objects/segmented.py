@@ -23,7 +23,7 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 
 
 @dataclass(frozen=True, kw_only=True)
-class SegmentGeometrySettings:
+class _SegmentGeometry:
     """The settings of one segment of rigid links. Stiffness and damping are set in `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed with link_lengths", "m")] = None
@@ -77,15 +77,15 @@ class SegmentGeometrySettings:
         )
 
 
-def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> SegmentGeometrySettings:
+def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> _SegmentGeometry:
     """A segment for `init`. If its cross-section is rectangular, it bends only across its thinner side."""
     section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
-    return SegmentGeometrySettings(values_given_as_rigidities=True, clamped_at_base=more.get("parent") is None, **more)
+    return _SegmentGeometry(values_given_as_rigidities=True, clamped_at_base=more.get("parent") is None, **more)
 
 
-def _init_object(word: str, segments: Mapping[str, SegmentGeometrySettings]) -> InitialObjectSettings:
+def _init_object(word: str, segments: Mapping[str, _SegmentGeometry]) -> InitialObjectSettings:
     item = _SegmentedObject(named_segments=segments)
     start = base.initial_parameters_with_comments(item.segment_definitions(), _RIGIDITY_RATIO[word])
     return InitialObjectSettings(item, start)
@@ -134,9 +134,9 @@ def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
     return x, y
 
 
-def _grown(branches: Sequence[tuple[str, SegmentGeometrySettings]]) -> dict[str, SegmentGeometrySettings]:
+def _grown(branches: Sequence[tuple[str, _SegmentGeometry]]) -> dict[str, _SegmentGeometry]:
     """Branches by name, after a check for unique names and for parents that precede their children."""
-    made: dict[str, SegmentGeometrySettings] = {}
+    made: dict[str, _SegmentGeometry] = {}
     for name, branch in branches:
         if name in made:
             what, allowed = f"two branches are called '{name}'", "a name of its own for each branch"
@@ -149,7 +149,7 @@ def _grown(branches: Sequence[tuple[str, SegmentGeometrySettings]]) -> dict[str,
     return made
 
 
-def _branch(text: str, links: int) -> tuple[str, SegmentGeometrySettings]:
+def _branch(text: str, links: int) -> tuple[str, _SegmentGeometry]:
     said, equals, numbers = text.partition("=")
     name, at, parent = said.partition("@")
     count = len(numbers.split(","))
@@ -197,8 +197,8 @@ values_given_as_rigidities: true, clamped_at_base: true}
 
     kind: Annotated[Literal["segments"], OptionInfo("kind of object")] = "segments"
     mount: Annotated[base.MountSettings, OptionInfo("pose of the root")] = field(default_factory=base.MountSettings)
-    named_segments: Annotated[Mapping[str, SegmentGeometrySettings], OptionInfo("segments by name, parents first")] = (
-        field(default_factory=dict)
+    named_segments: Annotated[Mapping[str, _SegmentGeometry], OptionInfo("segments by name, parents first")] = field(
+        default_factory=dict
     )
 
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:

@@ -25,13 +25,13 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitialObjectSetting
     length, mass, radius, tip = base.required_object_numbers(
         "a tapered rod", numbers, base.SIZE_AND_MASS_DESCRIPTIONS | _FURTHER_NUMBERS
     )
-    item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
+    item = _TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
     return InitialObjectSettings(item, base.initial_parameters_with_comments(item.segment_definitions(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
 @dataclass(frozen=True, kw_only=True)
-class TaperedRod(MountedObjectBuilder):
+class _TaperedRod(MountedObjectBuilder):
     """A solid round rod whose radius changes linearly from the clamped base to the tip. The segment is named `rod`.
 
     `rod.bend` and `rod.twist` [N m^2] and `rod.damping` [N m^2 s] are the values at the base. At radius r they are
