@@ -8,15 +8,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.pinocchio_comparison import (
-    _PinocchioComparison,
-    compare_system_with_pinocchio,
-    compare_urdf_with_pinocchio,
-)
+from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.effects import make_effect
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import Mechanism, rotation_from_rpy
-from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 
 GRAVITY = np.array([0.3, -0.2, -9.81])
 KEPT = ["extend", "hinge", "spin", "swing"]
@@ -76,8 +72,10 @@ def test_effects_are_compared_as_well(urdf_folder, kind, location, value):
 
 def test_differences_and_files_that_pinocchio_does_not_read_are_said(tmp_path, urdf_folder):
     said = "it differs from Pinocchio's: weight by 2 % of the largest entry"
-    assert _PinocchioComparison("it", 0.0, 0.02, 0.0).words == said
-    assert _PinocchioComparison("it", 0.0, float("nan"), 0.0).agrees_within_rounding is False
+    system = branched(urdf_folder)
+    same = compare_system_with_pinocchio(system, system.parameters.vector(), np.zeros(system.n_coordinates))
+    heavier, unknown = (replace(same, of="it", weight=error) for error in (0.02, float("nan")))
+    assert (heavier.words, unknown.agrees_within_rounding) == (said, False)
     (tmp_path / "odd.urdf").write_text("<robot name='odd'><link name='a'/><link name='b'/></robot>")
     with pytest.raises(ValueError, match="valid URDF"):
         compare_urdf_with_pinocchio(tmp_path / "odd.urdf", read_urdf(urdf_folder / "double_pendulum.urdf"), GRAVITY)
@@ -97,7 +95,7 @@ def test_differences_and_files_that_pinocchio_does_not_read_are_said(tmp_path, u
 )
 def test_a_file_is_read_as_pinocchio_reads_it(urdf_folder, file, joints, locked):
     package = file.startswith("package:")
-    path = _example_robot_urdf(file.removeprefix("package:")) if package else urdf_folder / file
+    path = urdf_path_from_robot_name(file) if package else urdf_folder / file
     robot = read_urdf(file if package else path, joints=joints, locked=locked)
     found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, locked)
     assert found.agrees_within_rounding, found.words
@@ -123,7 +121,7 @@ def test_a_file_read_wrongly_or_a_lock_at_another_value_is_said(urdf_folder):
     [("package:panda", ["panda_hand"], None), ("double_pendulum.urdf", ["lower"], ["shoulder"])],
 )
 def test_what_is_left_out_of_a_file_is_left_out_of_both(urdf_folder, file, left_out, joints):
-    path = _example_robot_urdf("panda") if file.startswith("package:") else urdf_folder / file
+    path = urdf_path_from_robot_name("package:panda") if file.startswith("package:") else urdf_folder / file
     robot = read_urdf(path, joints=joints, exclude_links=left_out)
     found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, None, left_out)
     assert found.agrees_within_rounding, found.words

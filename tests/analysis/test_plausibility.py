@@ -42,7 +42,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import baxter_foam_y_system
@@ -84,7 +84,7 @@ def with_points(recording: Recording, name: str, change) -> Recording:
 def test_inverse_dynamics_are_pinocchios():
     pin = pytest.importorskip("pinocchio")
     arm = free_arm("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
-    whole = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
+    whole = pin.buildModelFromUrdf(str(urdf_path_from_robot_name("package:baxter")))
     others = [whole.getJointId(name) for name in whole.names[1:] if name not in arm.joint_names]
     model = pin.buildReducedModel(whole, others, pin.neutral(whole))
     data = model.createData()

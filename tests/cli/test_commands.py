@@ -9,12 +9,13 @@ import pathlib
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from unittest.mock import Mock
 
 import h5py
 import pytest
 
-from yid_ocp.analysis.pinocchio_comparison import _PinocchioComparison
+from yid_ocp.analysis.pinocchio_comparison import compare_urdf_with_pinocchio
 from yid_ocp.cli import COMMANDS
 from yid_ocp.config.reader import load_config, settable_keys_with_prefix
 from yid_ocp.config.schema import config_json_schema
@@ -329,8 +330,10 @@ def test_a_wrong_entry_leaves_nothing_behind(cli, pendulum, tmp_path, entry, sai
 
 
 def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):
-    otherwise = _PinocchioComparison("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
-    monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", lambda *arguments, **more: otherwise)
+    def otherwise(*arguments, **more):
+        return replace(compare_urdf_with_pinocchio(*arguments, **more), mass=0.03)
+
+    monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", otherwise)
     done = cli("check", pendulum, "--out", "c")
     assert done.code == 0, done.err
     assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in done.out

@@ -12,6 +12,7 @@ import pytest
 import scipy
 from made_series import seeing
 
+from yid_ocp.diagnosis import screening as module
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
@@ -80,6 +81,16 @@ def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) 
 
 def point(residual, *signatures: _EffectSignature) -> ProjectedCandidatesLinearization:
     return ProjectedCandidatesLinearization(np.asarray(residual, float), signatures)
+
+
+def screened(at: ProjectedCandidatesLinearization, channels=(), detectable_at=None) -> ScreeningResult:
+    """What screening says of a linearisation, with residuals in channels; detectable at so many standard deviations."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "linearize_candidates", lambda *_: at)
+        patch.setattr(module, "channels_with_residual_indices", lambda _: channels)
+        if detectable_at is not None:
+            patch.setattr(module, "DETECTABLE_AMPLITUDE_Z", detectable_at)
+        return module.screen_candidates(SimpleNamespace(problem=None), (), {})
 
 
 def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> CandidateScore:

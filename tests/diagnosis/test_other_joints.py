@@ -12,7 +12,7 @@ from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
@@ -28,7 +28,7 @@ CANDIDATES = ("joint_spring", "joint_coulomb", "effort_offset", "link_mass")
 def robot(side: str):
     names = tuple(f"{side}_{joint}" for joint in JOINTS)
     system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
-    model = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
+    model = pin.buildModelFromUrdf(str(urdf_path_from_robot_name("package:baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
     step = compile_step(system, TIME_STEP)
     return names, step, pin.buildReducedModel(model, locked, pin.neutral(model))

@@ -6,19 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
-from factories import alike, amplitude, cases, effect, point, score, shape, signature, visible
+from factories import alike, amplitude, cases, effect, point, screened, shape, signature
 from made_series import series
 from small_problems import PENDULUM, H, pendulum_step, taken
 
-from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.screening import (
-    _candidate_detectable_amplitudes,
-    _confusability_matrix,
     _covariance_of_scores,
-    _make_joint_score_model,
     _newey_west_covariance,
-    _score_candidates,
     _shape_grid,
     linearize_candidates,
     screen_candidates,
@@ -39,16 +34,25 @@ PAIR = effect("tilt@world", amplitude("x", lower=-9.0, upper=9.0), amplitude("y"
 SHAPED = effect("branch@T1", amplitude(), shape())
 
 
-@pytest.fixture(autouse=True)
-def detectable_at_two_standard_deviations(monkeypatch):
-    monkeypatch.setattr(screening, "DETECTABLE_AMPLITUDE_Z", 2.0)
+def scored(at, rows=None):
+    """The scores of candidates, all of them visible."""
+    return screened(at, [series(rows or range(len(at.projected_residual)))], detectable_at=0.0).candidate_scores
 
 
 def only(of, columns, residual, noise=None, **shapes):
     """The score of one candidate that is visible."""
-    at = point(residual, signature(of, columns, noise, **shapes))
-    [found] = _score_candidates(at, [series(range(len(residual)))], [visible(of)])
+    [found] = scored(point(residual, signature(of, columns, noise, **shapes)))
     return found
+
+
+def detectable(*signatures):
+    """Of one candidate, with all its shapes, beside a residual of zero."""
+    [found] = screened(point(np.zeros(len(signatures[0].projected_sensitivity)), *signatures), (), 2.0).detectability
+    return found
+
+
+def overlaps(at):
+    return screened(at, [series(())], detectable_at=0.1).confusability
 
 
 @cases(
@@ -176,21 +180,20 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
 )
 def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
     of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
-    [found] = _candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)))
+    found = detectable(signature(of, columns, noise))
     assert found.detectable_amplitudes == {"friction@elbow.a": pytest.approx(size)}
     assert found.is_detectable is seen
 
 
 def test_the_range_counts_from_the_neutral_value():
     of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
-    found = [_candidate_detectable_amplitudes(point([0.0], signature(of, [c])))[0] for c in (6.0, 8.0)]
+    found = [detectable(signature(of, [c])) for c in (6.0, 8.0)]
     assert [entry.is_detectable for entry in found] == [False, True]
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
 def test_the_best_shape_tells_what_is_detectable(order):
-    at = point([0.0], *(signature(SHAPED, [size], s=size) for size in order))
-    [found] = _candidate_detectable_amplitudes(at)
+    found = detectable(*(signature(SHAPED, [size], s=size) for size in order))
     assert found.detectable_amplitudes["branch@T1.a"] == pytest.approx(0.5)
     assert found.is_detectable
 
@@ -205,7 +208,7 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
         ((seen, weaker), "y", 0.5, True),
         ((hidden, larger), "x", 0.1, False),
     ):
-        [found] = _candidate_detectable_amplitudes(point([0.0], *pair))
+        found = detectable(*pair)
         assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
 
 
@@ -226,7 +229,7 @@ def test_stated_priors_scatter_as_stated_where_they_decide_a_score():
     """A load that the uncertain mass of a link imitates shows in the prior of that mass more than in the data."""
     x, r = np.array([0.1, -0.1, 0.1, 5.0]), np.array([0.1, 0.2, -0.1, -0.8])
     at = point(r, signature(TWO_SIDED, x, noise=1e-9, priors=25.0))
-    [found] = _score_candidates(at, [series(range(3))], [visible(TWO_SIDED)])
+    [found] = scored(at, range(3))
     assert found.lm_statistic == pytest.approx(float(x @ r) ** 2 / 25.0, rel=1e-2)
 
 
@@ -282,20 +285,20 @@ def test_the_best_of_many_shapes_counts_as_the_best_of_that_many_tries():
     r = np.array([-1.5, -1.5, 0.0, 0.0])
     columns = [np.array(c) for c in ([1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0])]
     at = point(r, *(signature(SHAPED, c, s=0.1 * (i + 1)) for i, c in enumerate(columns)))
-    [found] = _score_candidates(at, [series(range(4))], [visible(SHAPED)])
+    [found] = scored(at)
     alone = only(SHAPED, columns[1], r, s=0.2)
     assert found.predicted_values == {"branch@T1.a": pytest.approx(1.5), "branch@T1.s": 0.2}
     assert found.predicted_chi2_decrease == pytest.approx(4.5)
     assert found.p_value == pytest.approx(3 * alone.p_value)
     none = point(0 * r, *(signature(SHAPED, c, s=1.0) for c in columns))
-    assert _score_candidates(none, [series(range(4))], [visible(SHAPED)])[0].p_value == 1.0
+    assert scored(none)[0].p_value == 1.0
 
 
 def test_scores_are_of_visible_candidates_and_the_most_promising_first():
-    others = [effect(f"offset@{name}", amplitude(lower=-math.inf)) for name in ("a", "b", "c")]
+    ranges = {"a": (0.0, 9.0), "b": (0.0, 9.0), "c": (0.0, 1.0)}
+    others = [effect(f"offset@{name}", amplitude(lower=-math.inf, expected=own)) for name, own in ranges.items()]
     at = point([3.0, 2.0, 1.0], *(signature(of, np.eye(3)[i]) for i, of in zip((1, 0, 2), others, strict=True)))
-    seen = [visible(others[0]), visible(others[1]), visible(others[2], seen=False)]
-    found = _score_candidates(at, [series(range(3))], seen)
+    found = screened(at, [series(range(3))], detectable_at=2.0).candidate_scores
     assert [s.effect.label for s in found] == ["offset@b", "offset@a"]
     assert [s.predicted_chi2_decrease for s in found] == pytest.approx([9.0, 4.0])
 
@@ -305,25 +308,27 @@ def test_a_signature_explained_by_another():
     b = effect("b@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
     angle = math.radians(30)
     at = point([0.0] * 2, signature(a, [2.0, 0.0]), signature(b, [math.cos(angle), math.sin(angle)]))
-    found = _confusability_matrix(_make_joint_score_model(at))
+    found = overlaps(at)
     assert found.labels == ("a@x", "b@x")
     np.testing.assert_allclose(found.overlap_fractions, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
     # nothing is like what moves nothing
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
-    found = _confusability_matrix(_make_joint_score_model(at))
+    found = overlaps(at)
     np.testing.assert_array_equal(found.overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])
-    assert _confusability_matrix(_make_joint_score_model(point([0.0]))).labels == ()
+    assert overlaps(point([0.0])).labels == ()
 
 
 def test_shapes_are_those_of_the_scores_or_the_middle_of_the_grid():
     one = effect("one@x", amplitude())
     axes = [signature(SHAPED, np.eye(4)[i], s=0.1 * (i + 1)) for i in range(4)]
     at = point([0.0] * 4, *axes, signature(one, [0.0, 1.0, 0.0, 0.0]))
-    assert _confusability_matrix(_make_joint_score_model(at)).overlap_fractions[1, 0] == 0.0
-    chosen = score(SHAPED, step={"branch@T1.a": 1.0, "branch@T1.s": 0.2})
-    assert _confusability_matrix(_make_joint_score_model(at, [chosen])).overlap_fractions[1, 0] == pytest.approx(1.0)
-    middle = point([0.0] * 4, *axes, signature(one, [0.0, 0.0, 1.0, 0.0]))
-    assert _confusability_matrix(_make_joint_score_model(middle)).overlap_fractions[1, 0] == pytest.approx(1.0)
+    hidden = effect("branch@T1", amplitude(expected=(0.0, 0.0)), shape())
+    unseen = point([0.0, -1.0, 0.0, 0.0], *(replace(own, effect=hidden) for own in axes), at.signatures[-1])
+    assert overlaps(unseen).overlap_fractions[1, 0] == 0.0  # the third of four shapes
+    chosen = point([0.0, -1.0, 0.0, 0.0], *at.signatures)  # the second one explains it
+    assert overlaps(chosen).overlap_fractions[1, 0] == pytest.approx(1.0)
+    middle = point([0.0, -1.0, 0.0, 0.0], *unseen.signatures[:-1], signature(one, [0.0, 0.0, 1.0, 0.0]))
+    assert overlaps(middle).overlap_fractions[1, 0] == pytest.approx(1.0)
 
 
 def test_candidates_alike_explain_the_signature_from_the_limit_on():
@@ -339,10 +344,10 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = list(_make_joint_score_model(at).ranked_candidate_pairs([a.label, b.label, c.label]))
+    pairs = list(screened(at).joint_score_model.ranked_candidate_pairs([a.label, b.label, c.label]))
     assert ["".join(of.kind for of in pair) for pair, *_ in pairs] == ["ab", "ac", "bc"]
     assert pairs[0][1:] == (pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0}), pytest.approx(-1.0))
-    [(fewer, *_)] = _make_joint_score_model(at).ranked_candidate_pairs(["c@x", "b@x"])
+    [(fewer, *_)] = screened(at).joint_score_model.ranked_candidate_pairs(["c@x", "b@x"])
     assert fewer == (b, c)
 
 
@@ -352,12 +357,12 @@ def test_pairs_promise_what_the_linear_model_of_both_does():
     columns = [rng.standard_normal((9, len(of.amplitude_parameter_names))) for of in effects]
     residual = rng.standard_normal(9)
     made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
-    for pair, values, decrease in _make_joint_score_model(point(residual, *made)).ranked_candidate_pairs(
-        [of.label for of in effects]
-    ):
+    everything = screened(point(residual, *made)).joint_score_model
+    for pair, values, decrease in everything.ranked_candidate_pairs([of.label for of in effects]):
         x = np.hstack([columns[effects.index(of)] for of in pair])
         names = [name for of in pair for name in of.amplitude_parameter_names]
-        lower, upper = (np.concatenate([screening._room(of)[k] for of in pair]) for k in (0, 1))
+        own = [q for of in pair for q in of.definitions if not q.is_shape_parameter]
+        lower, upper = zip(*((q.lower - q.neutral_value, q.upper - q.neutral_value) for q in own), strict=True)
         step = np.clip(-np.linalg.lstsq(x, residual)[0], lower, upper)
         assert [values[name] for name in names] == pytest.approx(step)
         promised = residual @ residual - np.sum((residual + x @ step) ** 2)

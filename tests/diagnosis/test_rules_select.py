@@ -8,12 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from factories import alike, amplitude, cases, effect, fit, loss, point, score, screening, shape
+from factories import alike, amplitude, cases, effect, fit, loss, score, screening, shape
 from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult, _make_joint_score_model
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult
 from yid_ocp.diagnosis.select import (
     _is_needed,
     _is_significant,
@@ -182,7 +182,7 @@ def test_a_value_that_may_as_well_lie_within_is_not_out_of_its_range():
         assert (found.implausible_parameters(of, LIMITS) == []) is plausible
 
 
-FEW = _make_joint_score_model(point([0.0]))
+FEW = EMPTY_SCREENING_RESULT.joint_score_model
 
 
 def ranked(**decreases):

@@ -1,24 +1,19 @@
 """The steps of a diagnosis, each on its own."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from factories import point as made_point
+from factories import screened as screened_at
+from factories import signature as made_signature
 from made_series import series
 
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import (
-    ProjectedCandidatesLinearization,
-    _candidate_detectable_amplitudes,
-    _confusability_matrix,
-    _EffectSignature,
-    _make_joint_score_model,
-    _score_candidates,
-    linearize_candidates,
-)
+from yid_ocp.diagnosis.screening import ProjectedCandidatesLinearization, linearize_candidates, screen_candidates
 from yid_ocp.effects import make_effect
-from yid_ocp.inference.null_test import channels_with_residual_indices
 from yid_ocp.problem import EstimationProblem
 
 
@@ -55,10 +50,8 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
 
 
 def test_screening_finds_the_withheld_effect_first_and_promises_what_a_refit_does_to_a_linear_model(screened):
-    composed, nominal, point = screened
-    ranked = _score_candidates(
-        point, channels_with_residual_indices(nominal.problem), _candidate_detectable_amplitudes(point)
-    )
+    composed, nominal, _ = screened
+    ranked = screen_candidates(composed, (), nominal.values).candidate_scores
     assert ranked[0].effect.label == "joint_coulomb@elbow"
     assert ranked[0].predicted_values["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
     assert ranked[0].p_value < 1e-6
@@ -81,7 +74,7 @@ def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_t
         leak = np.abs(jacobian.T @ signature.projected_sensitivity / size[:, None]).max()
         assert leak < 1e-8 * max(np.abs(signature.projected_sensitivity).max(), 1e-300) * len(jacobian)
     # a candidate explains itself, and nothing explains more
-    table = _confusability_matrix(_make_joint_score_model(point))
+    table = screened_at(point).confusability
     assert np.diag(table.overlap_fractions) == pytest.approx(1.0)
     assert np.all((table.overlap_fractions >= 0) & (table.overlap_fractions <= 1))
     assert "joint_stribeck@elbow" in table.labels
@@ -90,7 +83,7 @@ def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_t
 def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_noise(screened):
     _, _, point = screened
     still = ProjectedCandidatesLinearization(0 * point.projected_residual, point.signatures)
-    sizes, silent = ([v.detectable_amplitudes for v in _candidate_detectable_amplitudes(at)] for at in (point, still))
+    sizes, silent = ([v.detectable_amplitudes for v in screened_at(at).detectability] for at in (point, still))
     assert sizes == silent
     coulomb = next(size["joint_coulomb@elbow.tau_c"] for size in sizes if "joint_coulomb@elbow.tau_c" in size)
     assert 0 < coulomb < 0.1
@@ -105,10 +98,7 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     # the more it leans towards the residual, the more of it the second one explains
     columns = (column, column - lean * residual)
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
-    signatures = tuple(
-        _EffectSignature(effect, own, x, x.T @ x, 0 * x.T @ x, np.zeros(1))
-        for own, x in zip(grid, columns, strict=True)
-    )
-    point = ProjectedCandidatesLinearization(residual[:, 0], signatures)
-    best = _score_candidates(point, [series(range(200))], _candidate_detectable_amplitudes(point))[0]
+    at = made_point(residual[:, 0], *(made_signature(effect, x) for x in columns))
+    at = replace(at, signatures=tuple(replace(s, shape_values=own) for s, own in zip(at.signatures, grid, strict=True)))
+    best = screened_at(at, [series(range(200))]).candidate_scores[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]

@@ -12,7 +12,7 @@ import pytest
 
 from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.effects import _SENSOR_KINDS, EffectBase, candidate_kinds_and_locations, make_effect
+from yid_ocp.effects import EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
@@ -181,7 +181,8 @@ def all_effects() -> Callable[[System], list[EffectBase]]:
     """Every kind at the last of the places where it can be in a system."""
 
     def every(system: System) -> list[EffectBase]:
-        places = dict(candidate_kinds_and_locations(system, _SENSOR_KINDS))
+        recorded = ("joints.position", "joints.effort", "camera", "nominal_clock")
+        places = dict(candidate_kinds_and_locations(system, recorded))
         return [make_effect(kind, place, system) for kind, place in places.items()]
 
     return every

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from yid_ocp.effects import _SENSOR_KINDS, EFFECTS, candidate_kinds_and_locations, make_effect
+from yid_ocp.effects import EFFECTS, candidate_kinds_and_locations, make_effect
 from yid_ocp.effects import base as places
 from yid_ocp.effects.base import EffectBase
 from yid_ocp.errors import ConfigError, ModelError
@@ -44,7 +44,7 @@ OF_SERVOS = {
 }
 
 
-SIGNALS = (*_SENSOR_KINDS, "wrist:left_gripper")
+SIGNALS = ("joints.position", "joints.effort", "camera", "nominal_clock", "wrist:left_gripper")
 
 
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
@@ -107,7 +107,7 @@ def test_places_of_a_beam_on_a_gripper(beam) -> None:
     unseen = [place for _, place in candidate_kinds_and_locations(beam, ["joints.position"])]
     assert len([place for place in unseen if place.startswith("panda_joint4")]) <= 1
     bare = System.build(beam.mechanism, prescribed=beam.prescribed)
-    assert [p for k, p in candidate_kinds_and_locations(bare, _SENSOR_KINDS) if k == "point_mass"]
+    assert [p for k, p in candidate_kinds_and_locations(bare, SIGNALS) if k == "point_mass"]
 
 
 def test_places_of_a_branched_cable(cable) -> None:

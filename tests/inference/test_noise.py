@@ -18,7 +18,7 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.evaluation import _sensor_whitened_residual
+from yid_ocp.problem.evaluation import whitened_prediction_residual
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
 TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
@@ -56,7 +56,7 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
     torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
     changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
     result = problem.predictor.predict_episode(changed, *problem.unpack_episode_unknowns(x, 0), False)
-    return _sensor_whitened_residual(changed.measurements, result).residual
+    return whitened_prediction_residual(changed, None, result).residual
 
 
 def slopes(change, count, size):

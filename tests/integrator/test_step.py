@@ -15,7 +15,7 @@ from yid_ocp.integrator.step_model import NewtonStatusCode
 from yid_ocp.model import EffectStepTerms, FlexibleSegment, Grasp, Parameters, System, flexible_object
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.system import six_joint_floating_mechanism
-from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 
 ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
 BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
@@ -36,7 +36,7 @@ def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, m
     pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
     system = System.build(read_urdf("package:baxter", joints=ARM), prescribed=ARM)
     theta = system.parameters.vector()
-    full = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
+    full = pin.buildModelFromUrdf(str(urdf_path_from_robot_name("package:baxter")))
     rest = [i for i in range(1, full.njoints) if full.names[i] not in ARM]
     model = pin.buildReducedModel(full, rest, pin.neutral(full))
     assert list(model.names[1:]) == ARM

@@ -18,7 +18,7 @@ from small_problems import (
 )
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.effects import _SENSOR_KINDS, candidate_kinds_and_locations, make_effect
+from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import input_or_servo_torques_of_rollout, simulate
@@ -188,13 +188,14 @@ def test_without_commands_it_says_what_is_missing(step) -> None:
 
 
 def test_effects_on_efforts_are_none_of_a_servo(step) -> None:
-    kinds = {kind for kind, place in candidate_kinds_and_locations(step.system, _SENSOR_KINDS) if place in PENDULUM}
+    recorded = ("joints.position", "joints.effort", "camera", "nominal_clock")
+    kinds = {kind for kind, place in candidate_kinds_and_locations(step.system, recorded) if place in PENDULUM}
     assert {"servo_gain", "servo_delay", "servo_saturation", "backlash", "encoder_offset"} <= kinds
     assert not kinds & {"effort_gain", "effort_offset", "effort_lag", "series_elasticity"}
     without = {kind for kind, _ in candidate_kinds_and_locations(step.system, ["joints.position"])}
     assert {"servo_gain", "servo_delay", "servo_saturation", "backlash"} <= without
     assert make_effect("servo_gain", "elbow", step.system).neutral_values == {"servo_gain@elbow.scale": 1.0}
-    bare = candidate_kinds_and_locations(replace(step.system, servos={}, driven=()), _SENSOR_KINDS)
+    bare = candidate_kinds_and_locations(replace(step.system, servos={}, driven=()), recorded)
     assert bare
     assert "servo_gain" not in {kind for kind, _ in bare}
 

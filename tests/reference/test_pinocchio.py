@@ -12,7 +12,7 @@ from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import mechanism as mechanism_module
 from yid_ocp.model.kinematics import lagrangian_first_derivatives, lagrangian_second_derivatives, mass_matrix
 from yid_ocp.model.objects.foam_y import foam_y_object
-from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 
 pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
 
@@ -87,7 +87,7 @@ def make_twin(urdf_folder, file, joints, locked):
     if file is None:
         path = urdf_folder / "y_object.urdf"
     elif file.startswith("package:"):
-        path = _example_robot_urdf(file.removeprefix("package:"))
+        path = urdf_path_from_robot_name(file)
     else:
         path = urdf_folder / file
     if file is None:
