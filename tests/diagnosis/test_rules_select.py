@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,11 +16,8 @@ from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult
 from yid_ocp.diagnosis.select import (
-    _is_needed,
-    _is_significant,
     _near_best_models,
     _pairs_to_refit,
-    _refit_shortlist,
     bic_difference,
     held_out_gap_closure,
     held_out_improvement_and_error,
@@ -192,9 +190,19 @@ def ranked(**decreases):
     ]
 
 
+def one_round(nominal, fits, screened=None, **limits):
+    """The effect that is selected of one round of refits, if any, and which candidates are refitted from where."""
+    tried = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(select, "refit_with_each_effect", lambda _, base, chosen, start: tried.extend(chosen) or fits)
+        search = Mock(thresholds=Thresholds(max_effects=1, **limits))
+        seen = screened or screening([score(found.effects[-1]) for found in fits])
+        return [entry.effect for entry in select_effects(search, nominal, seen)[1]], tried
+
+
 def shortlisted(scores, table, **limits):
     screened = ScreeningResult((), tuple(scores), table, FEW)
-    return [of.kind for (of,), _ in _refit_shortlist(screened, Thresholds(**limits))]
+    return [of.kind for (of,), _ in one_round(fit(), [], screened, **limits)[1]]
 
 
 def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
@@ -211,7 +219,7 @@ def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
     matrix[0, 2:] = matrix[1, 2:] = 0.95
     many = alike([s.effect.label for s in scores], matrix)
     assert shortlisted(scores, many, n_refit_per_round=2) == ["a", "b", "c", "d"], "as many more, and each once"
-    [((of,), step), *_] = _refit_shortlist(ScreeningResult((), tuple(scores), many, FEW), LIMITS)
+    [((of,), step), *_] = one_round(fit(), [], ScreeningResult((), tuple(scores), many, FEW))[1]
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
 
@@ -439,8 +447,8 @@ def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best,
 )
 def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):
     nominal, found = fit((), loss(*before)), there(SMALL, *after)
-    assert _is_needed(nominal, found, LIMITS) is sure
-    assert not _is_needed(nominal, found, Thresholds(min_log_bayes_factor=20.0))
+    assert one_round(nominal, [found])[0] == ([SMALL] if sure else [])
+    assert one_round(nominal, [found], min_log_bayes_factor=20.0)[0] == []
 
 
 def near(*fits):
@@ -498,8 +506,13 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
 
 def test_an_effect_that_is_not_there_any_more_beside_another_is_left_out_again(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING)
-    gone = {"a@x": 2}
-    monkeypatch.setattr(select, "_is_significant", lambda of, full, limits: gone.get(of.label) != len(full.effects))
+    fitted = rounds.fit
+
+    def without_a(effects):
+        rounds.absent = ("a",) if len(effects) == 2 else ()
+        return fitted(effects)
+
+    monkeypatch.setattr(rounds, "fit", without_a)
     assert rounds.compose(max_effects=2)[1] == ["b"]
 
 
@@ -596,12 +609,12 @@ def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
 @pytest.mark.parametrize(("std", "there"), [(0.499, True), (0.51, False)])
 def test_an_effect_within_two_standard_deviations_of_neutral_is_not_there(std, there):
     of = effect("wide@x", amplitude("a", neutral=1.0), shape("s"))
-    found = fit([of], values={"wide@x.a": 2.0}, std={"wide@x.a": std})
-    assert _is_significant(of, found, LIMITS) is there
-    assert _is_significant(of, found, Thresholds(min_z=1.9))
+    nominal, found = fit((), loss(3.0, 3.2)), fit([of], values={"wide@x.a": 2.0}, std={"wide@x.a": std})
+    assert one_round(nominal, [found])[0] == ([of] if there else [])
+    assert one_round(nominal, [found], min_z=1.9)[0] == [of]
     # a shape that is not known next to nothing makes the amplitude no less sure
     unsure = fit([of], values=found.values, std={"wide@x.a": 9.0}, held={"wide@x.a": std})
-    assert _is_significant(of, unsure, LIMITS) is there
+    assert one_round(nominal, [unsure])[0] == ([of] if there else [])
 
 
 def test_an_effect_that_is_not_there_is_not_added(monkeypatch):

@@ -6,29 +6,37 @@ from unittest.mock import Mock
 
 import factories as f
 import pytest
-from factories import added, carried, cases, closed, effect, fit
+from factories import added, cases, closed, effect, fit
 
 from yid_ocp.diagnosis import verdict as verdict_module
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import (
-    Judgement,
-    NominalModelGapEvidence,
-    _check_effect_amplitude_transfer,
-    _compare,
-    _explained_fraction,
-    _inflate_fit_stds_by_disagreement,
-    _probability,
-    _verdict,
-    judge,
-)
+from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
 
 LIMITS = Thresholds(min_explained_fraction=0.5)
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
 ELSEWHERE, THIRD = effect("friction@wrist"), effect("spring@elbow")
 LOADS = effect("load@elbow", alone=True), effect("load@wrist", alone=True)
+
+
+NOMINAL = replace(fit(lost=f.loss(3.0, 3.0), cost=100.0), residual_count=100)
+
+
+def explaining(part, effects, **more):
+    """A model whose effects explain a part of what exceeds the noise of `NOMINAL`."""
+    made = fit(effects, f.loss(3.0, 3.0), **more)
+    return replace(made, cost=100.0 - (100.0 * part + made.total_effect_parameter_count) / 2, residual_count=100)
+
+
+def judgement(chosen, again=None, *, nominal=NOMINAL, gap=True, enough=True, search=None):
+    """What is said of chosen effects; `again` is the refit on the held-out recordings."""
+    search = search or Mock(thresholds=LIMITS, refit_on_held_out=Mock(return_value=again))
+    evidence = Mock(nominal_model=nominal, exceeds_noise=Mock(return_value=gap), are_data_sufficient=enough)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verdict_module, "select_effects", lambda *_: ((), tuple(chosen)))
+        return judge(search, evidence)
 
 
 def scored(*p_values):
@@ -76,7 +84,7 @@ def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
 
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)
 NO_INTERVAL, MUCH = closed(0.9, math.nan, math.nan), closed(0.95, 0.9, 0.98)
-ALIKE = (added(ONE, [OTHER]),)
+SINGLE, ALIKE = (added(ONE),), (added(ONE, [OTHER]),)
 TWO, THREE = (added(ONE), added(OTHER)), (added(ONE), added(OTHER), added(THIRD))
 ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOADS[1]))
 
@@ -111,28 +119,24 @@ ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOA
     },
 )
 def test_the_verdict(changed, verdict):
-    assert judged(changed)[0] == verdict
+    assert judged(**changed).verdict == verdict
 
 
-def judged(changed):
-    """The verdict on effects that were added."""
-    said = {"gap": True, "added": (added(ONE),), "enough": True, "total": CERTAIN, "explained": 1.0, "carried": True}
-    said |= changed
-    checks = () if said["carried"] else (carried(),)
-    effects = tuple(replace(entry, cumulative_closure=said["total"]) for entry in said["added"])
-    found = Judgement("", "", (), effects, said["explained"], checks, 0.0)
-    return _verdict(found, said["gap"], said["enough"], LIMITS)
+def judged(added=SINGLE, total=CERTAIN, explained=1.0, carried=True, **more):
+    """What is said of effects that were added, of which the first explains nothing alone beside others."""
+    effects = [entry.effect for entry in added]
+    models = [explaining(explained if i == len(effects) else 0.0, effects[:i]) for i in range(1, len(effects) + 1)]
+    closures = [closed(0.1, 0.0, 0.2)] * (len(effects) - 1) + [total]
+    parts = zip(added, models, closures, strict=False)
+    chosen = [replace(entry, refitted_model=model, cumulative_closure=part) for entry, model, part in parts]
+    return judgement(chosen, None if carried else fit(effects), **more)
 
 
 @pytest.mark.parametrize(("alone", "verdict"), [(0.6, "effect"), (0.4, "unknown")])
-def test_a_further_effect_that_explains_too_little_is_no_doubt_about_the_first(alone, verdict, monkeypatch):
-    both = (added(ONE, part=closed(0.3, 0.2)), added(OTHER, fitted=fit([ONE, OTHER]), part=closed(0.3, 0.2)))
-    monkeypatch.setattr(verdict_module, "select_effects", lambda *_: ((), both))
-    monkeypatch.setattr(
-        verdict_module, "_explained_fraction", lambda _, last, limits: [alone, 0.7][len(last.effects) - 1]
-    )
-    evidence = Mock(nominal_model=fit(), exceeds_noise=Mock(return_value=True))
-    said = judge(Mock(thresholds=LIMITS, refit_on_held_out=Mock(return_value=None)), evidence)
+def test_a_further_effect_that_explains_too_little_is_no_doubt_about_the_first(alone, verdict):
+    models = explaining(alone, [ONE]), explaining(0.7, [ONE, OTHER])
+    both = tuple(added(of, fitted=own, part=closed(0.3, 0.2)) for of, own in zip((ONE, OTHER), models, strict=True))
+    said = judgement(both)
     assert (said.verdict, said.unknown_reason) == (verdict, "" if verdict == "effect" else "little")
     assert said.selected_effects == (both[:1] if verdict == "effect" else both)
 
@@ -147,15 +151,15 @@ def test_a_further_effect_that_explains_too_little_is_no_doubt_about_the_first(a
     ],
 )
 def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
-    assert judged(changed)[1] == reason
+    said, no_gap = judged(**changed), judged(**changed, gap=False)
+    assert said.unknown_reason == reason
     # seen along one candidate alone, it is no gap
-    assert judged(changed | {"gap": False}) == (("no_gap" if reason else judged(changed)[0]), "")
+    assert (no_gap.verdict, no_gap.unknown_reason) == ("no_gap" if reason else said.verdict, "")
 
 
 def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_more():
-    def sure(explained, effects=ALIKE, checks=()):
-        effects = tuple(replace(entry, cumulative_closure=closed(0.4, 0.0, 0.5)) for entry in effects)
-        return _probability(Judgement("", "", (), effects, explained, checks, 0.0), LIMITS)
+    def sure(explained, effects=ALIKE, carried=True):
+        return judged(effects, closed(0.4, 0.0, 0.5), explained, carried).probability
 
     assert sure(1.0, ()) == 0.0
     assert 0.8 < sure(1.0) < 1.0
@@ -163,7 +167,7 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
     assert sure(1.0) > sure(1.0, TWO) > sure(1.0, THREE)
     assert sure(1.0, TWO) > sure(0.9, TWO)
     assert sure(1.0, ONE_LAW) == sure(1.0)
-    assert sure(1.0, checks=(carried(),)) == sure(0.0)
+    assert sure(1.0, carried=False) == sure(0.0)
 
 
 def test_equivalent_effects_share_the_probability_of_their_set():
@@ -189,14 +193,14 @@ def test_what_effects_explain_of_what_exceeds_the_noise(costs, count, left, part
     """Fall of r'r less what one parameter takes, over its excess over the number of residuals."""
     nominal, last = fit(cost=costs[0]), fit([ONE], f.loss(left, left), cost=costs[1])
     nominal, last = (replace(own, residual_count=count) for own in (nominal, last))
-    assert _explained_fraction(nominal, last, LIMITS) == pytest.approx(part)
+    assert judgement([added(ONE, fitted=last)], nominal=nominal).explained_fraction == pytest.approx(part)
 
 
 @cases("before, left, part", {"part": (1.12, 1.09, 69 / 78), "third": (1.14, 1.09, 1.0), "noise": (1.005, 1.009, 1.0)})
 def test_a_gap_that_is_small_itself_is_explained_where_a_third_of_it_goes(before, left, part):
     nominal = replace(fit(lost=f.loss(before, before, count=1e4), cost=100.0), residual_count=122)
     last = replace(fit([ONE], f.loss(left, left, count=1e4), cost=65.0), residual_count=122)
-    assert _explained_fraction(nominal, last, LIMITS) == pytest.approx(part)
+    assert judgement([added(ONE, fitted=last)], nominal=nominal).explained_fraction == pytest.approx(part)
 
 
 @cases(
@@ -262,7 +266,7 @@ def of(label, values, stds, effects=(SPRING,)):
 )
 def test_recordings_that_disagree_by_as_much_as_an_effect_do_not_determine_it(first, second, agrees):
     one, other = (of("spring@elbow", {"k": value}, {"k": std}) for value, std in (first, second))
-    [entry] = _compare(SPRING, one, other)
+    [entry] = judgement([added(SPRING, fitted=one)], other).transfer_checks
     assert entry.is_consistent is agrees
     assert (entry.effect_label, entry.parameter, entry.unit) == ("spring@elbow", "k", "N m")
     assert (entry.estimation_value, entry.held_out_value) == (first[0], second[0])
@@ -272,9 +276,9 @@ def test_recordings_that_disagree_by_as_much_as_an_effect_do_not_determine_it(fi
 def test_one_part_of_a_vector_that_agrees_is_enough():
     stds = {"x": 1e-3, "y": 1e-3}
     one, other = (of("shift@grasp", values, stds, (SHIFT,)) for values in ({"x": 1.0, "y": 0.1}, {"x": 1.0, "y": -0.1}))
-    assert [entry.is_consistent for entry in _compare(SHIFT, one, other)] == [True, True]
+    assert [entry.is_consistent for entry in judgement([added(SHIFT, fitted=one)], other).transfer_checks] == [True] * 2
     far = of("shift@grasp", {"x": -1.0, "y": -0.1}, stds, (SHIFT,))
-    assert [entry.is_consistent for entry in _compare(SHIFT, one, far)] == [False, False]
+    assert [entry.is_consistent for entry in judgement([added(SHIFT, fitted=one)], far).transfer_checks] == [False] * 2
 
 
 @pytest.mark.parametrize(
@@ -291,30 +295,25 @@ def test_one_part_of_a_vector_that_agrees_is_enough():
 )
 def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(first, second, std):
     one, other = (of("spring@elbow", {"k": value, "s": 3.0}, {"k": size}) for value, size in (first, second))
-    counted = _inflate_fit_stds_by_disagreement(one, _compare(SPRING, one, other))
+    pairs = ((one, other), (other, one))
+    both = (judgement([added(SPRING, fitted=own)], there).selected_effects for own, there in pairs)
+    counted, again = (chosen[0].refitted_model for chosen in both)
     assert counted.std == one.std | {"spring@elbow.k": pytest.approx(std)}
     assert counted.values == one.values
-    again = _inflate_fit_stds_by_disagreement(other, _compare(SPRING, other, one))
     reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
     assert not abs(first[0] - second[0]) > reach  # their intervals overlap
 
 
 @pytest.mark.parametrize(("there", "std"), [(None, 0.4), (2.1, 0.4), (3.0, math.sqrt(0.5))])
-def test_an_estimate_is_as_unsure_as_further_effects_and_other_recordings_make_it(there, std, monkeypatch):
+def test_an_estimate_is_as_unsure_as_further_effects_and_other_recordings_make_it(there, std):
     """Of a single effect, and of one that is judged alone because two explain too little."""
-    first = replace(fit([SPRING], f.loss(3.0, 3.2), values={"spring@elbow.k": 2.0, "spring@elbow.s": 3.0}))
+    first = explaining(0.6, [SPRING], values={"spring@elbow.k": 2.0, "spring@elbow.s": 3.0})
     more = [replace(first, values=first.values | {"spring@elbow.k": 2.0 + by}) for by in (0.4, -0.4)]
     entry = replace(added(SPRING, fitted=first), extended_models=tuple(more))
-    both = (entry, added(OTHER, fitted=fit([SPRING, OTHER]), part=closed(0.3, 0.2)))
+    both = (entry, added(OTHER, fitted=explaining(0.7, [SPRING, OTHER]), part=closed(0.3, 0.2)))
     again = None if there is None else fit([SPRING, OTHER], values=first.values | {"spring@elbow.k": there})
-    search = Mock(thresholds=LIMITS, refit_on_held_out=Mock(return_value=again))
-    evidence = Mock(nominal_model=fit(), exceeds_noise=Mock(return_value=True))
-    monkeypatch.setattr(
-        verdict_module, "_explained_fraction", lambda _, last, limits: 0.6 if len(last.effects) == 1 else 0.7
-    )
     for chosen in ((entry,), both):
-        monkeypatch.setattr(verdict_module, "select_effects", lambda *_, chosen=chosen: ((), chosen))
-        [found] = judge(search, evidence).selected_effects
+        [found] = judgement(chosen, again).selected_effects
         assert found.refitted_model.std == {"spring@elbow.k": pytest.approx(std), "spring@elbow.s": 0.01}
 
 
@@ -348,7 +347,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", refitted)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
-    [entry] = _check_effect_amplitude_transfer(search, first)
+    [entry] = judgement([added(SPRING, fitted=first)], search=search).transfer_checks
     assert (entry.estimation_value, entry.held_out_value, entry.is_consistent) == (2.0, 7.0, False)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
     assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
@@ -361,5 +360,5 @@ def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, bloc
     asked = []
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", lambda *_: asked.append(True))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
-    assert _check_effect_amplitude_transfer(search, fit([SPRING])) == ()
+    assert judgement([added(SPRING)], search=search).transfer_checks == ()
     assert bool(asked) is not blocks
