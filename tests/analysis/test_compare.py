@@ -16,7 +16,6 @@ from yid_ocp.analysis import compare as module
 from yid_ocp.analysis import estimation
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, compare_methods
 from yid_ocp.analysis.estimation import (
-    _predict_held_out_with_expected_errors,
     _worse_than_baseline_issues,
     channels_worse_than_naive_prediction,
     choose_cable_memory_fit,
@@ -500,7 +499,9 @@ def test_the_error_to_expect_is_that_of_the_sensors_and_of_torques_as_wrong_as_s
         recordings = [replace(r, joints=replace(r.joints, effort_std=size, effort_bias_std=size)) for r in recordings]
         options = ProblemOptions(path_cutoff=math.inf, **how)
         made = EstimationProblem(step, recordings[:1], ("elbow.stiffness",), options, None, recordings[1:])
-        [(_, outcome)], found = _predict_held_out_with_expected_errors(made, made.initial_unknowns)
+        fit = replace(solution(elbow_stiffness=estimate(1.0)), x=made.initial_unknowns)
+        checks = estimation.add_intervals_and_checks(made, fit).checks
+        [(_, outcome)], found = checks.held_out_predictions, checks.expected_prediction_errors
         [(_, plain)] = made.predict_held_out(made.initial_unknowns)
         np.testing.assert_array_equal(outcome.predicted_outputs[0], plain.predicted_outputs[0])
         return found["run_4"]["points_arm.tip"]

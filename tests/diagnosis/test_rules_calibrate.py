@@ -13,8 +13,6 @@ import pytest
 
 from yid_ocp.diagnosis.blind import CaseGroundTruth
 from yid_ocp.diagnosis.blind_scores import (
-    _CALIBRATION_FORMAT,
-    _CALIBRATION_RULES,
     _conformal_quantile,
     _recommended_settings,
     calibrate_thresholds,
@@ -156,7 +154,7 @@ def test_cases_that_could_not_be_fitted_do_not_count() -> None:
 
 
 def test_every_rule_is_of_a_threshold() -> None:
-    assert all(hasattr(Thresholds(), rule.setting) for rule in _CALIBRATION_RULES.values())
+    assert all(hasattr(Thresholds(), rule["setting"]) for rule in calibrate_thresholds((), (), ())["rules"].values())
     wide = thresholds_always_accepting_best_candidate(Thresholds(n_refit_per_round=3))
     assert wide.n_refit_per_round == 3
     assert wide.significance_level > 1 > Thresholds().significance_level
@@ -168,19 +166,19 @@ def kept():
 
 
 def test_defaults_are_those_that_it_advises_and_follow_from_its_samples_by_the_rules_as_they_are(kept):
-    settings = [rule.setting for rule in _CALIBRATION_RULES.values()]
-    assert kept["format"] == _CALIBRATION_FORMAT
+    current = calibrate_thresholds((), (), ())
+    settings = [rule["setting"] for rule in current["rules"].values()]
+    assert kept["format"] == current["format"]
     assert kept["settings"] == {setting: getattr(DEFAULT_THRESHOLDS, setting) for setting in settings}
     least = DEFAULT_THRESHOLDS.null_test_excess_criteria.min_excess_chi2_per_dof
     assert least == kept["settings"]["min_excess_chi2_per_dof"]
     rules = kept["rules"]
-    assert set(rules) == set(_CALIBRATION_RULES)
-    for name, rule in _CALIBRATION_RULES.items():
+    assert set(rules) == set(current["rules"])
+    for name, rule in current["rules"].items():
         own = rules[name]
-        said = (own["setting"], own["of"], own["side"], own["limit"])
-        assert said == (rule.setting, rule.of, rule.side, rule.limit)
+        assert all(own[part] == rule[part] for part in ("setting", "of", "side", "limit"))
         sample = [float("-inf") if value is None else value for value in own["sample"]]
-        value, coverage = _conformal_quantile(sample, rule.side, kept["asked"])
+        value, coverage = _conformal_quantile(sample, own["side"], kept["asked"])
         assert own["coverage"] == coverage
         assert own["quantile"] == (None if value == float("-inf") else value)
     assert _recommended_settings(rules) == kept["settings"]

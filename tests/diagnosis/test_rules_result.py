@@ -7,7 +7,6 @@ from typing import get_args, get_type_hints
 import factories as f
 import pytest
 
-from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text
 from yid_ocp.diagnosis.verdict import Judgement
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel
@@ -97,7 +96,7 @@ def test_candidates_are_listed_with_what_was_added_first():
             ]
         ),
     )
-    listed = _ranked_candidates(made, made)
+    listed = made.to_dict()["which"]
     assert [f"{e['kind']}@{e['location']}" for e in listed] == ["friction@elbow", "offset@wrist", "third@x"]
     assert [(entry["score"], entry["p_value"]) for entry in listed] == [(9.0, 0.05), (8.0, 0.1), (7.0, 0.2)]
     told = [tuple(entry["parameters"]["a"].values()) for entry in listed]
@@ -115,7 +114,7 @@ def test_candidates_are_listed_with_what_was_added_first():
         single_effect_models=(f.fit([OFFSET]), f.fit([third])),
         screening=f.screening([f.score(FRICTION, 0.1)]),
     )
-    told = [(entry["kind"], entry["p_value"]) for entry in _ranked_candidates(made, made)]
+    told = [(entry["kind"], entry["p_value"]) for entry in made.to_dict()["which"]]
     assert told == [("offset", 1.0), ("third", 1.0), ("friction", 0.1)], "what has no score is not sure of anything"
 
 

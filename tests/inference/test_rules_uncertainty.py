@@ -28,8 +28,6 @@ from yid_ocp.inference.uncertainty import (
     _MIN_CLUSTER_CHANNELS,
     GoodnessOfFit,
     ParameterEstimate,
-    _cost_checked_std,
-    _misfit_sandwich_covariance,
     _score_covariance,
     apply_profile_interval,
     assess_goodness_of_fit,
@@ -205,7 +203,7 @@ def constant(residual):
 def widened(problem):
     found = problem.evaluate([0.0])
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, found)
-    return math.sqrt(_misfit_sandwich_covariance(problem, found, covariance)[0, 0] / covariance[0, 0])
+    return math.sqrt(misfit_robust_covariance(problem, found, BAD)[0, 0] / covariance[0, 0])
 
 
 def test_a_misfit_that_stays_for_long_counts_as_one_and_one_that_alternates_as_many():
@@ -221,9 +219,7 @@ def test_only_a_fit_that_does_not_explain_the_data_counts_its_misfit():
     found = problem.evaluate([0.0])
     plain, _ = unknowns_covariance_and_reduced_chi2(problem, found)
     assert misfit_robust_covariance(problem, found, GOOD) == plain
-    assert (
-        misfit_robust_covariance(problem, found, BAD) == _misfit_sandwich_covariance(problem, found, plain) > 5 * plain
-    )
+    assert misfit_robust_covariance(problem, found, BAD) > 5 * plain
 
 
 def test_a_misfit_of_one_block_or_of_none_widens_nothing():
@@ -231,7 +227,7 @@ def test_a_misfit_of_one_block_or_of_none_widens_nothing():
     for problem in (one, MadeUp(linear(np.zeros((3, 0))), ())):
         found = problem.evaluate(np.zeros(len(problem.initial_unknowns)))
         covariance, _ = unknowns_covariance_and_reduced_chi2(problem, found)
-        np.testing.assert_array_equal(_misfit_sandwich_covariance(problem, found, covariance), covariance)
+        np.testing.assert_array_equal(misfit_robust_covariance(problem, found, BAD), covariance)
 
 
 def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(urdf_folder):
@@ -255,7 +251,7 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
     plain, _ = unknowns_covariance_and_reduced_chi2(problem, found)
     assert len(series) >= _MIN_CLUSTER_CHANNELS
     assert expected > 3 * plain[0, 0]
-    assert _misfit_sandwich_covariance(problem, found, plain)[0, 0] == pytest.approx(expected)
+    assert misfit_robust_covariance(problem, found, BAD)[0, 0] == pytest.approx(expected)
 
 
 def test_scores_of_a_fit_scatter_as_the_noise_does_however_much_a_cluster_decides():
@@ -291,7 +287,7 @@ def test_a_prior_counts_as_stated_where_a_part_of_all_stated_deviations_is_noise
     covariance, chi2 = unknowns_covariance_and_reduced_chi2(problem, found)
     assert covariance[1, 1] == pytest.approx(chi2 / 8)
     assert covariance[0, 0] == pytest.approx(0.5**2)
-    assert _misfit_sandwich_covariance(problem, found, covariance)[0, 0] == pytest.approx(0.5**2)
+    assert misfit_robust_covariance(problem, found, BAD)[0, 0] == pytest.approx(0.5**2)
 
 
 def saturating(top):
@@ -304,17 +300,16 @@ def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, kept):
     problem = MadeUp(saturating(top), lower=-np.inf, scales=(1.0,), priors={"k0": 100.0})
     x = np.zeros(1)
     found = problem.evaluate(x)
-    std = _cost_checked_std(problem, x, found, unknowns_covariance_and_reduced_chi2(problem, found)[0])[0]
+    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, found)
     # at 1.96 standard deviations the cost is that of a saturated prediction: 0.5^2 in place of 3.84
-    assert std == pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01)
-    said = [estimated(problem, x, [[1.0]], fit)["k0"].std for fit in (GOOD, None)]
-    assert said == [pytest.approx(std), 1.0]
+    said = [estimated(problem, x, covariance, fit)["k0"].std for fit in (GOOD, None)]
+    assert said == [pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01), 1.0]
 
 
 @pytest.mark.parametrize("bound", [{"lower": 0.9}, {"lower": -np.inf, "upper": 1.1}])
 def test_beyond_a_bound_the_cost_is_not_asked(bound):
     problem = MadeUp(linear([[1.0]], [-1.0]), **bound)
-    assert _cost_checked_std(problem, np.ones(1), problem.evaluate([1.0]), np.eye(1))[0] == 1.0
+    assert estimated(problem, [1.0], np.eye(1))["k0"].std == 1.0
 
 
 def estimated(problem, x, covariance, fit=GOOD):
@@ -391,11 +386,8 @@ def test_a_standard_deviation_of_a_million_times_value_and_size_is_none(scale, e
 )
 def test_of_many_parameters_and_of_well_known_ones_none_is_asked(count, std, asked):
     problem = MadeUp(linear(np.eye(count)), np.ones(count))
-    x = np.ones(count)
-    found = problem.evaluate(x)
-    before = len(problem.asked)
-    _cost_checked_std(problem, x, found, std**2 * np.eye(count))
-    assert (len(problem.asked) > before) is asked
+    estimated(problem, np.ones(count), std**2 * np.eye(count))
+    assert (len(problem.asked) > 1) is asked
 
 
 def test_numbers_of_a_result():

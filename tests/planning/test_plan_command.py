@@ -12,14 +12,11 @@ from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.report.diagnosis_summaries import _planning_command
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
-from yid_ocp.workflow.plan import (
-    _compile_step_for_planning,
-    discrimination_plan_settings,
-    identified_parameters_with_covariance,
-    run_plan,
-)
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.plan import discrimination_plan_settings, identified_parameters_with_covariance, run_plan
 from yid_ocp.workflow.simulate import run_simulate
 
 PLAN = """\
@@ -110,7 +107,7 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
 def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_path):
     folder = solved(tmp_path / "solved", 4.0, 0.25)
     run = load_config(config, [f"plan.parameter_run_folder={folder}"])
-    step = _compile_step_for_planning(run)
+    step = compile_step(build_system(run), 0.01, use_compiler=False)
     theta, known, source = identified_parameters_with_covariance(run, step)
     assert theta[step.system.parameters.index("elbow.stiffness")] == 4.0
     assert known.parameter_names == ("elbow.stiffness",)

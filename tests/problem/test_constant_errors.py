@@ -11,7 +11,6 @@ from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import whitened_prediction_residual
 from yid_ocp.problem.measurements import (
-    _estimated_constant_errors,
     subtract_estimated_bias_and_clock_errors,
     whiten_against_sensor_biases,
     whitened_measurement_sensitivities_to_sensor_errors,
@@ -55,9 +54,6 @@ def test_the_map_is_that_of_generalised_least_squares():
     covariance = np.eye(40) + slopes @ slopes.T
     made = whiten_against_sensor_biases(slopes, columns)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
-    expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
-    found = _estimated_constant_errors(slopes, columns[:, 0])
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior_would_be(urdf_folder):

@@ -10,7 +10,7 @@ import pytest
 from small_problems import pendulum_step, taken
 
 from yid_ocp.analysis import estimation
-from yid_ocp.analysis.estimation import _predict_held_out_with_expected_errors
+from yid_ocp.analysis.estimation import add_intervals_and_checks, prediction_errors_units_and_fit_errors
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
@@ -25,6 +25,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import torque_offset_table_rows
+from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.check import _input_noise
@@ -79,15 +80,15 @@ def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
 
 
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
-    problem, _, held_out = solved_pendulum
-    entry = estimation._prediction_error_entry(problem, *held_out[0])
+    problem, fit, held_out = solved_pendulum
+    apart = [*held_out, (held_out[0][0], "step 3 did not converge")]
+    entry, failed, _ = prediction_errors_units_and_fit_errors(problem, fit, apart)[0]
     assert entry["recording"] == "held_out"
     samples = held_out[0][0].measurements[0]
     for i, channel in enumerate(samples.sensor.channel_names):
         error = held_out[0][1].predicted_outputs[0][:, i] - samples.value[:, i]
         assert entry["rmse"][channel] == pytest.approx(np.sqrt(np.nanmean(error**2)))
         assert entry["baselines"]["zero"][channel] == pytest.approx(np.sqrt(np.nanmean(samples.value[:, i] ** 2)))
-    failed = estimation._prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
     assert (failed["message"], failed["rmse"]) == ("step 3 did not converge", {})
     assert failed["baselines"] == entry["baselines"]
 
@@ -250,6 +251,12 @@ def test_a_guess_is_not_judged_by_the_sample_that_made_it():
     assert np.array_equal(guess[[0, 2], 3:], np.full((2, 3), 5.0))
 
 
+def fit_at(x) -> Solution:
+    """A fit of which nothing is known but where it ended."""
+    none = np.full((len(x), len(x)), np.nan)
+    return Solution(Status.CONVERGED, "", ("x",) * len(x), x, none, {}, np.inf, None, (), 1, 0.0, None, "none")
+
+
 def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
     """Errors of the stated size, drawn by the simulation: the root mean square of what they do is what is expected."""
     step = pendulum_step(urdf_folder, driven=("shoulder",), prescribed=("elbow",))
@@ -260,8 +267,10 @@ def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
     truth = EstimationProblem(step, [source], ("elbow.mass",), options)
     made = [replace(truth.simulate_synthetic_recording(seed=seed), name=f"held_{seed}") for seed in range(10)]
     problem = EstimationProblem(step, [source], ("elbow.mass",), options, held_out=made)
-    pairs, expected = _predict_held_out_with_expected_errors(problem, problem.initial_unknowns)
-    found = [estimation._prediction_error_entry(problem, *pair)["rmse"] for pair in pairs]
+    fit = fit_at(problem.initial_unknowns)
+    checks = add_intervals_and_checks(problem, fit).checks
+    pairs, expected = checks.held_out_predictions, checks.expected_prediction_errors
+    found = [entry["rmse"] for entry in prediction_errors_units_and_fit_errors(problem, fit, pairs)[0]]
     channel = next(name for name in expected["held_0"] if name.endswith(".tip"))
     errors = np.sqrt(np.mean([own[channel] ** 2 for own in found]))
     noise = np.sqrt(np.mean([own[channel] ** 2 for own in expected.values()]))
