@@ -11,12 +11,7 @@ import numpy as np
 import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
-from yid_ocp.analysis.clock_checks import (
-    _by_clock,
-    _clock_error,
-    clock_and_noise_issues_from_residuals,
-    clock_offset_drift_and_rms_distance,
-)
+from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, clock_offset_drift_and_rms_distance
 from yid_ocp.analysis.estimation import _baselines
 from yid_ocp.analysis.joint_checks import (
     _GRASP_FORCE_STD,
@@ -360,18 +355,6 @@ def test_points_may_be_as_far_off_as_they_are_said_to_be(arms, runs, std, is_kno
     groups = tuple(moved(g) if g.name == "points_arm" else g for g in runs[1].points)
     found = list(forward_kinematics_issues(arms[1], replace(runs[1], points=groups), usual))
     assert [doubt.cause for doubt in found] == (["point_frame"] if is_known else [])
-
-
-def test_a_clocks_offset_is_known_no_better_than_the_errors_that_look_like_it():
-    """Of a point that moves steadily: a frame that is off by 2 cm is an offset of 2 cm over the speed."""
-    t, speed, noise = np.linspace(0.0, 10.0, 400), 0.5, 1e-3
-    by_clock = _by_clock(t, np.full(400, speed / noise), (0.0, 10.0))
-    residual = by_clock[:, 0] * 0.03 + np.random.default_rng(0).standard_normal(400)
-    found = _clock_error(t, residual, by_clock, np.full((400, 1), 1 / noise), np.array([0.02]), (0.0, 10.0))
-    assert found.delay == pytest.approx(0.03, rel=0.02)
-    assert found.delay_std == pytest.approx(0.02 / speed, rel=0.02)
-    alone = _clock_error(t, residual, by_clock, np.zeros((400, 0)), np.zeros(0), (0.0, 10.0))
-    assert alone.delay_std == pytest.approx(noise / speed / math.sqrt(400), rel=0.5)
 
 
 def test_clocks_that_are_far_apart(arms, runs):

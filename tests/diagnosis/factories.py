@@ -83,13 +83,12 @@ def point(residual, *signatures: _EffectSignature) -> ProjectedCandidatesLineari
     return ProjectedCandidatesLinearization(np.asarray(residual, float), signatures)
 
 
-def screened(at: ProjectedCandidatesLinearization, channels=(), detectable_at=None) -> ScreeningResult:
+def screened(at, channels=(), detectable_at=module.DETECTABLE_AMPLITUDE_Z) -> ScreeningResult:
     """What screening says of a linearisation, with residuals in channels; detectable at so many standard deviations."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "linearize_candidates", lambda *_: at)
         patch.setattr(module, "channels_with_residual_indices", lambda _: channels)
-        if detectable_at is not None:
-            patch.setattr(module, "DETECTABLE_AMPLITUDE_Z", detectable_at)
+        patch.setattr(module, "DETECTABLE_AMPLITUDE_Z", detectable_at)
         return module.screen_candidates(SimpleNamespace(problem=None), (), {})
 
 

@@ -198,13 +198,13 @@ def test_rates_are_over_the_cases_that_they_speak_of():
 
 def test_probabilities_are_compared_with_how_often_sets_hold_the_cause():
     marks = [marked("single", probability=p, is_cause_in_sets=p > 0.5) for p in (0.1, 0.2, 0.9, 0.7, 0.8)]
-    found = blind_scores._calibration_rates([*marks, marked("single", answer="-", probability=0.0)])
+    found = blind_case_score_summary([*marks, marked("single", answer="-", probability=0.0)])["calibration"]
     assert [own["level"] for own in found["probabilities"]] == pytest.approx([0.1, 0.2, 0.7, 0.8, 0.9])
     assert [own["rate"] for own in found["probabilities"]] == [0.0, 0.0, 1.0, 1.0, 1.0]
     assert found["expected_calibration_error"] == pytest.approx((0.1 + 0.2 + 0.3 + 0.2 + 0.1) / 5)
-    assert blind_scores._calibration_rates([])["expected_calibration_error"] is None
+    assert blind_case_score_summary([])["calibration"]["expected_calibration_error"] is None
     equal = [marked("single", probability=0.8, is_cause_in_sets=i % 2 == 0) for i in range(20)]
-    assert blind_scores._calibration_rates(equal)["expected_calibration_error"] == pytest.approx(0.3)
+    assert blind_case_score_summary(equal)["calibration"]["expected_calibration_error"] == pytest.approx(0.3)
     # large sets and sets of each cause of a pair count, which are not right answers
     wide = score_blind_case(SINGLE, alike([WRONG], [WRONG, "a@b", "c@d", RIGHT]))
     assert (wide.right, wide.is_cause_in_sets, wide.probability) == (False, True, 0.9)
@@ -212,7 +212,7 @@ def test_probabilities_are_compared_with_how_often_sets_hold_the_cause():
     assert not score_blind_case(OUTSIDE, said("effect", [RIGHT])).is_cause_in_sets
     # answers of older versions have no probability
     older = score_blind_case(SINGLE, {key: own for key, own in said("effect", [RIGHT]).items() if key != "probability"})
-    assert blind_scores._calibration_rates([older])["expected_calibration_error"] is None
+    assert blind_case_score_summary([older])["calibration"]["expected_calibration_error"] is None
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,8 @@ def test_probabilities_are_compared_with_how_often_sets_hold_the_cause():
     [(0, 10, 0.0, 0.3085), (10, 10, 0.6915, 1.0), (3, 60, 0.0104, 0.1392), (85, 100, 0.7647, 0.9135)],
 )
 def test_rates_have_binomial_intervals(count, total, low, high):
-    found = blind_scores._binomial_proportion([True] * count + [False] * (total - count))
+    marks = [marked("null", gap=i < count) for i in range(total)]
+    found = blind_case_score_summary(marks)["intervals"]["false_alarms"]
     assert (found["count"], found["of"], found["rate"]) == (count, total, count / total)
     assert (found["low"], found["high"]) == (pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))
 
@@ -230,7 +231,7 @@ def test_what_was_said_of_what_is_counted():
     single = [said("effect", [RIGHT]), said("effect", ["density@T1"]), said("no_gap")]
     marks = [score_blind_case(SINGLE, answer) for answer in single]
     marks += [score_blind_case(NULL, said(verdict)) for verdict in ("no_gap", "unknown", "no_gap")]
-    assert blind_scores._confusion_matrix(marks) == {
+    assert blind_case_score_summary(marks)["confusion"] == {
         "true": ["kelvin_voigt", "null"],
         "said": ["density", "kelvin_voigt", "no_gap", "unknown"],
         "counts": [[1, 1, 1, 0], [0, 0, 2, 1]],
@@ -246,7 +247,9 @@ def test_intervals_and_p_values_are_held_against_what_they_promise():
         told = said("no_gap")
         return score_blind_case(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
 
-    found = blind_scores._calibration_rates([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
+    found = blind_case_score_summary([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])[
+        "calibration"
+    ]
     held = {entry["level"]: entry["count"] for entry in found["intervals"]}
     assert (held[0.5], held[0.8], held[0.9], held[0.95], held[0.99]) == (1, 1, 2, 2, 3)
     assert {entry["level"]: entry["count"] for entry in found["p_values"]} == {0.01: 0, 0.05: 1, 0.1: 1, 0.2: 1, 0.5: 2}

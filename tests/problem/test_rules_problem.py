@@ -57,9 +57,8 @@ def test_blocks_and_values_find_their_places():
     block = np.arange(10.0).reshape(2, 5)
     wide = LAYOUT.scatter_to_unknown_columns(block, 1)
     np.testing.assert_array_equal(wide[1], [5, 6, 0, 0, 0, 7, 8, 9])
-    np.testing.assert_array_equal(
-        LAYOUT.pack_same_for_all_recordings({"a": 1, "b": 2, "l": 3}.get, np.array([4, 5])), [1, 2, 3, 4, 5, 3, 4, 5]
-    )
+    packed = LAYOUT.pack_same_for_all_recordings({"a": 1, "b": 2, "l": 3}.get, np.array([4, 5]))
+    assert packed.tolist() == [1, 2, 3, 4, 5, 3, 4, 5]
 
 
 def test_a_recording_has_its_own_values_and_start(make):
@@ -77,10 +76,8 @@ def test_a_recording_has_its_own_values_and_start(make):
 
 def test_start_bounds_and_values_by_name(make):
     problem = make(initial_state="estimated", seeds=(1,))
-    assert problem.unknowns.named_values(problem.initial_unknowns) == {
-        **START,
-        **dict.fromkeys(problem.unknown_names[3:], 0.0),
-    }
+    named, begin = problem.unknowns.named_values, START | dict.fromkeys(problem.unknown_names[3:], 0.0)
+    assert named(problem.initial_unknowns) == begin
     lower, upper = problem.bounds
     assert lower[0] == 0.0
     assert upper[0] == math.inf
@@ -88,7 +85,7 @@ def test_start_bounds_and_values_by_name(make):
     np.testing.assert_array_equal(upper[3:], np.inf)
     found = problem.unknown_vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
     changed = {"elbow.stiffness": 9.0, "shoulder.stiffness": 0.0, "start.q.elbow[run_1]": 0.5}
-    assert problem.unknowns.named_values(found) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0), **changed}
+    assert named(found) == begin | changed
 
 
 def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, free_step):
@@ -302,13 +299,12 @@ def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, hel
     x = problem.unknown_vector({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
     found = problem.predict_held_out(x)
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
-    for i, (episode, result) in enumerate(found):
+    offsets = [offset for *_, offset in held_out_prediction_inputs(problem, x)]
+    for (episode, result), offset in zip(found, offsets, strict=True):
         theta = problem.system.parameters.vector({"elbow.stiffness": 4.0, "elbow.rest": 0.1})
-        expected = problem.predictor.predict_episode(
-            episode, theta, held_out_prediction_inputs(problem, x)[i][2], False
-        )
+        expected = problem.predictor.predict_episode(episode, theta, offset, False)
         np.testing.assert_allclose(result.predicted_outputs[0], expected.predicted_outputs[0], atol=1e-12)
-        assert np.any(held_out_prediction_inputs(problem, x)[i][2])
+        assert np.any(offset)
 
 
 def test_a_held_out_part_of_a_recording_shares_its_start_and_local_parameters(make):

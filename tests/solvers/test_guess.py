@@ -50,9 +50,8 @@ def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, t
     found = guess_unknowns_and_node_states(problem, nodes_of(problem), START, misfit)
     np.testing.assert_allclose(found.x, taken * START)
     assert list(dict.fromkeys(told)) == tried
-    rest = problem.predictor.initial_state_and_derivative(
-        problem.episodes[0], problem.unpack_episode_unknowns(found.x, 0)[0]
-    )
+    theta, _ = problem.unpack_episode_unknowns(found.x, 0)
+    rest = problem.predictor.initial_state_and_derivative(problem.episodes[0], theta)
     np.testing.assert_allclose(found.initial_states[0].state, rest.state, atol=1e-9)
 
 
