@@ -150,11 +150,10 @@ def test_csv_errors(case: str, tmp_path: Path) -> None:
 def test_csv_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
-    absent, folder = tmp_path / "absent.csv", tmp_path / "folder.csv"
-    folder.mkdir()
-    for file, message in ((path, "table in UTF-8"), (folder, "this is a folder"), (absent, "no such file")):
+    absent = tmp_path / "absent.csv"
+    for file, message in ((path, "table in UTF-8"), (tmp_path, "this is a folder"), (absent, "no such file")):
         with pytest.raises(DataError, match=message):
-            read_any(file)
+            READERS[".csv"](file)
     monkeypatch.setattr("csv.reader", Mock(side_effect=OSError(5, "any words")))
     with pytest.raises(DataError, match=r"cannot be read \(Input/output error\)(.|\n)*try: copy it again"):
         read_any(path)
