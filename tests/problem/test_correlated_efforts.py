@@ -18,7 +18,6 @@ from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, fit_problem
 from yid_ocp.solvers.symbolic_transcription import transcribe
