@@ -31,9 +31,8 @@ def without(recording: Recording, begin: float, end: float) -> Recording:
 def samples(channels: Sequence[str], std, unit="m", width=1, **more):
     """What one sensor measured, as far as rules look at it."""
     columns = tuple(channel for channel in channels for _ in range(width))
-    return SimpleNamespace(
-        sensor=seeing(channels, unit, width), channel_name_per_output=columns, std=np.asarray(std, float), **more
-    )
+    own = {"channel_name_per_output": columns, "smoothing_filter": None, **more}
+    return SimpleNamespace(sensor=seeing(channels, unit, width), std=np.asarray(std, float), **own)
 
 
 def seeing(channels: Sequence[str], unit="m", width=1, efforts=()):

@@ -32,7 +32,6 @@ from yid_ocp.sensors.base import missing_noise_level_error
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_SENSOR_KEY,
     JOINT_POSITION_GROUP_NAME,
-    PositionSensor,
     is_point_group_measured_by_arm,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -316,7 +315,7 @@ class ExperimentVariantSensitivityBuilder:
     def _with_encoders(self, problem: EstimationProblem) -> EstimationProblem | None:
         """Return the problem with encoder readings of driven joints, or None if the recorded experiment has none."""
         base = self.setting.problem
-        used = any(isinstance(samples.sensor, PositionSensor) for e in base.episodes for samples in e.measurements)
+        used = any(samples.sensor.position_joints for e in base.episodes for samples in e.measurements)
         if not used or not problem.system.driven:
             return None
         sensors = dict(problem.options.sensors)

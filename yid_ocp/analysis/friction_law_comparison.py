@@ -17,7 +17,6 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
-from yid_ocp.sensors.joints import JointSensor
 from yid_ocp.solvers import GaussNewton, Solution
 
 _MAX_FOLD_ITERATIONS = 15
@@ -94,7 +93,7 @@ def _indices_of_sensors_of_friction(samples: Sequence[SensorMeasurements]) -> Se
 
     Points on an object that a prescribed arm moves have the same error for all laws, which would hide differences.
     """
-    return [i for i, own in enumerate(samples) if isinstance(own.sensor, JointSensor)] or range(len(samples))
+    return [i for i, own in enumerate(samples) if not own.sensor.frame_names] or range(len(samples))
 
 
 def mean_and_std_error_over_motion_kinds(

@@ -22,7 +22,6 @@ from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_to
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.sensors.joints import PositionSensor
 
 _NEGLIGIBLE_STD = 0.1  # standard deviation of a reading that may be neglected, in units of its noise
 # Initial number of random samples of all errors, doubled while too small, and its maximum.
@@ -101,7 +100,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
     if not evaluation.ok or evaluation.jacobian is None:
         raise failed_rollout_error(evaluation.message)
     for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
-        if isinstance(samples.sensor, PositionSensor):
+        if samples.sensor.position_joints:
             read = samples.interpolate_to_samples(blur[samples.evaluation_nodes])
             own = samples.residual_and_jacobian(np.zeros(samples.value.shape), read).jacobian
             assert own is not None

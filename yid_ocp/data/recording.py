@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_of_sensor_group
+from yid_ocp.sensors.base import CHANNEL_KINDS, EffortSamplingKind, channel_kinds_of_sensor_group
 
 RecordedOrNominalClock = Literal["recorded", "nominal"]
 
@@ -279,7 +279,7 @@ class Recording(ReprMixin):
     @property
     def sensor_setting_keys(self) -> tuple[str, ...]:
         """Keys allowed under `sensors` in the settings for this recording, such as `joints.effort`."""
-        own = [f"joints.{quantity}" for quantity in ("effort", "position") if self.joints is not None]
+        own = [key for key in CHANNEL_KINDS if self.joints is not None and CHANNEL_KINDS[key].group == "joints"]
         own += [group.name for group in self.points]
         own += [f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values_by_quantity]
         return tuple(own)

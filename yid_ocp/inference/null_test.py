@@ -21,9 +21,9 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
+from yid_ocp.sensors.base import SmoothingFilter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
-from yid_ocp.sensors.mounted import MountedSensor
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS = 32  # draws of encoder noise, which give the variance of a score to a quarter
@@ -252,13 +252,11 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
             t = times_since_recording_start(episode, samples)
             place = np.full(samples.positive_weight_mask.shape, -1)
             place[samples.positive_weight_mask] = np.arange(rows.start, rows.stop)
-            autocorrelation = np.ones(1)
-            is_smoothed = isinstance(samples.sensor, MountedSensor) and problem.system.prescribed
-            if samples.sensor.effort_joints or is_smoothed:
-                cutoff, step = problem.options.path_cutoff, episode.grid.time_step
-                low_pass = ZeroPhaseLowPassFilter(cutoff) if is_smoothed else zero_phase_effort_filter(cutoff)
-                stride = low_pass.decorrelation_stride(step)
-                autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
+            autocorrelation, step = np.ones(1), episode.grid.time_step
+            if (low_pass := samples.smoothing_filter) is not None:
+                autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[
+                    :: low_pass.decorrelation_stride(step)
+                ]
             for column, channel in enumerate(samples.channel_name_per_output):
                 seen = samples.positive_weight_mask[:, column]
                 if seen.any():
@@ -267,7 +265,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
     return tuple(series)
 
 
-def _filtered_noise_autocorrelation(low_pass: ZeroPhaseLowPassFilter, step: float) -> Array:
+def _filtered_noise_autocorrelation(low_pass: SmoothingFilter, step: float) -> Array:
     """Autocorrelation of filtered white noise at lags 0, 1, ... times `step` [s]."""
     if not np.isfinite(low_pass.cutoff):
         return np.ones(1)

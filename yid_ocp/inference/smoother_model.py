@@ -41,7 +41,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal_at_zero
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors import Sensor
-from yid_ocp.sensors.mounted import MountedSensor
 
 _UnknownKind = Literal["force", "push", "offset", "bias"]
 
@@ -150,14 +149,8 @@ def _unknown_forces(course: _LinearizedEpisode) -> tuple[list[str], list[Smoothe
 
 def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str:
     """Return the location of a sensor's bias: `camera`, `wrist:FRAME`, the frame's grasp, or the sensor's group."""
-    if sensor.camera_pose is not None:
-        return "camera"
-    if isinstance(sensor, MountedSensor):
-        return f"{sensor.channel.group}:{frame}"
-    for grasp in system.grasps:
-        if frame in (grasp.held_frame, grasp.holder_frame):
-            return grasp.name
-    return sensor.group_name
+    held = (grasp.name for grasp in system.grasps if frame in (grasp.held_frame, grasp.holder_frame))
+    return sensor.bias_location(frame) or next(held, sensor.group_name)
 
 
 def _loads(course: _LinearizedEpisode) -> Array:

@@ -16,6 +16,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.sensors import Sensor, SensorData
+from yid_ocp.sensors.base import SmoothingFilter
 
 # half an hour in steps of 10 ms; exceeded by a clock in milliseconds or with jumps
 _MAX_STEPS = 200_000
@@ -91,6 +92,7 @@ class SensorMeasurements:
     bias_std: Array  # standard deviation of a constant error of every output, or zero, (k,)
     noise_correlation: Array | None = None  # noise correlation of a sample's outputs, if not independent, (M, k, k)
     change_by_clock: Array | None = None  # change of the outputs by one std of the clock offset, (M, k)
+    smoothing_filter: SmoothingFilter | None = None  # of the values, if their noise is autocorrelated by it
 
     @property
     def has_uncertain_biases_or_clock(self) -> bool:
@@ -243,7 +245,7 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
     std = np.where(seen, data.std, np.nan)
     bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
     span = data.predictable_nodes or (0, grid.steps)
-    more = data.noise_correlation, data.change_by_clock
+    more = data.noise_correlation, data.change_by_clock, data.smoothing_filter
     return SensorMeasurements(data.sensor, node, fraction, data.value, weight, std, span, bias, *more)
 
 

@@ -63,6 +63,10 @@ class PositionSensor(JointSensor):
     has_paper_weight = False
     group_name: str = JOINT_POSITION_GROUP_NAME
 
+    @property
+    def position_joints(self) -> tuple[str, ...]:
+        return self.joint_names
+
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         return self.select_sensor_joint_entries(state.q, state)
 
@@ -147,7 +151,8 @@ def filtered_effort_measurements(
     total, correlation = _smoothed_effort_noise(inputs, sensor.joint_names, std * np.abs(unit), period, times)
     if correlation is not None:
         correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
-    return SensorData(sensor, times, measured, total / np.abs(unit), (1, last - 1), bias, correlation)
+    more = (total / np.abs(unit), (1, last - 1), bias, correlation)
+    return SensorData(sensor, times, measured, *more, smoothing_filter=inputs.effort_filter)
 
 
 def filter_and_thin_to_nodes(

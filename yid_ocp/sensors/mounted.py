@@ -38,6 +38,9 @@ class MountedSensor(base.Sensor):
     def channel_names(self) -> tuple[str, ...]:
         return tuple(f"{self.group_name}.{name}" for name in self.names)
 
+    def bias_location(self, frame: str) -> str:
+        return f"{self.channel.group}:{frame}"
+
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         frames = zip(self.signs, self.frame_names, strict=True)
         return ca.vertcat(*(sign * self._frame_reading(state, frame) for sign, frame in frames))
@@ -100,7 +103,8 @@ def _measured(
     times, period = around.node_times[nodes], float(np.median(np.diff(group.t)))
     own = by_output[0] * around.path_filter.noise_gains_of_value_and_rates(period)[0]
     total, correlation = _with_encoder_noise(around, sensor, own, times)
-    return base.SensorData(sensor, times, measured, total, inner, by_output[1], correlation)
+    more = (total, inner, by_output[1], correlation)
+    return base.SensorData(sensor, times, measured, *more, smoothing_filter=around.path_filter)
 
 
 def _with_encoder_noise(
