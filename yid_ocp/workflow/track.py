@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -60,9 +60,7 @@ def _run_track(
         found, refused = None, None
         try:
             with add_setting_location_to_errors(run, "track"):
-                tracker, recording = _frame_tracker(tasks.settings, system)
-                config = tasks.work_folder / _CONFIG_FILE
-                _LAST_TRACKER[:] = [((files.read_input_text(config), config), tracker)]
+                tracker, recording = _frame_tracker(tasks.work_folder / _CONFIG_FILE), _read_joints(tasks.settings)
                 issues = [] if recording is None else all_issues_of_one_recording(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_shared_values()
@@ -237,12 +235,18 @@ def _read_joints(run: RunSettings) -> Recording | None:
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
-def _frame_tracker(run: RunSettings, system: System) -> tuple[FrameTracker, Recording | None]:
-    """Return the tracker of the frames in files, and the recording with the joints (None if none is listed)."""
-    recording = _read_joints(run)
-    sequence, scene = _read_frames(run, "frames_path"), _camera_scene(run, system)
+def _frame_tracker(config: Path) -> FrameTracker:
+    """Return the tracker of the frames in files. A process makes it once while the configuration has the same text."""
+    return _tracker(config.absolute(), files.read_input_text(config))
+
+
+@lru_cache(maxsize=1)  # another configuration replaces it, because frames take much memory
+def _tracker(config: Path, text: str) -> FrameTracker:
+    del text
+    run = load_config(config)
+    sequence, scene = _read_frames(run, "frames_path"), _camera_scene(run, build_system(run))
     background = None if run.track.background_frames_path is None else _read_frames(run, "background_frames_path")
-    return FrameTracker(scene, recording, sequence, run.track.options, background), recording
+    return FrameTracker(scene, _read_joints(run), sequence, run.track.options, background)
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,6 +303,8 @@ def _frame_tasks(
     """Return the tracking tasks, and the true motion if a virtual camera renders the frames (which are written)."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
     joints = resolve_default_recording(run.recordings.estimate[0]) if run.recordings.estimate else None
+    if said.background_frames_path is not None:
+        _read_frames(run, "background_frames_path")
     if said.frames_path is not None:
         _read_joints(run)
         _read_frames(run, "frames_path")  # raises errors about the files with the names of the settings
@@ -332,7 +338,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: calibrate the sequence. Returns the values common to all frames as plain data, or the error."""
     del inputs  # part of the key of the result
     try:
-        tracker = _tracker(files.read_input_text(config), config)
+        tracker = _frame_tracker(config)
         return dict(files.to_lossless_plain_data(tracker.estimate_shared_values()))
     except DataError as error:
         return {"refused": files.attributes_to_dict(error, "what where allowed hint")}
@@ -340,18 +346,6 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     del inputs
-    tracker = _tracker(files.read_input_text(config), config)
+    tracker = _frame_tracker(config)
     found = tracker.process_frame(index, files.dataclass_from_plain_data(SequenceEstimates, common))
     return dict(files.to_lossless_plain_data(found))
-
-
-def _tracker(text: str, config: Path) -> FrameTracker:
-    """Return the tracker of this process. It is made again if the configuration (`text` of the file) changed."""
-    if not _LAST_TRACKER or _LAST_TRACKER[0][0] != (text, config):
-        run = load_config(config)
-        _LAST_TRACKER[:] = [((text, config), _frame_tracker(run, build_system(run))[0])]
-    return _LAST_TRACKER[0][1]
-
-
-_LAST_TRACKER: list[tuple[tuple[str, Path], FrameTracker]] = []
-"""The last tracker of this process, with the text and the path of its configuration."""
