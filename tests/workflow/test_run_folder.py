@@ -211,10 +211,9 @@ class Constant(EffectBase):
 
 
 @pytest.fixture
-def kinds(monkeypatch):
+def kinds():
     """Kinds that a test registers are forgotten after it."""
     before = set(EFFECTS)
-    monkeypatch.setattr(run_inputs, "_loaded", {})
     yield before
     EFFECTS.unregister_names(set(EFFECTS) - before)
 
@@ -284,8 +283,7 @@ def test_distributions_are_found_by_their_entry_point(kinds, pendulum, monkeypat
     assert software_and_plugin_versions()["entry point constant"] == "my-effects 1.2"
     build_system(load_config(pendulum))
     assert "constant" in EFFECTS
-    run_inputs._loaded.clear()  # as if a script had imported it before
-    build_system(load_config(pendulum))
+    build_system(load_config(pendulum))  # as if a script had imported it before
     broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", run_inputs._ENTRY_POINT_GROUP), found.dist)
     monkeypatch.setattr(run_inputs, "_installed", lambda: [broken])
     with pytest.raises(ConfigError, match=r"entry point gone raised ModuleNotFoundError(.|\n)*my-effects 1.2"):

@@ -18,13 +18,12 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.effects import EFFECTS
 from yid_ocp.errors import ConfigError, YidError, nearest_name_question, unknown_name_error_arguments
-from yid_ocp.files import file_sha256, is_file
+from yid_ocp.files import file_sha256, is_file, json_sha256
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.registry import Registry
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS
 
 _ENTRY_POINT_GROUP = "yid_ocp.effects"  # entry points of modules that register effects, sensors or report sections
-_loaded: dict[str, str] = {}  # loaded files and entry points, with hash or distribution
 
 
 def load_plugins(run: RunSettings) -> None:
@@ -34,22 +33,21 @@ def load_plugins(run: RunSettings) -> None:
     after this process ran it. Nothing of this plug-in is then registered.
     """
     for entry in _installed():
-        name, of = f"entry point {entry.name}", _distribution(entry)
-        if name not in _loaded:
-            imported = entry.module in sys.modules  # already imported, and registered, by a script
-            with _registering(name, f"{entry.value} of {of}", "update that package, or remove it", None, imported):
-                entry.load()
-            _loaded[name] = of
+        where, imported = f"{entry.value} of {_distribution(entry)}", entry.module in sys.modules
+        with _registering(f"entry point {entry.name}", where, "update that package, or remove it", known=imported):
+            entry.load()
     for i, plugin in enumerate(run.plugins):
         path, where = Path(plugin), run.setting_location("plugins", i)
-        name, digest = str(path.resolve()), file_sha256(path)
-        if _loaded.get(name, digest) != digest:
+        # its place and text make a unique name, so that neither another file nor another version is taken for it
+        prefix = f"yid_ocp_plugin_{path.stem}_{json_sha256(str(path.resolve()))[:8]}_"
+        name = prefix + file_sha256(path)
+        loaded = [module for module in list(sys.modules) if module.startswith(prefix)]
+        if loaded not in ([], [name]):
             what, hint = "the plug-in changed after this process loaded it", "start a new Python process"
             raise ConfigError(what, where=where, allowed="the loaded version", hint=hint)
-        if name not in _loaded:
-            with _registering(f"plug-in {path.name}", where, f"correct {path.name}", path):
-                _run(path, digest)
-            _loaded[name] = digest
+        if not loaded:
+            with _registering(f"plug-in {path.name}", where, f"correct {path.name}", path, name):
+                _run(path, name)
 
 
 def installed_plugin_versions() -> dict[str, str]:
@@ -67,9 +65,8 @@ def _installed() -> Sequence[metadata.EntryPoint]:
     return sorted(metadata.entry_points(group=_ENTRY_POINT_GROUP), key=lambda entry: entry.name)
 
 
-def _run(path: Path, digest: str) -> None:
-    """Import a plug-in file under a unique module name, so that two files of the same name do not conflict."""
-    name = f"yid_ocp_plugin_{path.stem}_{digest[:8]}"
+def _run(path: Path, name: str) -> None:
+    """Import a plug-in file as the module `name`."""
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ImportError("the file is not a Python module")
@@ -83,7 +80,9 @@ def _run(path: Path, digest: str) -> None:
 
 
 @contextlib.contextmanager
-def _registering(name: str, where: str, hint: str, path: Path | None = None, known: bool = False) -> Iterator[None]:
+def _registering(
+    name: str, where: str, hint: str, path: Path | None = None, module: str = "", known: bool = False
+) -> Iterator[None]:
     """Context manager in which a plug-in runs: its errors become `ConfigError`, after which nothing of it is kept."""
     from yid_ocp.report.sections import REPORT_SECTIONS  # which few runs with plug-ins need before their report
 
@@ -98,6 +97,7 @@ def _registering(name: str, where: str, hint: str, path: Path | None = None, kno
     except (Exception, SystemExit) as error:
         for registry, names in zip(registries, before, strict=True):
             registry.unregister_names(set(registry) - names)
+        sys.modules.pop(module, None)
         if isinstance(error, YidError):
             what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
             raise ConfigError(what, where=where, allowed=error.allowed, hint=error.hint or hint) from error
