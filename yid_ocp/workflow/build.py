@@ -30,7 +30,7 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
-from yid_ocp.model.objects.base import CableTopology, ObjectBetweenClamps
+from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
@@ -56,8 +56,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     model, arms = run.model, run.model.arms
     run_inputs.input_files_by_name(run)
     run_inputs.load_plugins(run)
-    if isinstance(model.object, ObjectBetweenClamps):
-        return _completed(run, _clamped_system(run, model.object, model.object.kind))
+    if (cable := cable_topology_between_clamps(run)) is not None:
+        return _completed(run, _clamped_system(run, cable))
     robot = None
     if model.robot is not None:
         with add_setting_location_to_errors(run, "model", "arms", "joints"):
@@ -130,7 +130,7 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
     """Return the measured vertices and clamps of a run's cable. None for an object that is not held by clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
-        return run.model.object.branch_vertices() if isinstance(run.model.object, ObjectBetweenClamps) else None
+        return None if run.model.object is None else run.model.object.branch_vertices()
 
 
 def arms_are_estimated_states(run: RunSettings) -> bool:
@@ -176,7 +176,9 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     return damping, of_object
 
 
-def _clamped_system(run: RunSettings, item: ObjectBetweenClamps, kind: str) -> System:
+def _clamped_system(run: RunSettings, cable: CableTopology) -> System:
+    assert run.model.object is not None
+    kind = run.model.object.kind
     for key in ("robot", "grasp", "joint_springs", "frames"):
         if getattr(run.model, key):
             what, allowed = f"model.{key} is not possible for an object of kind {kind}, which clamps hold", f"no {key}"
@@ -186,8 +188,8 @@ def _clamped_system(run: RunSettings, item: ObjectBetweenClamps, kind: str) -> S
         what = f"the lengths of a {kind} are computed from recordings, but none is listed"
         raise run.config_error(what, "recordings", "estimate", allowed="one or more", hint="add a recording")
     with add_setting_location_to_errors(run, "model", "object"):
-        lengths = typical_point_pair_distances(item.branch_vertices().edge_vertex_names, recordings)
-        return item.build_system_with_clamps(lengths, run.model.gravity)
+        lengths = typical_point_pair_distances(cable.edge_vertex_names, recordings)
+        return run.model.object.build_system_with_clamps(lengths, run.model.gravity)
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:

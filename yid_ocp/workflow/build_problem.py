@@ -27,7 +27,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model import System
-from yid_ocp.model.objects.base import CableTopology, ClampPosePointNames, ObjectBetweenClamps
+from yid_ocp.model.objects.base import CableTopology, ClampPosePointNames
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import DividedLinksModel, RefinementKind
@@ -80,7 +80,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
     clamps: tuple[ClampPosePointNames, ...] = ()
-    if cable is not None and isinstance(run.model.object, ObjectBetweenClamps):
+    if cable is not None and run.model.object is not None:
         clamps = cable.clamp_pose_point_names
         for name in {group.name for group in groups}:
             said = sensors.setdefault(name, SensorOptions())

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -190,8 +190,8 @@ def initial_parameters_with_comments(
 class ObjectBuilder:
     """The base class of all kinds of flexible objects in `OBJECT_KINDS`. Its fields are the object's settings.
 
-    A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that forms a whole system with its clamps
-    also has the methods of `ObjectBetweenClamps`.
+    A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that forms a whole system with its clamps,
+    such as a cable, overrides `branch_vertices` and the two methods after it.
     """
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
@@ -231,6 +231,21 @@ class ObjectBuilder:
         per_joint = {segment.name for segment in self.segment_definitions() if not segment.values_given_as_rigidities}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
+    def branch_vertices(self) -> CableTopology | None:
+        """Return the object's vertices and the clamps that hold it at measured points. None for other objects.
+
+        Raises `DataError` or `ModelError` if they are inconsistent.
+        """
+        return None
+
+    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
+        """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
+        raise NotImplementedError
+
+    def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+        """Return length parameters from one recording's edge lengths [m]. Empty if all recordings share the lengths."""
+        return {}
+
     def input_file_paths(self) -> dict[str, str]:
         """Return the paths of the input files in the object's settings, by settings key."""
         own: Any = type(self)
@@ -243,20 +258,6 @@ class ObjectBuilder:
     def with_file_names_only(self) -> ObjectBuilder:
         """Return a copy with file names in place of paths, so that the objects of different runs can be compared."""
         return replace(self, **{key: Path(file).name for key, file in self.input_file_paths().items()})
-
-
-@runtime_checkable
-class ObjectBetweenClamps(Protocol):
-    """The interface of objects, such as a cable, that form a system together with clamps at measured points."""
-
-    def branch_vertices(self) -> CableTopology:
-        """Return the object's vertices and clamps. Raises `DataError` or `ModelError` if they are inconsistent."""
-
-    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
-        """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
-
-    def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Return length parameters from one recording's edge lengths [m]. Empty if all recordings share the lengths."""
 
 
 @dataclass(frozen=True, kw_only=True)
