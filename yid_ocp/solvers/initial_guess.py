@@ -124,28 +124,24 @@ def _resting(
 ) -> tuple[Array, Array]:
     """Node states and multipliers at equilibria of the measured postures, with momenta from their differences."""
     step, statics = problem.step, problem.model_functions.equilibrium_solver
-    n, m, h = step.sizes["n"], step.sizes["m"], step.time_step
-    state = np.tile(start, (len(nodes), 1))
-    pull = np.zeros((len(nodes), m))
+    n, nx, h = step.sizes["n"], step.sizes["nx"], step.time_step
+    # at equal times, however far apart the nodes are: a longer way can lead to another shape of a soft object
+    at = np.unique(np.append(np.arange(0, nodes[-1], max(1, round(_EQUILIBRIUM_SPACING / h))), nodes[-1]))
+    state, pull = np.tile(start, (len(at), 1)), np.zeros((len(at), step.sizes["m"]))
     shape: Array | None = None
-    every = max(1, round(_EQUILIBRIUM_SPACING * (len(nodes) - 1) / (h * max(int(nodes[-1]), 1))))
-    chosen = np.unique(np.append(np.arange(0, len(nodes), every), len(nodes) - 1))
-    for j in chosen:
-        node = nodes[j]
-        posture = np.concatenate([episode.measured_driven_angles[node], episode.prescribed_path[node]])
-        torque = episode.torque[min(node, len(episode.torque) - 1)] if problem.system.driven else None
+    for j, k in enumerate(at):
+        posture = np.concatenate([episode.measured_driven_angles[k], episode.prescribed_path[k]])
+        torque = episode.torque[min(k, len(episode.torque) - 1)] if problem.system.driven else None
         rest = statics.solve(posture, theta, torque, shape)
         if rest.max_imbalance < 1e-3:
             shape = rest.state[:n]
             state[j], pull[j] = rest.state, rest.constraint_reactions
         else:
             state[j], pull[j] = state[max(j - 1, 0)], pull[max(j - 1, 0)]
-    times = nodes * h
-    for table in (state, pull):
-        for column in range(table.shape[1]):
-            table[:, column] = np.interp(times, times[chosen], table[chosen, column])
+    columns = np.column_stack([state, pull]).T
+    state, pull = np.hsplit(np.stack([np.interp(nodes, at, column) for column in columns], axis=1), [nx])
     state[:, list(problem.system.actuated_coordinate_indices)] = episode.measured_driven_angles[nodes]
-    velocity = np.gradient(state[:, :n], times, axis=0)
+    velocity = np.gradient(state[:, :n], nodes * h, axis=0)
     state[:, n : 2 * n] += generalized_momentum_from_velocity(step, state[:, :n], velocity, theta)
     return state, pull[:-1] * h
 
