@@ -252,11 +252,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
             t = times_since_recording_start(episode, samples)
             place = np.full(samples.positive_weight_mask.shape, -1)
             place[samples.positive_weight_mask] = np.arange(rows.start, rows.stop)
-            autocorrelation, step = np.ones(1), episode.grid.time_step
-            if (low_pass := samples.smoothing_filter) is not None:
-                autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[
-                    :: low_pass.decorrelation_stride(step)
-                ]
+            autocorrelation = _noise_autocorrelation(samples.smoothing_filter, episode.grid.time_step)
             for column, channel in enumerate(samples.channel_name_per_output):
                 seen = samples.positive_weight_mask[:, column]
                 if seen.any():
@@ -265,9 +261,9 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
     return tuple(series)
 
 
-def _filtered_noise_autocorrelation(low_pass: SmoothingFilter, step: float) -> Array:
-    """Autocorrelation of filtered white noise at lags 0, 1, ... times `step` [s]."""
-    if not np.isfinite(low_pass.cutoff):
+def _noise_autocorrelation(low_pass: SmoothingFilter | None, step: float) -> Array:
+    """Autocorrelation, at lags 0, 1, ... samples, of white noise that was filtered every `step` [s] and thinned."""
+    if low_pass is None or not np.isfinite(low_pass.cutoff):
         return np.ones(1)
     half = int(2 * low_pass.passes / (low_pass.cutoff * step)) + 10
     impulse = np.zeros((2 * half + 1, 1))
@@ -275,4 +271,4 @@ def _filtered_noise_autocorrelation(low_pass: SmoothingFilter, step: float) -> A
     times = step * np.arange(2 * half + 1, dtype=float)
     response = low_pass(times, impulse)[:, 0]
     full = np.correlate(response, response, "full")[2 * half :]
-    return np.asarray(full[:half] / full[0])
+    return np.asarray(full[:half] / full[0])[:: low_pass.decorrelation_stride(step)]
