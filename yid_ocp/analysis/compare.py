@@ -19,6 +19,7 @@ from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     ParameterEstimate,
     mark_free_estimates_not_trusted,
+    value_and_uncertainty_text,
 )
 from yid_ocp.inference.whitening import problem_without_input_errors
 from yid_ocp.problem import EstimationProblem
@@ -152,8 +153,9 @@ def _explanations(
             continue
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
-        said = VERDICT_SENTENCE_TEXTS[reference.verdict]
-        sentences.append(f"{name}{known} {said}: its value depends on the method ({places})")
+        is_lost = reference.verdict == "not_identifiable"
+        ends = "the data do not determine it, so no value is shown" if is_lost else f"the methods end at {places}"
+        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}: {ends}")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
     return sentences + [_descent_errors(run, judged, truth, disturbed) for run in descents]
 
@@ -171,7 +173,8 @@ def _descent_errors(
     within = f"within {100 * MAX_IDENTIFIABLE_RELATIVE_STD:.0f} % of the truth"
     if not wrong:
         return f"{run.method} ended {within} everywhere"
-    places = ", ".join(f"{name} ({found[name]:.3g} for {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
+    shown = {name: value_and_uncertainty_text(found[name], None, verdict=known[name].verdict) for name in wrong}
+    places = ", ".join(f"{name} ({shown[name]} for {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
     text = f"where {run.method} did not end {within}: {places}"
     if wrong == hidden:
         return f"{text}; these are exactly the parameters that are not found"

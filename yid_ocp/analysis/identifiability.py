@@ -97,7 +97,8 @@ class IdentifiabilityResult(ReprMixin):
     def _summary(self) -> ReprTexts:
         rows = [("parameter", "value", "unit", "")]
         for name, entry in self.parameters.items():
-            value = uncertainty.value_and_uncertainty_text(entry.value, uncertainty.finite_or_none(entry.std), None)
+            std = uncertainty.finite_or_none(entry.std)
+            value = uncertainty.value_and_uncertainty_text(entry.value, std, verdict=entry.verdict)
             rows.append((name, value, entry.unit, uncertainty.VERDICT_TABLE_TEXTS[entry.verdict]))
         found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
         return ReprTexts(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)

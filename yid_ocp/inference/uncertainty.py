@@ -463,9 +463,18 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
 
 
 def value_and_uncertainty_text(
-    value: float, std: float | None, interval: ConfidenceInterval | None = None, least_digits: int = 4
+    value: float,
+    std: float | None,
+    interval: ConfidenceInterval | None = None,
+    least_digits: int = 4,
+    verdict: str | None = None,
 ) -> str:
-    """Format a value with its 95 % interval, or with its std if known: all digits down to the second of the std."""
+    """Format a value with its 95 % interval, or with its std if known: all digits down to the second of the std.
+
+    A value with the verdict `not_identifiable` has no meaning and is shown as a dash.
+    """
+    if verdict == "not_identifiable":
+        return "–"
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
     if std is None:

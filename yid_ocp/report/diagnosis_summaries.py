@@ -287,8 +287,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 # elsewhere, and without noise, the curvature is no measure of uncertainty
                 ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
                 known = (found["std"], found["interval"]) if ended else (None, None)
-                lost = own["verdict"] == "not_identifiable"
-                cells.append("–" if lost else value_and_uncertainty_text(found["value"], *known))
+                cells.append(value_and_uncertainty_text(found["value"], *known, verdict=own["verdict"]))
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})
@@ -445,7 +444,6 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
-    if entry is None or entry["verdict"] == "not_identifiable":
-        return "" if entry is None else "–"
-    text = value_and_uncertainty_text(entry["value"], entry["std"], None)
-    return text if entry["free"] else f"{entry['value']:.4g} (fixed)"
+    if entry is None or not entry["free"]:
+        return "" if entry is None else f"{entry['value']:.4g} (fixed)"
+    return value_and_uncertainty_text(entry["value"], entry["std"], verdict=entry["verdict"])

@@ -60,7 +60,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         std = "" if failed or entry["std"] is None or entry["verdict"] == "at_bound" else f"{entry['std']:.2g}"
         interval = "" if failed else _interval_cell(entry, entry["std"])
         verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
-        value = "–" if not failed and entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}"
+        value = value_and_uncertainty_text(entry["value"], None, verdict=None if failed else entry["verdict"])
         own = (name, value, std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
         rows.append((*own, bound_range_text(entry, 4)))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
@@ -213,7 +213,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         spread = (_relative(entry[key]) for key in ("std_relative", "std_relative_unknown", "std_alone"))
         relative = entry["std_relative"]
         interval = _interval_cell(entry, None if relative is None else relative * abs(entry["value"]))
-        value = "–" if entry["verdict"] == "not_identifiable" else f"{entry['value']:.4g}"
+        value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
     yield from issue_summary_blocks(result)

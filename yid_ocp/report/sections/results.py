@@ -125,7 +125,7 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
         return
     rows = []
     for name, entry in findings.result["judged"]["parameters"].items():
-        if entry["free"]:
+        if entry["free"] and entry["verdict"] != "not_identifiable":
             own = {method: e["parameters"][name] for method, e in findings.result["methods"].items()}
             values = {m: (e["value"], None if comparison.has_process_noise else e["std"]) for m, e in own.items()}
             rows.append((name, entry["unit"], values | {"solve": (entry["value"], entry["std"])}))
