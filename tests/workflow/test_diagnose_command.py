@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 from small_problems import pendulum_step
 
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
@@ -18,9 +19,11 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, StoredFit
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
+from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import (
     _has_unused_efforts,
     _SingleJsonFileRefitStore,
@@ -330,3 +333,32 @@ def test_the_embedded_example_finds_what_was_withheld(carried_out):
     assert result["which"][0]["parameters"]["tau"]["value"] == pytest.approx(0.05, rel=0.1)
     assert result["gap"]["closure_ci"][0] > 0.9
     assert (done.folder / "report.html").exists()
+
+
+def merged(one: dict, other: dict) -> dict:
+    return one | {k: merged(one[k], v) if isinstance(v, dict) and k in one else v for k, v in other.items()}
+
+
+def test_what_is_found_is_told_as_text_that_a_configuration_takes(rubbing, whole, tmp_path, cli):
+    """The numbers of a diagnosis and of the chosen friction law, where the model has neither effect nor law."""
+    both = ", ".join(str(rubbing.with_name(f"{name}.h5")) for name in ("estimate", "held_out"))
+    settings = ["recordings.held_out=[]", f"recordings.estimate=[{both}]", "output.write_report=true"]
+    done = cli("friction", rubbing, "--out", tmp_path / "law", settings=settings)
+    law, diagnosis = json.loads((tmp_path / "law" / "result.json").read_text()), whole[0].result
+    for result in (law, diagnosis):
+        use, reader = result["to_use"], YAML(typ="safe")
+        assert "elbow.tau_c = " in use["values"][-1]
+        assert "frictionloss=" in use["mjcf"][-1]
+        told = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))
+        assert {*use["values"], *use["mjcf"]} <= {line.strip() for line in told}
+        with (tmp_path / "merged.yaml").open("w") as file:
+            reader.dump(merged(reader.load(rubbing), reader.load("\n".join(use["yaml"]))), file)
+        known = build_system(load_config(tmp_path / "merged.yaml")).parameters
+        for name, value in (line.split(" ±")[0].split(" = ") for line in use["values"]):
+            assert known[name].value == pytest.approx(float(value), rel=1e-3)
+    fit = law["laws"][law["warranted"]]["parameters"]
+    assert law["friction_parameters"] == [name for name in fit if name != "shoulder.stiffness"]
+    first_screen = (tmp_path / "law" / "report.html").read_text("utf-8").partition('id="scene"')[0]
+    shown = value_and_uncertainty_text(fit["elbow.damping"]["value"], fit["elbow.damping"]["std"])
+    assert shown in first_screen
+    assert shown in done.out

@@ -15,6 +15,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
+from yid_ocp.effects import make_effect
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_whitening_at, problem_without_input_errors
@@ -261,44 +262,44 @@ def test_a_group_without_a_sample_has_no_expected_error():
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
 
 
-def test_a_spring_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
+def copied(system, values, **estimates):
+    """Texts to copy, of estimates given as (value, std, unit, verdict); all parameters have `values`."""
+    made = {n: ParameterEstimate(*own[:3], 3.0, 0.0, np.inf, True, own[3]) for n, own in estimates.items()}
+    theta = system.parameters.vector(values)
+    return prediction_outputs.estimate_texts_by_format(system, theta, made, ("export", "my runs/a"))
+
+
+def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(robot, springs={"elbow": RobotJointSpring(3.0, 0.2)})
-    theta = system.parameters.vector({"elbow.stiffness": 4.0})
-    problem = SimpleNamespace(system=system, unpack_episode_unknowns=lambda x, i: (theta, None))
-    found = {"elbow.stiffness": ParameterEstimate(4.0, 0.1, "N m/rad", 3.0, 0.0, np.inf, True, "identifiable")}
-    told = prediction_outputs.estimate_texts_by_format(problem, SimpleNamespace(x=None, parameters=found), "runs/a")
-    [line] = told["mjcf"]
+    kinds = [("joint_coulomb", "elbow"), ("rotor_inertia", "elbow"), ("joint_coulomb", "shoulder")]
+    system = system.with_effects([make_effect(*own, system) for own in kinds])
+    values = {"elbow.stiffness": 4.0, "elbow.damping": 0.3, "shoulder.damping": 0.2}
+    values |= {"joint_coulomb@elbow.tau_c": 0.5, "rotor_inertia@elbow.armature": 0.01}
+    lost = {"shoulder.damping": (0.2, 0.1, "N m s/rad", "weak")}
+    found = {name: (value, 0.01 * value, "SI", "identifiable") for name, value in values.items() if name not in lost}
+    [line] = copied(system, values, **found, **lost)["mjcf"]
     joint = line.replace("<joint ", '<joint axis="0 0 1" ')
     body = f'<body><geom size="1"/>{joint}</body>'
     model = mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>')
-    assert (model.joint("elbow").stiffness[0], model.qpos_spring[0]) == (4.0, pytest.approx(0.2))
-    lost = {"shoulder.mass": replace(found["elbow.stiffness"], verdict="identifiable")}
-    told = prediction_outputs.estimate_texts_by_format(problem, SimpleNamespace(x=None, parameters=lost), "runs/a")
-    assert told["mjcf"] == []
+    elbow = model.joint("elbow")
+    assert (elbow.stiffness[0], model.qpos_spring[0], elbow.damping[0]) == (4.0, pytest.approx(0.2), 0.3)
+    assert (elbow.frictionloss[0], elbow.armature[0]) == (0.5, 0.01)
+    only = copied(system, values, **{"elbow.damping": found["elbow.damping"]})
+    assert only["mjcf"] == ['<joint name="elbow" damping="0.3"/>']
+    assert copied(system, values, **{"shoulder.mass": (1.0, 0.1, "kg", "identifiable")})["mjcf"] == []
 
 
 def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
-    system = build_system(load_config(None))
-    theta = system.parameters.vector({"T1.bend": 22.0})
-    problem = SimpleNamespace(system=system, unpack_episode_unknowns=lambda x, i: (theta, None))
-
-    def estimate(value, verdict):
-        return ParameterEstimate(value, 0.5, "N m/rad", 3.0, 0.0, np.inf, True, verdict)
-
-    found = {"T1.bend": estimate(22.0, "identifiable"), "T1.twist": estimate(7.0, "not_identifiable")}
-    told = prediction_outputs.estimate_texts_by_format(problem, SimpleNamespace(x=None, parameters=found), "my runs/a")
+    system, lost = build_system(load_config(None)), {"T1.twist": (7.0, 0.5, "N m/rad", "not_identifiable")}
+    told = copied(system, {"T1.bend": 22.0}, **{"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")}, **lost)
     assert told["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
-    small = {"T1.bend": replace(found["T1.bend"], value=2.2e-5, std=5e-7)}
-    told_small = prediction_outputs.estimate_texts_by_format(
-        problem, SimpleNamespace(x=None, parameters=small), "runs/a"
-    )
-    assert told_small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & N m/rad \\"]
-    assert told["export"] == "yid-ocp export 'my runs/a' --out model.xml"
-    lost = {"T1.twist": found["T1.twist"]}
-    nothing = SimpleNamespace(x=None, parameters=lost)
-    assert prediction_outputs.estimate_texts_by_format(problem, nothing, "runs/a") == {}
+    assert (told["export"], told["uncounted_errors"]) == ("yid-ocp export 'my runs/a'", ["of discretisation"])
+    small = copied(system, {}, **{"T1.bend": (2.2e-5, 5e-7, "1", "identifiable")})
+    assert small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & 1 \\"]
+    assert small["values"] == ["T1.bend = 2.2e-05 ± 5e-07"]
+    assert copied(system, {}, **lost) == {}

@@ -151,11 +151,9 @@ _UNUSED = FeatureExportSupport("native", "it has no influence on this model")
 def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
     """Return by label `kind@location` how well the format `form` (`mjcf`, `urdf` or `sdf`) supports each effect."""
     value, found = mjcf.ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
-    theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
-        amplitudes, neutral = getattr(effect, "amplitude_parameter_names", ()), getattr(effect, "neutral_values", {})
-        if amplitudes and all(theta[name] == neutral[name] for name in amplitudes):
+        if value.is_neutral(effect):
             found[label] = _NEUTRAL
         else:
             _, aspects = mjcf.effect_joint_terms_and_changed_aspects(system, effect, value)

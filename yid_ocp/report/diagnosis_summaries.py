@@ -22,6 +22,7 @@ from yid_ocp.report.terminal import (
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
+    numbers_to_use_blocks,
     p_value_text,
     register_summary,
     scale_and_unit_with_metres_as_mm,
@@ -93,6 +94,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["next_plan"] is not None:
         yield "to separate these effects, plan a motion:"
         yield CodeBlock(_planning_command(result["next_plan"]))
+    yield from numbers_to_use_blocks(result)
     yield f"verdict: {verdict} ({sum(result['seconds'].values()):.1f} s)"
 
 
@@ -286,8 +288,8 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 found = entry["parameters"][name]
                 # elsewhere, and without noise, the curvature is no measure of uncertainty
                 ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
-                known = (found["std"], found["interval"]) if ended else (None, None)
-                cells.append(value_and_uncertainty_text(found["value"], *known, verdict=own["verdict"]))
+                std, interval = (found["std"], found["interval"]) if ended else (None, None)
+                cells.append(value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"]))
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})

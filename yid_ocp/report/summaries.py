@@ -28,6 +28,7 @@ from yid_ocp.report.terminal import (
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
+    numbers_to_use_blocks,
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
@@ -78,10 +79,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from (SummaryStatement(text, "verdict") for text in _found_and_lost(free))
         if result["fit"]["explains"]:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
-    if use := result.get("to_use"):
-        yield "to use these numbers (± is one standard deviation):"
-        lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
-        yield CodeBlock("\n".join(lines))
+    yield from numbers_to_use_blocks(result)
     yield result.get("safeguard", "")
     ended = f"{result['status']}: {result['message']}; {result['iterations']} iterations, {result['seconds']:.1f} s"
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
@@ -255,14 +253,29 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for law, entry in result["laws"].items():
         note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
         rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
+    fitted, friction = result["laws"][best]["parameters"], result["friction_parameters"]
+    shown = {
+        name: value_and_uncertainty_text(e["value"], e["std"], e["interval"], verdict=e["verdict"])
+        for name, e in fitted.items()
+    }
+    heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
+    constants: TableRows = [("joint", *(f"{constant} [{unit}]" for constant, unit in heads.items()))]
+    for joint in result["joints"]:
+        known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
+        constants.append((joint, *(known.get(constant, "") for constant in heads)))
+    yield SummaryTable(constants, f"Friction by the law '{best}'")
+    lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
+    said = f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {lost}"
+    yield SummaryStatement(said if lost else "", "verdict")
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
-    fitted = result["laws"][best]["parameters"].items()
-    own = [(name, value_and_uncertainty_text(e["value"], e["std"], None), e["unit"]) for name, e in fitted]
-    yield SummaryTable([("parameter", "value", "unit"), *own], f"Fit with the law '{best}'")
+    others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
+    yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     text = f"the law '{best}' is chosen: it is the simplest whose error is within one standard error of the least; "
     text += f"each kind of motion was held out in turn: {', '.join(result['kinds'])}"
     yield SummaryStatement(text, "conclusion")
-    yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
+    if not result["to_use"]:
+        yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
+    yield from numbers_to_use_blocks(result)
 
 
 @register_summary("yid-plan/1")

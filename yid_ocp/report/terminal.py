@@ -124,6 +124,16 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
         yield SummaryStatement("no value counts as found, because a recording has a severe issue", "verdict")
 
 
+def numbers_to_use_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    """Yield the found values of a result in the formats of other programs, to copy. Nothing if none is found."""
+    if use := result.get("to_use"):
+        left_out = " and ".join(use["uncounted_errors"])
+        without = f", without the error {left_out}" if left_out else ""
+        yield f"to use these numbers (± is one standard deviation{without}):"
+        lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
+        yield CodeBlock("\n".join(lines))
+
+
 def misfit_summary_blocks(
     fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
 ) -> SummaryBlockOrTextIterator:

@@ -71,10 +71,16 @@ class ExpressionEvaluator:
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
         self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
+        self._values = dict(zip(system.parameters.names, self._theta, strict=True))
 
     def __call__(self, expression: ca.SX) -> Array:
         """Values of an expression that depends on parameters only."""
         return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
+
+    def is_neutral(self, effect: Effect) -> bool:
+        """Whether an effect changes nothing, because all its amplitudes have their neutral values."""
+        names, neutral = getattr(effect, "amplitude_parameter_names", ()), getattr(effect, "neutral_values", {})
+        return bool(names) and all(self._values[name] == neutral[name] for name in names)
 
     def _is_zero_at_parameter_values(self, expression: ca.SX) -> bool:
         """Whether an expression, at the parameter values, is zero for all values of its other symbols."""
@@ -159,7 +165,7 @@ def system_joint_dynamics_terms(system: System, value: ExpressionEvaluator) -> d
         if not value._is_zero_at_parameter_values(compliance):
             stiffness = 1 / float(value(compliance)[0])
             add(joint, JointDynamicsTerms(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
-    for effect in system.effects:
+    for effect in (own for own in system.effects if not value.is_neutral(own)):
         for joint, own in effect_joint_terms_and_changed_aspects(system, effect, value)[0].items():
             add(joint, own)
     return found

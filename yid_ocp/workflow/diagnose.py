@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
+import os
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +27,13 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.inference.smoother import smoothed_unknown_units
-from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
+from yid_ocp.inference.uncertainty import (
+    ParameterEstimate,
+    covariance_to_dict,
+    typical_parameter_magnitudes,
+    unknowns_covariance_and_reduced_chi2,
+    verdict_by_relative_std,
+)
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -114,6 +121,8 @@ def run_diagnose(
             "unused_efforts": _has_unused_efforts(problem),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
+        if finding.verdict in ("effect", "no_gap") and problem.options.has_no_data_issue_above_warning:
+            own["to_use"] = _texts_of_final_model(finding, os.path.relpath(folder.final_path))
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
         more = {"finding": finding, "predictions": predicted}
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
@@ -144,6 +153,28 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     matrix, _ = unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
     covariance = covariance_to_dict(shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared])
     return {"parameters": found, "covariance": covariance}
+
+
+def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, Any]:
+    """Return texts to copy: estimates of the final model, its effects, and its time step if it is not the stated one.
+
+    A parameter of an accepted effect also counts as found if it is only weakly determined.
+    """
+    fit, system = finding.final_model, finding.final_model.problem.system
+    sizes, estimates = typical_parameter_magnitudes(fit.problem, fit.unknowns), {}
+    for name in fit.problem.shared_parameters:
+        entry, value, std = system.parameters[name], fit.values[name], fit.std[name]
+        verdict = verdict_by_relative_std(value, std, sizes[name])
+        found = "identifiable" if verdict == "weak" and "@" in name else verdict
+        range_and_verdict = entry.value, entry.lower, entry.upper, True, found
+        estimates[name] = ParameterEstimate(value, std, entry.unit, *range_and_verdict)
+    effects = [f"  - {{kind: {own.kind}, location: {own.location}}}" for own in finding.accepted_effects]
+    lines = ["model:", "  effects:  # add them to those of the configuration", *effects] if effects else []
+    stated, used = finding.stated_and_used_time_step
+    lines += ["problem:", f"  time_step: {used:g}"] if used != stated else []
+    theta, export = fit.problem.unpack_episode_unknowns(fit.unknowns, 0)[0], ("export", folder, "--out", "model.xml")
+    texts = prediction_outputs.estimate_texts_by_format
+    return texts(system, theta, estimates, export, model_yaml=lines)
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,15 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.inference import whitening
 from yid_ocp.inference.smoother import smoothed_unknown_units
+from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
+from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.solvers import Solution
+from yid_ocp.virtual.mjcf import ExpressionEvaluator, system_joint_dynamics_terms
 
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
@@ -58,52 +61,77 @@ def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[st
     return found
 
 
-def estimate_texts_by_format(problem: EstimationProblem, solution: Solution, folder: str) -> dict[str, Any]:
-    """Return texts to copy, with the estimates of identifiable parameters. Empty without such a parameter.
+def estimate_texts_by_format(
+    system: System,
+    theta: Array,
+    estimates: Mapping[str, ParameterEstimate],
+    command: Sequence[str],
+    uncounted_errors: Sequence[str] = ("of discretisation",),
+    model_yaml: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Return texts to copy, with those of the `estimates` that are identifiable. Empty without such a parameter.
 
-    The keys are `values` (lines NAME = VALUE ± STD), `joints` (number of links and range of joint stiffness [N m/rad],
-    by segment and deformation), lines of `yaml` and `mjcf`, rows of `latex`, `export` (the command that exports the
-    model of the run `folder`) and `cite` (what to cite).
+    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `joints` (number of links and range
+    of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of
+    `latex`, `export` (the `command` to continue with) and `cite`. `theta` (ntheta,) holds all parameters.
     """
-    found = {n: e for n, e in solution.parameters.items() if e.free and e.verdict == "identifiable"}
+    found = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
     if not found:
         return {}
-    system, theta = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0]
-    joints, lines, found_symbols = [], [], ca.vertcat(*(system.parameters[name].symbol for name in found))
+    joints, lines = [], _mjcf_joint_lines(system, theta, found)
+    found_symbols = ca.vertcat(*(system.parameters[name].symbol for name in found))
 
-    def numbers(*terms: ca.SX) -> Array:
+    def numbers(terms: Sequence[ca.SX]) -> Array:
+        if not terms or not ca.depends_on(ca.vertcat(*terms), found_symbols):
+            return np.zeros(0)
         return np.array(ca.Function("k", [system.parameters.symbols], [ca.vertcat(*terms)])(theta)).ravel()
 
-    for spring in system.elastic_joints:
-        terms = spring.stiffness, spring.rest_angle
-        if spring.segment_name == spring.joint_name and ca.depends_on(ca.vertcat(*terms), found_symbols):
-            k, rest = numbers(*terms)
-            note = '<!-- with compiler angle="radian" -->'
-            lines.append(f'<joint name="{spring.joint_name}" stiffness="{k:.4g}" springref="{rest:.4g}"/> {note}')
     for layout in system.segment_layouts:
         for deformation in ("bend", "twist"):
             own = [s for s in system.elastic_joints if (s.segment_name, s.deformation) == (layout.name, deformation)]
-            values = [spring.stiffness for spring in own]
-            if not own or not ca.depends_on(ca.vertcat(*values), found_symbols):
-                continue
-            stiffness = numbers(*values)
-            low, high, links = float(stiffness.min()), float(stiffness.max()), len(layout.link_joints)
-            known = {"segment": layout.name, "deformation": deformation, "links": links}
-            joints.append(known | {"lowest": low, "highest": high})
+            sizes = {"stiffness": numbers([s.stiffness for s in own]), "damping": numbers([s.damping for s in own])}
+            sizes, links = {key: size for key, size in sizes.items() if len(size)}, len(layout.link_joints)
             note = f"{layout.name} {deformation}, {links} links; n links: times n/{links}"
-            note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
-            lines.append(f'<joint stiffness="{np.median(stiffness):.4g}"/> <!-- {note} -->')
+            if len(stiffness := sizes.get("stiffness", ())):
+                low, high = float(min(stiffness)), float(max(stiffness))
+                known = {"segment": layout.name, "deformation": deformation, "links": links}
+                joints.append(known | {"lowest": low, "highest": high})
+                note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
+            shown = " ".join(f'{key}="{np.median(size):.4g}"' for key, size in sizes.items())
+            lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}
     rows = [rf"{labels[n]} & ${e.value:.4g} \pm {e.std:.2g}$ & {e.unit} \\" for n, e in found.items()]
+    initial = [f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items()]
     return {
-        "values": [f"{n} = {e.value:.4g} ± {e.std:.2g} {e.unit}" for n, e in found.items()],
+        "values": [f"{n} = {e.value:.4g} ± {e.std:.2g} {e.unit}".removesuffix(" 1") for n, e in found.items()],
+        "uncounted_errors": list(uncounted_errors),
         "joints": joints,
-        "yaml": ["parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
+        "yaml": [*model_yaml, "parameters:", *initial],
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
-        "export": f"yid-ocp export {shlex.quote(str(folder))} --out model.xml",
+        "export": shlex.join(["yid-ocp", *command]),
         "cite": "CITATION.cff of yid_ocp, and Caldwell, Coleman and Correll (ISER 2014) for the problem",
     }
+
+
+def _mjcf_joint_lines(system: System, theta: Array, found: Mapping[str, ParameterEstimate]) -> list[str]:
+    """Return an MJCF element for each joint of the robot, with the attributes that found parameters change."""
+    values = dict(zip(system.parameters.names, theta, strict=True))
+    moved = values | {name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in found}
+    terms, others = (system_joint_dynamics_terms(system, ExpressionEvaluator(system, own)) for own in (values, moved))
+    links, lines = {s.joint_name for s in system.elastic_joints if s.segment_name != s.joint_name}, []
+    for joint, own in terms.items():
+        changed = {key for key, size in vars(own).items() if size != getattr(others[joint], key)}
+        sizes = {"damping": own.damping, "armature": own.armature, "dry_friction": own.dry_friction}
+        sizes = {key.replace("dry_friction", "frictionloss"): size for key, size in sizes.items() if key in changed}
+        note = ""
+        if changed & {"stiffness", "constant_force"} and own.stiffness > 0:
+            sizes |= {"stiffness": own.stiffness, "springref": own.constant_force / own.stiffness}
+            note = ' <!-- with compiler angle="radian" -->'
+        if sizes and joint not in links:
+            shown = " ".join(f'{key}="{size:.4g}"' for key, size in sizes.items())
+            lines.append(f'<joint name="{joint}" {shown}/>{note}')
+    return lines
 
 
 def _has_torque_bias(episode: Episode) -> bool:

@@ -46,7 +46,9 @@ def run_solve(
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
         folder.log_event("end", **end)
         prediction_outputs.write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
-        offsets, to_path = prediction_outputs.torque_offsets_by_recording, os.path.relpath(folder.final_path)
+        offsets = prediction_outputs.torque_offsets_by_recording
+        copied = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0], solution.parameters
+        export = "export", os.path.relpath(folder.final_path), "--out", "model.xml"
         more = {
             "issues": issues_to_plain_data(checks.data_issues),
             "safeguard": checks.cable_memory_message,
@@ -54,7 +56,7 @@ def run_solve(
             "discretisation": discretisation_shifts_to_dict(checks.discretisation_shifts, checks.data_std),
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
-            "to_use": prediction_outputs.estimate_texts_by_format(problem, solution, to_path),
+            "to_use": prediction_outputs.estimate_texts_by_format(*copied, export, checks.uncounted_errors),
             "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
         result = solution_to_result_dict(problem, solution, held_out) | more
