@@ -74,6 +74,10 @@ def gaps():
     for seen in ((), (True,), (True, False)):
         hidden = {"screening": screening(seen=[visible(FRICTION, own) for own in seen])}
         yield f"insufficient data, {seen}", finding("insufficient_data", **few, **hidden, **NO_EFFECT)
+    for p, size in ((1e-9, 1.05), (1e-3, 1.15), (0.006, 1.15)):
+        tests = {"nominal_test": outcome(p, chi2=size), "nominal_held_out_test": outcome(0.5, chi2=0.99)}
+        seen = {"screening": screening([score(FRICTION, p=1e-6 if size < 1.1 else 1e-3)])}
+        yield f"no gap, p = {p} and chi2 {size}", finding("no_gap", **tests, **seen, **NO_EFFECT)
     quiet = {"nominal_test": outcome(0.2, chi2=1.02), "nominal_held_out_test": outcome(0.6, chi2=0.989)}
     yield "along a candidate alone", finding(**quiet)
     yield "no gap", finding("no_gap", next_experiment="None is needed.", **NO_EFFECT)

@@ -118,7 +118,7 @@ def _gap(result: DiagnosisResult) -> str:
         "no_gap": f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).",
     }
     if result.verdict in texts:
-        return texts[result.verdict]
+        return " ".join([texts[result.verdict], *(_why_no_gap(result) if result.verdict == "no_gap" else ())])
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
@@ -126,6 +126,27 @@ def _gap(result: DiagnosisResult) -> str:
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
     small = f"not along what {best.effect.label} would do (p {_p_value_relation(p_value)})"
     return f"As a whole the recordings are explained to within their noise ({sizes}), but {small}."
+
+
+def _why_no_gap(result: DiagnosisResult) -> list[str]:
+    """Sentences on why a significant residual does not count as a gap."""
+    limits, tests = result.thresholds, (result.nominal_test, result.nominal_held_out_test)
+    p_value, scores = min(test.p_value for test in tests), result.screening.candidate_scores
+    least, level = 1 + limits.min_excess_chi2_per_dof, limits.gap_significance_level
+    size, text = max(test.chi2_per_dof for test in tests), list[str]()
+    if p_value < limits.significance_level and size <= least:
+        text.append(
+            f"The excess over noise is significant, but a gap needs chi2 per degree of freedom above {least:.4g}."
+        )
+    elif level / len(tests) <= p_value < limits.significance_level:
+        text.append(
+            f"The excess over noise is significant, but a gap needs p below {level:.2g}, with both tests counted."
+        )
+    if (along := bonferroni_corrected_min_candidate_p_value(scores)) < level:
+        best = min(scores, key=lambda own: own.p_value).effect.label
+        seen = f"A residual along {best} is significant (p {_p_value_relation(along)})"
+        text.append(f"{seen}, but it counts as a gap only with an accepted effect.")
+    return text
 
 
 def _places(result: DiagnosisResult) -> str:
