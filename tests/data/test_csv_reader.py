@@ -99,6 +99,25 @@ def test_csv_clocks_of_joints_and_points(tmp_path: Path) -> None:
     assert (recording.joint_names, recording.points) == (("T1_x", "T1_y", "T1_z"), ())
 
 
+STAMPS = {
+    "2025-03-04T10:20:30": "2025-03-04 10:20:31.5", "2025-03-04T10:20:30Z": "2025-03-04T11:20:31.500000001+01:00",
+    "2025-03-04 10:20:30,25": "2025-03-04 04:50:31,750 -0530", "1,5": "3", "-2,5e-1": "1,25",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("first", STAMPS)
+@pytest.mark.parametrize("mark", ["\t", ";"], ids=["tab", "semicolon"])
+def test_csv_decimal_commas_and_time_stamps(first: str, mark: str, tmp_path: Path) -> None:
+    """With a header and without; seconds are those of the stamps, whatever their zone."""
+    rows = [mark.join(("t", "q_a", "q_b")), mark.join((first, "0,5", "-1")), mark.join((STAMPS[first], "1", "2,5e-1"))]
+    for path in (table(tmp_path, "\n".join(rows)), table(tmp_path, "\n".join(rows[1:]))):
+        contents = preview_file(path)
+        known = {"column_meanings": {"1": "t", "2": "position:a", "3": "position:b"}, "has_header": False}
+        recording = read_any(path, **(known if "has_header" in contents.reader_options else {}))
+        assert np.diff(joints_of(recording).t) == pytest.approx(1.5, abs=1e-6)
+        np.testing.assert_array_equal(joints_of(recording).position, [[0.5, -1.0], [1.0, 0.25]])
+
+
 GOOD = "t,q_a\n0,1\n"
 CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "empty": ("", {}, "the table is empty", ""),
@@ -117,6 +136,10 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
     "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:JOINT"),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
+    "decimal commas": ("t,q_a\n0,0,1,5\n", {}, "the row has 4 cells", "decimal commas need semicolons"),
+    "both marks": ("t;q_a;q_b\n0;0.1;1,234\n", {}, "decimal commas and decimal points", ""),
+    "time of day": ("t,q_a\n10:20:30,1\n", {}, "'t' has the cell '10:20:30'", ""),
+    "no such day": ("t,q_a\n2025-13-04T10:20:30,1\n", {}, "'t' has the cell '2025-13", ""),
     "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' has the cell 'fast'", ""),
     "joint missing in a channel": (
         "t,q_a,q_b,effort_a\n0,1,1,1\n",

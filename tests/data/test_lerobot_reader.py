@@ -63,7 +63,7 @@ def test_state_and_action_of_an_episode(version: str, tmp_path: Path) -> None:
     assert np.allclose(joints.t, np.arange(4) / 30)
     assert np.allclose(joints.position, np.radians([[101, 100], [111, 110], [121, 120], [131, 130]]))
     assert np.allclose(joints.values_by_channel["position_command"] - joints.position, math.radians(1))
-    assert recording.notes == ("observation.images.top was left out (a video feature that is not understood)",)
+    assert recording.notes[0] == "observation.images.top was left out (a video feature that is not understood)"
     assert (recording.name, recording.source) == ("arm_000001", "arm, episode 1")
 
 
@@ -91,14 +91,21 @@ def test_the_preview_asks_for_a_unit_that_could_be_two_and_numbers_of_frames_are
     by_name = {source.name: source for source in contents.sources}
     assert by_name["action"].imported_as == "position_command"
     assert not by_name["observation.images.top"].imported_as
-    assert by_name["observation.state"].imported_as == "joints shoulder_pan, elbow_flex, gripper"
+    assert by_name["observation.state"].imported_as == "joints shoulder_pan, elbow_flex"
+    assert by_name["observation.state"].note == "without gripper: 0 to 100 % of the gripper's calibrated range"
     assert by_name["frame_index"].imported_as == "t"
     assert not by_name["index"].imported_as
     with pytest.raises(DataError, match="unit of the joint positions is unknown") as caught:
         read_any(path, **contents.reader_options)
     assert "-100 to 100" in caught.value.hint
     options = {**contents.reader_options, "units": {"position": "deg", "position_command": "deg"}}
-    assert read_any(path, **options).joint_names == ("shoulder_pan", "elbow_flex", "gripper")
+    assert read_any(path, **options).joint_names == ("shoulder_pan", "elbow_flex")
+    # per cent are no degrees: of all joints the gripper is left out, and not taken if it is named
+    made = read_any(path, **options | {"joints": None})
+    assert (made.joint_names, made.notes[-1][:22]) == (("shoulder_pan", "elbow_flex"), "gripper was left out (")
+    assert joints_of(made).values_by_channel["position_command"].shape == (4, 2)
+    with pytest.raises(DataError, match="'gripper' has no angles"):
+        read_any(path, **options | {"joints": ["gripper=jaw", "elbow_flex"]})
 
 
 @pytest.mark.parametrize(

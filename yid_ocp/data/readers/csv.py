@@ -39,6 +39,7 @@ _MOST_BAD = 0.5  # fraction of bad lines above which the table is refused
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # overhead of a line, in cells
 _LISTED = 5  # numbers of bad lines in a note
+_TIME_STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?")
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,9 @@ def _read_csv(path: str | os.PathLike[str], options: _CsvOptions = _DEFAULTS) ->
     - points: `<point>_x`, `<point>_y`, `<point>_z`
 
     Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are recognised by their headers, which also state
-    the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. The joints, the points or a
-    sensor have no sample at a time if all their cells in this row are empty. Raises `DataError` if the file, a column,
+    the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. Numbers may have a decimal
+    comma, times may be time stamps of ISO 8601 (date and time of day). The joints, the points or a sensor have no
+    sample at a time if all their cells in this row are empty. Raises `DataError` if the file, a column,
     cell, option or unit cannot be understood, or if `validated_recording` refuses the result.
     """
     path = Path(path)
@@ -106,7 +108,10 @@ def _mocap_table(path: Path) -> tuple[PointGroup, str, tuple[str, ...]] | None:
 def _delimiter(path: Path) -> str:
     """Delimiter of the first line with several cells; a comma if there is none."""
     _, first = next(_rows(path, ","), (1, []))
-    return next((mark for mark in "\t; " if mark in first[0].strip()), ",") if len(first) == 1 else ","
+    if len(first) == 1:
+        return next((mark for mark in "\t; " if mark in first[0].strip()), ",")
+    line = ",".join(first)  # of numbers with decimal commas, if the table has no header
+    return next((mark for mark in "\t;" if mark in line and all(map(_is_number, line.split(mark)))), ",")
 
 
 def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: _CsvOptions = _DEFAULTS) -> Recording:
@@ -186,6 +191,8 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         if len(cells) == len(names):
             numbers.extend(map(_number, cells))
             blank.extend(not cell.strip() for cell in cells)
+    if head and not numbers:  # every row has more or fewer cells: the error of reading the first one
+        _numbers(head[1], names, [None] * len(names), f"{path}, line {head[0]}")
     table = np.array(numbers).reshape(-1, len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
     if not numeric.any():
@@ -341,22 +348,42 @@ def _is_number(cell: str) -> bool:
 
 def _number(cell: str) -> float:
     try:
-        return float(cell)
+        return _parsed_number(cell)
     except ValueError:
         return math.nan
+
+
+def _parsed_number(cell: str) -> float:
+    """Number with a decimal point or comma, or seconds since 1970 of a time stamp. Raises `ValueError`."""
+    try:
+        return float(cell)
+    except ValueError:
+        if (stamp := _TIME_STAMP.fullmatch(cell.strip())) is None:
+            return float(cell.replace(",", ".", 1))
+    date, clock, zone = stamp.groups()
+    late = 0 if zone in (None, "Z") else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
+    return float(np.datetime64(f"{date}T{clock.replace(',', '.')}", "ns").astype(float)) * 1e-9 - 60.0 * late
 
 
 def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
     if len(cells) != len(header):
         what, allowed = f"the row has {len(cells)} cells", f"{len(header)} cells, as in the header"
-        raise DataError(what, where=where, allowed=allowed, hint=f"correct the row{_OR_SKIP}")
+        hint = f"correct the row{_OR_SKIP}"
+        if len(cells) > len(header):
+            hint += "; numbers with decimal commas need semicolons or tabs between the cells: export the table again"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
+    values = [cell for cell, meaning in zip(cells, meanings, strict=True) if meaning and meaning != ("t", "")]
+    if any("," in cell for cell in values) and any("." in cell for cell in values):
+        what, allowed = "the row has decimal commas and decimal points", "one of both, and no thousands separators"
+        raise DataError(what, where=where, allowed=allowed, hint=f"export the table again{_OR_SKIP}")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
         if meaning:
             try:
-                numbers.append(float(cell) if cell.strip() else math.nan)
+                numbers.append(_parsed_number(cell) if cell.strip() else math.nan)
             except ValueError as error:
-                allowed = "a number with a decimal point, or an empty cell if there was no measurement"
+                allowed = "a number, or an empty cell if there was no measurement"
+                allowed = "seconds, or a time stamp such as 2025-03-04T10:20:30.5Z" if meaning[0] == "t" else allowed
                 what, hint = f"column '{name}' has the cell '{cell}'", f"correct or empty the cell{_OR_SKIP}"
                 raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return numbers

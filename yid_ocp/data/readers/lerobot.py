@@ -35,6 +35,7 @@ _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_inde
 _NEVER_RADIANS = re.compile(r"(so_?100|so_?101|koch|lekiwi|omx|hope_?jr)", re.IGNORECASE)
 """Types of robots that LeRobot records in degrees or in normalised units, -100 to 100 of the calibrated range."""
 _MAX_RADIANS, _MAX_NORMALISED = 2.1 * math.pi, 100.5
+_PERCENT = "0 to 100 % of the gripper's calibrated range"
 
 
 class _Feature(BaseModel):
@@ -73,7 +74,8 @@ def _read_lerobot_episode(
     `observation.state` is the measured position of the joints. If the names of its entries end in `.pos`, `.vel` and
     `.torque`, `.effort` or `.current`, it is position, velocity and effort. `action` is the commanded position. Times
     are frame index / frame rate, a nominal clock. `units` must state the unit of angles (often degrees) if they cannot
-    be radians, or if LeRobot never records this robot in radians. `notes` lists images and other features. The other
+    be radians, or if LeRobot never records this robot in radians. With degrees, a gripper is left out, because LeRobot
+    records it in per cent of its range. `notes` lists images and other features. The other
     options are those of `JointPointAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
     `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode, or if
     `validated_recording` refuses the result.
@@ -82,10 +84,20 @@ def _read_lerobot_episode(
     table, file = _episode(dataset, episode)
     names, channels, left = _channels(dataset, table)
     t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
+    where = f"{dataset.folder}, episode {episode}"
+    if (units or {}).get("position") == "deg":
+        chosen = {entry.partition("=")[0].strip() for entry in joints or ()}
+        if grippers := [name for name in _grippers(names) if name in chosen and _is_own_robot(dataset)]:
+            what, hint = f"'{grippers[0]}' has no angles: LeRobot records {_PERCENT}", f"leave {grippers[0]} out"
+            raise DataError(what, where=where, allowed="joints whose positions are angles, in --joints", hint=hint)
+        why = f"{_PERCENT} are no angles: state its angle in model.arms.locked_joints"
+        left |= {name: why for name in _grippers(names) if name not in chosen}
+        kept = [i for i, name in enumerate(names) if name not in left]
+        names, channels = tuple(names[i] for i in kept), {key: values[:, kept] for key, values in channels.items()}
     group = JointGroup(names, t - t[0], clock="nominal", **channels)
     own = source, f"{dataset.folder.name}_{episode:06d}", file_sha256(file)
     notes = tuple(f"{name} was left out ({why})" for name, why in left.items())
-    raw, where = Recording(group, (), description, *own, notes=notes), f"{dataset.folder}, episode {episode}"
+    raw = Recording(group, (), description, *own, notes=notes)
     if "position" not in (units or {}):
         _check_are_radians(group, dataset, where)
     options = base.JointPointAndUnitOptions(joints, None, units, torque_constants, gear_ratios)
@@ -98,16 +110,18 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     table, _ = _episode(dataset, 0)
     names, channels, left = _channels(dataset, table)
     group = JointGroup(names, _times(dataset, table), clock="nominal", **channels)
-    sources = []
+    sources, (units, guesses) = [], base.guess_non_si_units(Recording(group))
+    grippers = _grippers(names) if "position" in units or _is_own_robot(dataset) else []
+    names = tuple(name for name in names if name not in grippers)
+    by_name = {_ACTION: "position_command", _STATE: f"joints {', '.join(names)}"}
     for name, feature in dataset.info.features.items():
-        becomes = {_ACTION: "position_command", _STATE: f"joints {', '.join(names)}"}.get(name, _CHANNELS.get(name, ""))
-        own = (becomes, "") if name not in left else ("", left[name])
+        note = f"without {', '.join(grippers)}: {_PERCENT}" if name == _STATE and grippers else ""
+        own = ("", left[name]) if name in left else (by_name.get(name, _CHANNELS.get(name, "")), note)
         if name == "frame_index":
             own = ("t", "")
         elif name in _BOOKKEEPING:
             own = ("", "numbers frames and tasks")
         sources.append(base.TopicOrColumnSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
-    units, guesses = base.guess_non_si_units(Recording(group))
     if "position" in units and _widest(group) <= _MAX_NORMALISED:  # degrees or normalised: reading asks which
         del units["position"]
         guesses = tuple(guess for guess in guesses if not guess.startswith("angles"))
@@ -119,18 +133,27 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     return base.FilePreview(tuple(sources), options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
 
+def _grippers(names: Sequence[str]) -> list[str]:
+    """Joints that LeRobot records in per cent even if the arm is in degrees."""
+    return [name for name in names if "gripper" in name.lower()]
+
+
+def _is_own_robot(dataset: _Dataset) -> bool:
+    return bool(_NEVER_RADIANS.search(dataset.info.robot_type or ""))
+
+
 def _widest(group: JointGroup) -> float:
-    """Largest recorded angle without grippers, whose range is 0 to 100 even if the arm is in degrees."""
-    arm = [i for i, name in enumerate(group.names) if "gripper" not in name.lower()]
+    """Largest recorded angle, without grippers."""
+    arm = [i for i, name in enumerate(group.names) if name not in _grippers(group.names)]
     return float(np.nanmax(np.abs(group.position[:, arm]), initial=0.0))
 
 
 def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None:
     """Raise `DataError` if angles are in degrees or normalised units, or the robot is never recorded in radians."""
-    widest, robot = _widest(group), dataset.info.robot_type or ""
-    if widest <= _MAX_RADIANS and not _NEVER_RADIANS.search(robot):
+    widest, robot = _widest(group), dataset.info.robot_type
+    if widest <= _MAX_RADIANS and not _is_own_robot(dataset):
         return
-    of = f", and LeRobot does not record a {robot} in radians" if _NEVER_RADIANS.search(robot) else ""
+    of = f", and LeRobot does not record a {robot} in radians" if _is_own_robot(dataset) else ""
     what = f"the unit of the joint positions is unknown: the largest absolute value is {widest:.3g}{of}"
     allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "--units deg"
     if widest <= _MAX_NORMALISED:
