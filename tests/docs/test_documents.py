@@ -16,19 +16,16 @@ from ruamel.yaml import YAML
 
 import yid_ocp
 from yid_ocp.analysis.step_symbols import NamedStepEquations
-from yid_ocp.cli import build_argument_parser
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.base import EffectBase
-from yid_ocp.errors import ConfigError
 from yid_ocp.export.equations import _MAX_JACOBIAN_OPERATIONS
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.init import _object_from_arguments
 
 
 @pytest.fixture
@@ -80,22 +77,6 @@ def printed_commands(text: str) -> list[list[str]]:
         for part in " ".join(map(shlex.quote, words)).replace("'&&'", "|").replace("'|'", "|").split(" | "):
             found += [shlex.split(part)] if part.startswith("yid-ocp ") else []
     return found
-
-
-def test_every_command_that_is_printed_is_understood(repository):
-    parser, count = build_argument_parser(), 0
-    for file in [repository / "README.md", *repository.glob("docs/**/*.md")]:
-        for _, *arguments in printed_commands(file.read_text(encoding="utf-8")):
-            try:
-                parsed = parser.parse_args(arguments)
-                if arguments[0] == "init":
-                    _object_from_arguments(parsed)  # has all the numbers that it needs
-            except (SystemExit, ConfigError) as error:
-                pytest.fail(f"{file.name}: {' '.join(arguments)}: {error}")
-            named = [word for word in arguments if re.fullmatch(r"configs/\w+\.yaml", word)]
-            assert all((repository / word).is_file() for word in named), file.name
-            count += 1
-    assert count > 50
 
 
 def test_names_in_the_pages_exist(repository):
