@@ -3,6 +3,7 @@
 import json
 import math
 import mmap
+import re
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from yid_ocp.analysis.estimation import (
     prediction_errors_units_and_fit_errors,
 )
 from yid_ocp.cli import main
+from yid_ocp.errors import ConfigError
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, fit_problem
@@ -54,6 +56,20 @@ def test_methods_agree_on_what_the_data_inform(problem):
         assert run.wall_seconds > 0
         assert run.peak_memory_mib > 10
         assert len(run.held_out_predictions) == 1
+
+
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        ([-1.0, 0.2, 0.1], "elbow.stiffness = -1 N m/rad lies below its lower bound of 0 N m/rad"),
+        ([4.0, 0.2, -0.5], "shoulder.damping = -0.5 N m s/rad lies below its lower bound of 0"),
+        ([4.0, math.nan, 0.1], "elbow.rest = nan is not a finite number"),
+        ([4.0], "1 values for 3 unknowns"),
+    ],
+)
+def test_a_start_beyond_a_bound_is_refused_by_name(problem, start, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        estimation.solve(problem, initial_unknowns=start)
 
 
 def test_a_method_that_stops_early_is_said_to_differ(problem):

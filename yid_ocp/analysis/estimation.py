@@ -14,7 +14,8 @@ from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, Issue
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
+from yid_ocp.errors import ConfigError
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
@@ -25,6 +26,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER
+from yid_ocp.model.parameters import Parameter
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
 from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
@@ -59,10 +61,12 @@ def solve(
     solver : Solver, optional
         Default: `GaussNewton()`, regardless of the configuration file.
     initial_unknowns : sequence of float, optional
-        Default: the initial unknowns of the problem.
+        Default: the initial unknowns of the problem. Raises `ConfigError` for another number, or beyond a bound.
     callback : callable, optional
         Receives every `Iterate`.
     """
+    if initial_unknowns is not None:
+        _check_start(problem, initial_unknowns)
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
@@ -73,6 +77,16 @@ def solve(
     solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
     checks = replace(solution.checks or EstimateChecksBeyondFit(), cable_memory_message=safe.message)
     return replace(solution, checks=checks)
+
+
+def _check_start(problem: EstimationProblem, start: Sequence[float]) -> None:
+    names, known = problem.unknown_names, problem.system.parameters
+    if len(start) != len(names):
+        what, hint = f"{len(start)} values for {len(names)} unknowns", "use problem.unknown_vector({NAME: VALUE, ...})"
+        raise ConfigError(what, where="initial_unknowns", allowed=f"values of {abbreviated_names_text(names)}", hint=hint)
+    for name, value, lower, upper in zip(names, start, *problem.bounds, strict=True):
+        shared = name.partition("[")[0]
+        Parameter(name, float(value), known[shared].unit if shared in known else "1", lower, upper)  # checks its bounds
 
 
 def add_intervals_and_checks(
