@@ -52,10 +52,10 @@ def count_with_noun(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def abbreviated_names_text(names: Sequence[str]) -> str:
+def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES_IN_LINE) -> str:
     """Join names to one line of text. Three or more names with consecutive numbers are merged, as in `joint1..7`.
 
-    The line has at most `_MAX_NAMES_IN_LINE` entries, followed by the number of omitted names.
+    The line has at most `max_entries` entries, followed by the number of omitted names.
     """
     parts = [re.split(r"(\d+)", name) for name in names]
     taken: set[int] = set()
@@ -74,7 +74,7 @@ def abbreviated_names_text(names: Sequence[str]) -> str:
             if len(run) > max(2, len(longest)) and not taken.intersection(run):
                 longest, text = run, "".join([*own[: at + 1], "..", parts[run[-1]][at], *own[at + 1 :]])
         taken.update(longest)
-        if len(said) < _MAX_NAMES_IN_LINE:
+        if len(said) < max_entries:
             said.append(text)
         else:
             left += len(longest)

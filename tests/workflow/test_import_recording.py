@@ -177,6 +177,28 @@ def test_doubts_are_said_at_import(text: str, said: str, odd: Path, capsys: pyte
     assert said in capsys.readouterr().out
 
 
+def test_sources_that_differ_in_a_number_are_one_row(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In the tables of `import`, and points in what `init` prints and writes; JSON lists all."""
+    names = [f"q_joint{i}" for i in range(1, 8)] + [f"tau_joint{i}" for i in range(1, 8)]
+    names += [f"m{i}_{axis}" for i in (1, 2, 3, 5) for axis in "xyz"] + [f"tip_{axis}" for axis in "xyz"]
+    rows = [",".join(["0.01" if k else "0", *(f"{math.sin(0.1 * k + i):.4f}" for i in range(29))]) for k in range(2)]
+    (odd / "run.csv").write_text("\n".join([",".join(["t", *names]), *rows]))
+    assert main(["import", "run.csv", "--preview"]) == 0
+    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    shown = ["q_joint1..7", "tau_joint1..7", *(f"m{i}_{axis}" for i in (1, 2, 3, 5) for axis in "xyz")]
+    assert [words[0] for words in told[3:17]] == shown
+    assert told[3][-1] == "position:joint1..7"
+    assert main(["import", "run.csv", "--preview", "--json"]) == 0
+    assert [source["name"] for source in json.loads(capsys.readouterr().out)["sources"]] == ["t", *names]
+    assert main(["import", "run.csv", "--out", "run.h5"]) == 0
+    assert "m1..3, m5, tip" in capsys.readouterr().out
+    assert main(["init", "package:xarm7", "run.h5", "--out", "run.yaml"]) == 0
+    told = capsys.readouterr().out
+    assert "joints: joint1..7\n" in told
+    for text in (told, (odd / "run.yaml").read_text()):
+        assert "m1..3, m5, tip at ?" in text
+
+
 def test_no_command_is_suggested_that_would_fail(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (odd / "run.csv").write_text("t,bend\n0,1\n1,2\n")
     assert main(["import", "run.csv", "--preview"]) == 0

@@ -83,7 +83,8 @@ def _check_start(problem: EstimationProblem, start: Sequence[float]) -> None:
     names, known = problem.unknown_names, problem.system.parameters
     if len(start) != len(names):
         what, hint = f"{len(start)} values for {len(names)} unknowns", "use problem.unknown_vector({NAME: VALUE, ...})"
-        raise ConfigError(what, where="initial_unknowns", allowed=f"values of {abbreviated_names_text(names)}", hint=hint)
+        allowed = f"values of {abbreviated_names_text(names)}"
+        raise ConfigError(what, where="initial_unknowns", allowed=allowed, hint=hint)
     for name, value, lower, upper in zip(names, start, *problem.bounds, strict=True):
         shared = name.partition("[")[0]
         Parameter(name, float(value), known[shared].unit if shared in known else "1", lower, upper)  # checks its bounds

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
+from yid_ocp.display import abbreviated_names_text
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     goodness_of_fit_message,
@@ -224,7 +226,8 @@ def recording_summary_lines(recording: Recording) -> list[str]:
     for group in recording.all_groups:
         rate, span = mean_sample_rate(group.t), f"{group.t[-1] - group.t[0]:.4g}"
         sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", span
-        rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), ", ".join(group.names)))
+        names = abbreviated_names_text(group.names, math.inf)
+        rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), names))
     return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
 
 
@@ -240,9 +243,18 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
 def importable_file_summary_lines(contents: FilePreview) -> list[str]:
     """Return lines of text that describe a file of another tool: a table of what `import` finds, and notes."""
     rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
-    for source in contents.sources:
-        rate = f"{source.mean_rate:.4g}" if math.isfinite(source.mean_rate) else ""
-        rows.append((source.name, source.kind, str(source.n_samples), rate, source.imported_as or "-", source.note))
+    alike: dict[tuple[str, ...], list[Sequence[str]]] = {}  # rows that only differ in a number
+    for own in contents.sources:
+        rate = f"{own.mean_rate:.4g}" if math.isfinite(own.mean_rate) else ""
+        kind, _, names = own.imported_as.partition(" ")
+        becomes = f"{kind} {abbreviated_names_text(names.split(', '), math.inf)}" if names else kind or "-"
+        rows.append((own.name, own.kind, str(own.n_samples), rate, becomes, own.note))
+        alike.setdefault(tuple(re.sub(r"(?<=\D)\d+", "#", cell) for cell in rows[-1]), []).append(rows[-1])
+    for group in alike.values():
+        first, *others = group
+        names = [abbreviated_names_text(list(dict.fromkeys(cells)), math.inf) for cells in zip(*group, strict=True)]
+        if others and not any(", " in name and name != cell for name, cell in zip(names, first, strict=True)):
+            rows = [names if row is first else row for row in rows if row not in others]
     return [*aligned_table_lines(rows), *_note_lines(contents.notes)]
 
 

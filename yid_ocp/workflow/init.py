@@ -17,7 +17,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema, option_info_from_annotation
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_RECORDING_GROUP
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.errors import ConfigError, DataError, OutputError, nearest_name_question, require_known_names
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitialObjectSettings, init_object_templates, parse_comma_separated_numbers
@@ -185,7 +185,7 @@ def _summary_lines(
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
     lines = [
-        f"joints: {', '.join(proposal.joints)}",
+        f"joints: {abbreviated_names_text(proposal.joints, math.inf)}",
         f"held by: {', '.join(held)}" + f" (frames there, for --holder: {', '.join(others)})" * bool(others),
         f"mode: {proposal.arm_mode}: {proposal.arm_mode_reason}",
         f"start: {proposal.initial_state}: {proposal.initial_state_reason}",
@@ -193,7 +193,7 @@ def _summary_lines(
     damping = _value(proposal.urdf_joint_damping)
     lines += [f"damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
-        lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.reason}" for place in places]
+        lines += [f"{group}: {points} at {frame}, {reason}" for points, frame, reason in _merged_places(places)]
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
     for signals, kinds in effect_kinds_without_recorded_signals(recordings).items():
         lines.append(f"diagnose does not try {', '.join(kinds)}: nothing was recorded of {signals}")
@@ -205,6 +205,14 @@ def _summary_lines(
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
         lines.append(f"friction of the arm's joints: yid-ocp friction {quoted}{more}")
     return [*lines, ""]
+
+
+def _merged_places(places: Iterable[Any]) -> list[tuple[str, str, str]]:
+    """Return points, frame (`?` if unknown) and reason. Points with the same frame and reason are one entry."""
+    points: dict[tuple[str, str], list[str]] = {}
+    for own in places:
+        points.setdefault((own.frame or "?", own.reason), []).append(own.point)
+    return [(abbreviated_names_text(names, math.inf), *about) for about, names in points.items()]
 
 
 def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices) -> Recording:
@@ -250,6 +258,7 @@ def _config_text(
     loader = jinja2.PackageLoader("yid_ocp.workflow")
     environment = jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters |= {"yaml": _value, "wrapped": _wrapped_list, "number": _number}
+    environment.filters["merged"] = _merged_places
     environment.filters["settings"] = lambda settings: "\n".join(_settings_lines("    ", settings))
     known: dict[str, Any] = {"about": about, "robot": robot, "item": item, "files": recordings, "imports": imports}
     known |= {"p": proposal, "sensors": _sensors(proposal), "motors": list(MOTOR_PRESETS)}
