@@ -104,7 +104,7 @@ def test_the_preview_asks_for_a_unit_that_could_be_two_and_numbers_of_frames_are
     made = read_any(path, **options | {"joints": None})
     assert (made.joint_names, made.notes[-1][:22]) == (("shoulder_pan", "elbow_flex"), "gripper was left out (")
     assert joints_of(made).values_by_channel["position_command"].shape == (4, 2)
-    with pytest.raises(DataError, match="'gripper' has no angles"):
+    with pytest.raises(DataError, match="no joint 'gripper'"):
         read_any(path, **options | {"joints": ["gripper=jaw", "elbow_flex"]})
 
 

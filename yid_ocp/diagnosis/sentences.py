@@ -134,14 +134,11 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     p_value, scores = min(test.p_value for test in tests), result.screening.candidate_scores
     least, level = 1 + limits.min_excess_chi2_per_dof, limits.gap_significance_level
     size, text = max(test.chi2_per_dof for test in tests), list[str]()
+    begin = "The excess over noise is significant, but a gap needs"
     if p_value < limits.significance_level and size <= least:
-        text.append(
-            f"The excess over noise is significant, but a gap needs chi2 per degree of freedom above {least:.4g}."
-        )
+        text.append(f"{begin} chi2 per degree of freedom above {least:.4g}.")
     elif level / len(tests) <= p_value < limits.significance_level:
-        text.append(
-            f"The excess over noise is significant, but a gap needs p below {level:.2g}, with both tests counted."
-        )
+        text.append(f"{begin} p below {level:.2g}, with both tests counted.")
     if (along := bonferroni_corrected_min_candidate_p_value(scores)) < level:
         best = min(scores, key=lambda own: own.p_value).effect.label
         seen = f"A residual along {best} is significant (p {_p_value_relation(along)})"

@@ -254,10 +254,8 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
         rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
     fitted, friction = result["laws"][best]["parameters"], result["friction_parameters"]
-    shown = {
-        name: value_and_uncertainty_text(e["value"], e["std"], e["interval"], verdict=e["verdict"])
-        for name, e in fitted.items()
-    }
+    told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
+    shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
     constants: TableRows = [("joint", *(f"{constant} [{unit}]" for constant, unit in heads.items()))]
     for joint in result["joints"]:

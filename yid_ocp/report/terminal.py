@@ -246,8 +246,8 @@ def importable_file_summary_lines(contents: FilePreview) -> list[str]:
     alike: dict[tuple[str, ...], list[Sequence[str]]] = {}  # rows that only differ in a number
     for own in contents.sources:
         rate = f"{own.mean_rate:.4g}" if math.isfinite(own.mean_rate) else ""
-        kind, _, names = own.imported_as.partition(" ")
-        becomes = f"{kind} {abbreviated_names_text(names.split(', '), math.inf)}" if names else kind or "-"
+        kind, _, of = own.imported_as.partition(" ")
+        becomes = f"{kind} {abbreviated_names_text(of.split(', '), math.inf)}" if of else kind or "-"
         rows.append((own.name, own.kind, str(own.n_samples), rate, becomes, own.note))
         alike.setdefault(tuple(re.sub(r"(?<=\D)\d+", "#", cell) for cell in rows[-1]), []).append(rows[-1])
     for group in alike.values():

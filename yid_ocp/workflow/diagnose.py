@@ -165,16 +165,16 @@ def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, An
     for name in fit.problem.shared_parameters:
         entry, value, std = system.parameters[name], fit.values[name], fit.std[name]
         verdict = verdict_by_relative_std(value, std, sizes[name])
-        found = "identifiable" if verdict == "weak" and "@" in name else verdict
-        range_and_verdict = entry.value, entry.lower, entry.upper, True, found
-        estimates[name] = ParameterEstimate(value, std, entry.unit, *range_and_verdict)
+        verdict = "identifiable" if verdict == "weak" and "@" in name else verdict
+        told = entry.unit, entry.value, entry.lower, entry.upper
+        estimates[name] = ParameterEstimate(value, std, *told, True, verdict)
     effects = [f"  - {{kind: {own.kind}, location: {own.location}}}" for own in finding.accepted_effects]
     lines = ["model:", "  effects:  # add them to those of the configuration", *effects] if effects else []
     stated, used = finding.stated_and_used_time_step
     lines += ["problem:", f"  time_step: {used:g}"] if used != stated else []
-    theta, export = fit.problem.unpack_episode_unknowns(fit.unknowns, 0)[0], ("export", folder, "--out", "model.xml")
-    texts = prediction_outputs.estimate_texts_by_format
-    return texts(system, theta, estimates, export, model_yaml=lines)
+    copied = system, fit.problem.unpack_episode_unknowns(fit.unknowns, 0)[0], estimates
+    export = "export", folder, "--out", "model.xml"
+    return prediction_outputs.estimate_texts_by_format(*copied, export, model_yaml=lines)
 
 
 @dataclass(frozen=True)

@@ -86,12 +86,8 @@ def _read_lerobot_episode(
     t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
     where = f"{dataset.folder}, episode {episode}"
     if (units or {}).get("position") == "deg":
-        chosen = {entry.partition("=")[0].strip() for entry in joints or ()}
-        if grippers := [name for name in _grippers(names) if name in chosen and _is_own_robot(dataset)]:
-            what, hint = f"'{grippers[0]}' has no angles: LeRobot records {_PERCENT}", f"leave {grippers[0]} out"
-            raise DataError(what, where=where, allowed="joints whose positions are angles, in --joints", hint=hint)
         why = f"{_PERCENT} are no angles: state its angle in model.arms.locked_joints"
-        left |= {name: why for name in _grippers(names) if name not in chosen}
+        left |= dict.fromkeys(_grippers(names), why)
         kept = [i for i, name in enumerate(names) if name not in left]
         names, channels = tuple(names[i] for i in kept), {key: values[:, kept] for key, values in channels.items()}
     group = JointGroup(names, t - t[0], clock="nominal", **channels)
@@ -111,7 +107,7 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     names, channels, left = _channels(dataset, table)
     group = JointGroup(names, _times(dataset, table), clock="nominal", **channels)
     sources, (units, guesses) = [], base.guess_non_si_units(Recording(group))
-    grippers = _grippers(names) if "position" in units or _is_own_robot(dataset) else []
+    grippers = _grippers(names) if "position" in units or _NEVER_RADIANS.search(dataset.info.robot_type or "") else []
     names = tuple(name for name in names if name not in grippers)
     by_name = {_ACTION: "position_command", _STATE: f"joints {', '.join(names)}"}
     for name, feature in dataset.info.features.items():
@@ -138,10 +134,6 @@ def _grippers(names: Sequence[str]) -> list[str]:
     return [name for name in names if "gripper" in name.lower()]
 
 
-def _is_own_robot(dataset: _Dataset) -> bool:
-    return bool(_NEVER_RADIANS.search(dataset.info.robot_type or ""))
-
-
 def _widest(group: JointGroup) -> float:
     """Largest recorded angle, without grippers."""
     arm = [i for i, name in enumerate(group.names) if name not in _grippers(group.names)]
@@ -151,9 +143,13 @@ def _widest(group: JointGroup) -> float:
 def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None:
     """Raise `DataError` if angles are in degrees or normalised units, or the robot is never recorded in radians."""
     widest, robot = _widest(group), dataset.info.robot_type
-    if widest <= _MAX_RADIANS and not _is_own_robot(dataset):
+    if widest <= _MAX_RADIANS and not _NEVER_RADIANS.search(dataset.info.robot_type or ""):
         return
-    of = f", and LeRobot does not record a {robot} in radians" if _is_own_robot(dataset) else ""
+    of = (
+        f", and LeRobot does not record a {robot} in radians"
+        if _NEVER_RADIANS.search(dataset.info.robot_type or "")
+        else ""
+    )
     what = f"the unit of the joint positions is unknown: the largest absolute value is {widest:.3g}{of}"
     allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "--units deg"
     if widest <= _MAX_NORMALISED:
