@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike
@@ -78,26 +77,23 @@ def estimate_texts_by_format(
     found = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
     if not found:
         return {}
-    joints, lines = [], _mjcf_joint_lines(system, theta, found)
-    found_symbols = ca.vertcat(*(system.parameters[name].symbol for name in found))
-
-    def numbers(terms: Sequence[ca.SX]) -> Array:
-        if not terms or not ca.depends_on(ca.vertcat(*terms), found_symbols):
-            return np.zeros(0)
-        return np.array(ca.Function("k", [system.parameters.symbols], [ca.vertcat(*terms)])(theta)).ravel()
-
+    terms, springs, joints = _found_joint_terms(system, theta, found), system.elastic_joints, []
+    links = {s.joint_name for s in springs if s.segment_name != s.joint_name}
+    lines = [_mjcf_joint_line(joint, own) for joint, own in terms.items() if own and joint not in links]
     for layout in system.segment_layouts:
         for deformation in ("bend", "twist"):
-            own = [s for s in system.elastic_joints if (s.segment_name, s.deformation) == (layout.name, deformation)]
-            sizes = {"stiffness": numbers([s.stiffness for s in own]), "damping": numbers([s.damping for s in own])}
-            sizes, links = {key: size for key, size in sizes.items() if len(size)}, len(layout.link_joints)
-            note = f"{layout.name} {deformation}, {links} links; n links: times n/{links}"
-            if len(stiffness := sizes.get("stiffness", ())):
-                low, high = float(min(stiffness)), float(max(stiffness))
-                known = {"segment": layout.name, "deformation": deformation, "links": links}
+            own = [
+                terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == (layout.name, deformation)
+            ]
+            sizes = {key: [at[key] for at in own if key in at] for key in ("stiffness", "damping")}
+            count = len(layout.link_joints)
+            note = f"{layout.name} {deformation}, {count} links; n links: times n/{count}"
+            if stiffness := sizes["stiffness"]:
+                low, high = min(stiffness), max(stiffness)
+                known = {"segment": layout.name, "deformation": deformation, "links": count}
                 joints.append(known | {"lowest": low, "highest": high})
                 note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
-            shown = " ".join(f'{key}="{np.median(size):.4g}"' for key, size in sizes.items())
+            shown = " ".join(f'{key}="{np.median(size):.4g}"' for key, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}
     rows = [rf"{labels[n]} & ${e.value:.4g} \pm {e.std:.2g}$ & {e.unit} \\" for n, e in found.items()]
@@ -114,24 +110,24 @@ def estimate_texts_by_format(
     }
 
 
-def _mjcf_joint_lines(system: System, theta: Array, found: Mapping[str, ParameterEstimate]) -> list[str]:
-    """Return an MJCF element for each joint of the robot, with the attributes that found parameters change."""
-    values = dict(zip(system.parameters.names, theta, strict=True))
-    moved = values | {name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in found}
+def _found_joint_terms(system: System, theta: Array, names: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return the attributes of each joint in MJCF that depend on the parameters `names`."""
+    values, found = dict(zip(system.parameters.names, theta, strict=True)), {}
+    moved = values | {name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in names}
     terms, others = (system_joint_dynamics_terms(system, ExpressionEvaluator(system, own)) for own in (values, moved))
-    links, lines = {s.joint_name for s in system.elastic_joints if s.segment_name != s.joint_name}, []
     for joint, own in terms.items():
         changed = {key for key, size in vars(own).items() if size != getattr(others[joint], key)}
         sizes = {"damping": own.damping, "armature": own.armature, "dry_friction": own.dry_friction}
-        sizes = {key.replace("dry_friction", "frictionloss"): size for key, size in sizes.items() if key in changed}
-        note = ""
+        found[joint] = {key.replace("dry_friction", "frictionloss"): sizes[key] for key in sizes if key in changed}
         if changed & {"stiffness", "constant_force"} and own.stiffness > 0:
-            sizes |= {"stiffness": own.stiffness, "springref": own.constant_force / own.stiffness}
-            note = ' <!-- with compiler angle="radian" -->'
-        if sizes and joint not in links:
-            shown = " ".join(f'{key}="{size:.4g}"' for key, size in sizes.items())
-            lines.append(f'<joint name="{joint}" {shown}/>{note}')
-    return lines
+            found[joint] |= {"stiffness": own.stiffness, "springref": own.constant_force / own.stiffness}
+    return found
+
+
+def _mjcf_joint_line(joint: str, attributes: Mapping[str, float]) -> str:
+    shown = " ".join(f'{key}="{size:.4g}"' for key, size in attributes.items())
+    note = ' <!-- with compiler angle="radian" -->' if "springref" in attributes else ""
+    return f'<joint name="{joint}" {shown}/>{note}'
 
 
 def _has_torque_bias(episode: Episode) -> bool:
