@@ -35,6 +35,7 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 
 def without_times(folder) -> dict:
     result = json.loads((folder / "result.json").read_text())
+    result["to_use"].pop("export")  # names the folder
     return {name: value for name, value in result.items() if name not in ("seconds", "command", "date", "inputs")}
 
 

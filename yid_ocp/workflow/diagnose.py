@@ -111,18 +111,18 @@ def run_diagnose(
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
         moving = not last.problem.options.clamp_pose_point_names and bool(system.driven or system.prescribed)
-        x = last.unknowns
+        x, is_found = last.unknowns, finding.verdict in ("effect", "no_gap")
+        is_found = is_found and problem.options.has_no_data_issue_above_warning
         recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
         own = {
             "model": _final_model_to_dict(finding),
             "issues": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.torque_offsets_by_recording(last.problem, x),
+            "to_use": _texts_of_final_model(finding, os.path.relpath(folder.final_path)) if is_found else {},
             "not_candidates": effect_kinds_without_recorded_signals(recordings),
             "unused_efforts": _has_unused_efforts(problem),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
-        if finding.verdict in ("effect", "no_gap") and problem.options.has_no_data_issue_above_warning:
-            own["to_use"] = _texts_of_final_model(finding, os.path.relpath(folder.final_path))
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
         more = {"finding": finding, "predictions": predicted}
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
