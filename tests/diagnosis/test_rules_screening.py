@@ -140,6 +140,28 @@ def test_noise_that_moves_an_arm_and_predicts_its_efforts_biases_no_score(kind, 
     assert min(p_values) > 0.01
 
 
+def test_an_inertia_turns_the_encoders_noise_into_more_noise_of_efforts(urdf_folder):
+    system = System.build(read_urdf(urdf_folder / "servo_pendulum.urdf"), prescribed=["joint"], damping={"joint": 0.05})
+    rotor, values = make_effect("rotor_inertia", "joint", system), {"rotor_inertia@joint.armature": 0.02}
+    heavy, plain = (compile_step(own, H, use_compiler=False) for own in (system.with_effects([rotor]), system))
+    smooth, options = replace(taken(plain, 4, steps=300), points=()), ProblemOptions(path_cutoff=40.0)
+    exact = EstimationProblem(heavy, [smooth], ("joint.damping",), options, values)
+    [exact] = exact.evaluate(exact.initial_unknowns, False).episode_predictions
+    group, noise = smooth.joints, np.random.default_rng(1).standard_normal((2, 301, 1))
+    effort = np.interp(group.t, group.t[:-1] + H / 2, exact.rollout.effort[:, 0])[:, None] + 0.01 * noise[0]
+    noisy = replace(group, position=group.position + 6e-4 * noise[1], effort=effort, position_std=6e-4, effort_std=0.01)
+    made = EstimationProblem(plain, [replace(smooth, joints=noisy)], ("joint.damping",), options)
+    made = AllCandidatesProblem.from_problem(made, [rotor])
+    assert made.with_effort_noise_of_effects([rotor], {**values, "rotor_inertia@joint.armature": 1e-4}) is None
+    chi2 = []
+    for own in (made, made.with_effort_noise_of_effects([rotor], values)):
+        own = own.with_nominal_and_effects_free([rotor])
+        residual = own.evaluate(own.unknown_vector(values), False).residual[own.residual_rows.data]
+        chi2.append(residual @ residual / len(residual))
+    assert chi2[1] == pytest.approx(1.0, abs=0.3)
+    assert chi2[0] > 3.0
+
+
 @pytest.mark.parametrize("colour", [(1.0,), (1.0, 0.6), (1.0, 0.5, -0.3), (1.0, *[0.1] * 40)])
 def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
     columns = np.random.default_rng(1).standard_normal((30, 2))

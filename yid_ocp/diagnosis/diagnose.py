@@ -37,7 +37,7 @@ from yid_ocp.diagnosis.refit import (
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, screen_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
@@ -185,6 +185,22 @@ def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
 
 
+def _with_noise_beside_effects(seen: _Examined, judged: Judgement) -> _Examined | None:
+    """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
+    if judged.verdict != "unknown" or not judged.selected_effects:
+        return None
+    search, fit = seen.with_events, judged.selected_effects[-1].refitted_model
+    problem = search.problem.with_effort_noise_of_effects(fit.effects, fit.values)
+    if problem is None:
+        return None
+    text = f"efforts are noisier beside {hypotheses.join_effect_labels(fit.effects)}: going on with this noise"
+    search.progress.begin_stage(text)
+    # stored and recorded results are of the noise before
+    search = replace(search, problem=problem, store=NO_REFIT_STORE, record=EffectSearchRecord(), rounds=[])
+    nominal = _fitted_nominal_model(search, seen.nominal.values)
+    return _examined(search, nominal, seen.truncated, seen.is_corrected_for_links, seen.removed)
+
+
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
     """How much half the time step lowers r'r - n of a fit; minus infinity if the motion cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
@@ -301,6 +317,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     judged = judge(search, evidence)
     # what is left beside an effect may be the error of the discretisation
     is_in_time = time.perf_counter() < search.deadline  # a search that begins anew would find nothing
+    if is_in_time and (noisier := _with_noise_beside_effects(seen, judged)):
+        return _diagnosed(problem, noisier, earlier)
     for entry in judged.selected_effects[-2:][:is_in_time]:
         own = entry.refitted_model
         scores = search.record.screenings.get(f"beside {hypotheses.join_effect_labels(own.effects)}")

@@ -26,7 +26,7 @@ from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, truncate_episode
+from yid_ocp.problem.episodes import Episode, episode_with_effort_noise_at, truncate_episode
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions
@@ -35,6 +35,7 @@ from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
 _BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
+_MIN_NOISE_GROWTH = 1.05  # of efforts beside effects from which weights are computed anew
 _MIN_PREDICTED_DURATION = 1.0  # shortest part of a truncated held-out recording that is kept [s]
 KEPT_FRACTIONS_BEFORE_FAILURE = (0.9, 0.5, 0.0)
 """Fractions of the duration until the simulation of a held-out recording fails, of which it keeps one. All are below 1,
@@ -219,6 +220,25 @@ class AllCandidatesProblem:
             return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made, held_out_spread=None)
         held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(time_step)
         return replace(self, problem=made.with_episodes(made.episodes, held.episodes), held_out_spread=None)
+
+    def with_effort_noise_of_effects(
+        self, effects: Sequence[EffectBase], values: Mapping[str, float]
+    ) -> AllCandidatesProblem | None:
+        """Return the problem with the noise of compared efforts that encoder noise causes beside `effects`.
+
+        None if no joint's noise is clearly larger than now. Whitening is by sensor noise alone.
+        """
+        own, now = self.with_nominal_and_effects_free(effects), self.problem
+        theta, _ = own.unpack_episode_unknowns(own.unknown_vector(values), 0)
+
+        def told(episodes: Sequence[Episode]) -> list[Episode]:
+            return [episode_with_effort_noise_at(now.step, episode, now.options, theta) for episode in episodes]
+
+        made = replace(self, problem=now.with_episodes(told(now.episodes), told(now.held_out)), held_out_spread=None)
+        pairs = zip(now.episodes, made.problem.episodes, strict=True)
+        samples = (own for before, after in pairs for own in zip(before.measurements, after.measurements, strict=True))
+        growth = [np.nanmedian(new.std / old.std, axis=0).max() for old, new in samples if old.sensor.effort_joints]
+        return made if max(growth, default=1.0) > _MIN_NOISE_GROWTH else None
 
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], kept_fraction: float

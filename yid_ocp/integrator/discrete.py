@@ -98,6 +98,7 @@ class DiscreteEquations:
     constraint_relaxation_gain: ca.SX | None
     p1: ca.SX
     rigid_body_terms: LagrangianFirstDerivatives
+    effect_momentum: ca.SX  # derivative by v of the effects' part of the Lagrangian, such as rotor inertias, (n, 1)
     # `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force: for
     # Jacobians without differentiating the tree
     balance_remainder: ca.SX
@@ -179,7 +180,7 @@ def discrete_equations(
         p1 += (1 - share) * h * scale * closed.force
     symbols = {name: getattr(at, name) for name in ("q0", "q1", "z0", "z1", "p0", "lam", "u", "time_step", "h")}
     wanted = {"momentum_balance": balance, "internal_residual": internal[0], "internal_residual_at_rest": internal[1]}
-    wanted |= {"p1": p1, "balance_remainder": balance_rest, "p1_remainder": p1_rest}
+    wanted |= {"p1": p1, "balance_remainder": balance_rest, "p1_remainder": p1_rest, "effect_momentum": extra_v}
     parts = () if closed is None else (closed.force, closed.A, closed.T)
     # together, so that all of them share what they have in common
     placed = at.placed([*wanted.values(), *vars(rigid).values(), *parts])

@@ -324,7 +324,7 @@ def generalized_momentum_from_velocity(step: Step, q: ArrayLike, v: ArrayLike, t
     middle, half = (np.atleast_2d(np.asarray(x, float)) * by for x, by in ((q, 1.0), (v, step.time_step / 2)))
     none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
     with CASADI_LOCK:
-        momentum = e.row_scale * e.rigid_body_terms.lagrangian_by_v
+        momentum = e.row_scale * (e.rigid_body_terms.lagrangian_by_v + e.effect_momentum)
         function = ca.Function("momentum", e.arguments, [momentum]).map(len(middle))
         rows = function((middle - half).T, (middle + half).T, *none, np.asarray(theta, float), step.time_step)
     return np.array(ca.densify(rows)).T.reshape(np.shape(q))

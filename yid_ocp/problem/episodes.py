@@ -359,5 +359,21 @@ def _samples(
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
 
 
+def episode_with_effort_noise_at(step: Step, episode: Episode, options: ProblemOptions, theta: Array) -> Episode:
+    """Return an episode whose encoder noise is converted to noise of compared efforts at the parameters `theta`."""
+    again = _samples(step, episode.recording, options, theta, episode.grid, False, {})
+    found = {samples.sensor.group_name: samples for samples in again if samples.sensor.effort_joints}
+
+    def changed(own: SensorMeasurements) -> SensorMeasurements:
+        if own.sensor.group_name not in found or own.value.shape != found[own.sensor.group_name].value.shape:
+            return own
+        new = found[own.sensor.group_name]
+        weight = np.where(own.weight > 0, new.weight, 0.0)
+        std = np.where(np.isnan(own.std), np.nan, new.std)
+        return replace(own, weight=weight, std=std, noise_correlation=new.noise_correlation)
+
+    return replace(episode, measurements=tuple(map(changed, episode.measurements)))
+
+
 PredictedEpisodeOrFailure = tuple[Episode, EpisodePrediction | str]
 """A recording and its prediction, or the reason why it has no prediction."""
