@@ -400,5 +400,6 @@ def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, s
     monkeypatch.setattr(diagnosing, "fit_problem", lambda *given, **how: asked.append(given) or solution(2.0))
     monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
     given = None if known is None else solution(known)
-    assert diagnosing.fit_nominal_model("problem", "composed", given) == start
+    composed = SimpleNamespace(with_input_errors_of=lambda fitted: "composed")
+    assert diagnosing.fit_nominal_model("problem", composed, given) == start
     assert len(asked) == solved

@@ -28,6 +28,7 @@ from yid_ocp.diagnosis.refit import (
     EffectSearchRecord,
     NominalSolutionAndRefitStore,
     RefitContext,
+    RefitStatistics,
     RefitStore,
     RefittedModel,
     held_out_loss,
@@ -37,7 +38,7 @@ from yid_ocp.diagnosis.refit import (
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, screen_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
@@ -145,7 +146,7 @@ def _examined(
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
-    composed = replace(composed, changes_by_encoder_noise={})
+    composed.changes_by_encoder_noise.clear()
     nominal = replace(nominal, held_out_loss=held_out_loss(own, nominal.unknowns, nominal.evaluation, spread))
     try:
         screened = screen_candidates(composed, (), nominal.values)
@@ -185,11 +186,11 @@ def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
 
 
-def _with_noise_beside_effects(seen: _Examined, judged: Judgement) -> _Examined | None:
+def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics, verdict: str) -> _Examined | None:
     """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
-    if judged.verdict != "unknown" or not judged.selected_effects:
+    if verdict != "unknown":
         return None
-    search, fit = seen.with_events, judged.selected_effects[-1].refitted_model
+    search = seen.with_events
     problem = search.problem.with_effort_noise_of_effects(fit.effects, fit.values)
     if problem is None:
         return None
@@ -317,8 +318,9 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     judged = judge(search, evidence)
     # what is left beside an effect may be the error of the discretisation
     is_in_time = time.perf_counter() < search.deadline  # a search that begins anew would find nothing
-    if is_in_time and (noisier := _with_noise_beside_effects(seen, judged)):
-        return _diagnosed(problem, noisier, earlier)
+    for entry in judged.selected_effects[-1:][:is_in_time]:
+        if noisier := _with_noise_beside_effects(seen, entry.refitted_model, judged.verdict):
+            return _diagnosed(problem, noisier, earlier)
     for entry in judged.selected_effects[-2:][:is_in_time]:
         own = entry.refitted_model
         scores = search.record.screenings.get(f"beside {hypotheses.join_effect_labels(own.effects)}")
@@ -406,10 +408,7 @@ def fit_nominal_model(
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
     solution = solution or fit_problem(problem, GaussNewton(max_iterations=30), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
-    if solution.problem is not None and composed.problem.has_process_noise:
-        pairs = zip(composed.problem.episodes, solution.problem.episodes, strict=True)
-        episodes = [replace(episode, input_errors=own.input_errors) for episode, own in pairs]
-        composed = replace(composed, problem=composed.problem.with_episodes(episodes, composed.problem.held_out))
+    composed = composed.with_input_errors_of(solution.problem)
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
 
 

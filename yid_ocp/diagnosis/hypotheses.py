@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -135,7 +135,7 @@ class AllCandidatesProblem:
     functions_of_some: CasadiLockedCache[tuple[tuple[str, ...], float], ModelFunctions] | None = None
     held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
     # of screenings that share them, by point of the shape grid: changes of residual and, by unknown, Jacobian (n,)
-    changes_by_encoder_noise: dict[int, list[tuple[Array, dict[str, Array]]]] | None = None
+    changes_by_encoder_noise: dict[int, list[tuple[Array, dict[str, Array]]]] = field(default_factory=dict)
 
     @staticmethod
     def from_problem(
@@ -220,6 +220,14 @@ class AllCandidatesProblem:
             return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made, held_out_spread=None)
         held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(time_step)
         return replace(self, problem=made.with_episodes(made.episodes, held.episodes), held_out_spread=None)
+
+    def with_input_errors_of(self, fitted: EstimationProblem | None) -> AllCandidatesProblem:
+        """Return the problem with the smoothed errors of torques and angles of a fit to the same recordings."""
+        if fitted is None:
+            return self
+        pairs = zip(self.problem.episodes, fitted.episodes, strict=True)
+        episodes = [replace(episode, input_errors=own.input_errors) for episode, own in pairs]
+        return replace(self, problem=self.problem.with_episodes(episodes, self.problem.held_out))
 
     def with_effort_noise_of_effects(
         self, effects: Sequence[EffectBase], values: Mapping[str, float]

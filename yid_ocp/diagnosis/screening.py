@@ -110,7 +110,7 @@ def linearize_candidates(
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
     redrawn = [null_test.episodes_with_added_path_noise(placed, rng) for _ in draws]
     # changes by encoder noise hardly depend on the effects in the model
-    known = {} if problem.changes_by_encoder_noise is None else problem.changes_by_encoder_noise
+    known = problem.changes_by_encoder_noise
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
     for point, shapes in enumerate(itertools.zip_longest(*map(_shape_grid, tried))):
         chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]

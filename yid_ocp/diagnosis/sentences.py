@@ -115,10 +115,12 @@ def _gap(result: DiagnosisResult) -> str:
     said = f"{tests[0].degrees_of_freedom:.0f} effective samples for {unknowns} unknowns; {detectable}"
     texts = {
         "insufficient_data": f"The data are insufficient: {said}.",
-        "no_gap": f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).",
+        "no_gap": " ".join(
+            [f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).", *_why_no_gap(result)]
+        ),
     }
     if result.verdict in texts:
-        return " ".join([texts[result.verdict], *(_why_no_gap(result) if result.verdict == "no_gap" else ())])
+        return texts[result.verdict]
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
@@ -131,19 +133,15 @@ def _gap(result: DiagnosisResult) -> str:
 def _why_no_gap(result: DiagnosisResult) -> list[str]:
     """Sentences on why a significant residual does not count as a gap."""
     limits, tests = result.thresholds, (result.nominal_test, result.nominal_held_out_test)
-    p_value, scores = min(test.p_value for test in tests), result.screening.candidate_scores
-    least, level = 1 + limits.min_excess_chi2_per_dof, limits.gap_significance_level
-    size, text = max(test.chi2_per_dof for test in tests), list[str]()
-    begin = "The excess over noise is significant, but a gap needs"
-    if p_value < limits.significance_level and size <= least:
-        text.append(f"{begin} chi2 per degree of freedom above {least:.4g}.")
-    elif level / len(tests) <= p_value < limits.significance_level:
-        text.append(f"{begin} p below {level:.2g}, with both tests counted.")
-    if (along := bonferroni_corrected_min_candidate_p_value(scores)) < level:
-        best = min(scores, key=lambda own: own.p_value).effect.label
-        seen = f"A residual along {best} is significant (p {_p_value_relation(along)})"
-        text.append(f"{seen}, but it counts as a gap only with an accepted effect.")
-    return text
+    scores, level = result.screening.candidate_scores, limits.gap_significance_level
+    best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
+    along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
+    needs = f"chi2 per degree of freedom above {least:.4g} and p below {level:.2g} with both tests counted"
+    small = f"The excess over noise is significant, but a gap needs {needs}."
+    seen = f"A residual along {''.join(best)} is significant (p {_p_value_relation(along)})"
+    is_significant = min(test.p_value for test in tests) < limits.significance_level
+    narrow = f"{seen}, but it counts as a gap only with an accepted effect."
+    return _applying([(is_significant, small), (along < level, narrow)])
 
 
 def _places(result: DiagnosisResult) -> str:
@@ -164,12 +162,14 @@ def _causes(result: DiagnosisResult) -> list[str]:
     if added:
         names = " and ".join(_named(entry.effect, added[-1].refitted_model, limits) for entry in added)
         verb, part = "closes" if len(added) == 1 else "together close", "an unknown part of it on held-out motions"
-        if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
-            part += ", because the nominal model's error there is within noise"
-        if math.isfinite(total.ci_low):
-            interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
-            part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
-        text.append(f"{names} {verb} {part}.")
+        interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
+        is_noise = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
+        parts = [
+            (math.isfinite(total.ci_low), f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"),
+            (is_noise, f"{part}, because the nominal model's error there is within noise"),
+            (True, part),
+        ]
+        text.append(f"{names} {verb} {_applying(parts)[0]}.")
     for own, *others in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
     explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
@@ -181,9 +181,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
         "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
     }
     text.append(reasons[result.unknown_reason])
-    if result.unknown_reason:
-        text.append(_several_places(result))
-    return text
+    return text + _applying([(bool(result.unknown_reason), _several_places(result))])
 
 
 def _several_places(result: DiagnosisResult) -> str:
@@ -234,9 +232,11 @@ def _remains(result: DiagnosisResult) -> list[str]:
     worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
     mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
     what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
-    said = f"{what} is within noise and the uncertainty of the parameters."
-    if result.remaining_test.p_value < result.thresholds.significance_level:
-        said = f"{what} exceeds noise: {', '.join([*worst.values(), *mostly])}."
+    exceeds = result.remaining_test.p_value < result.thresholds.significance_level
+    more = f"{what} exceeds noise: {', '.join([*worst.values(), *mostly])}."
+    [said] = _applying(
+        [(exceeds, more), (not exceeds, f"{what} is within noise and the uncertainty of the parameters.")]
+    )
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_parameters_before_and_after.items()
@@ -268,6 +268,6 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             text.append(f"{made} could not be predicted ({part.failure_message}).")
             continue
         text.append(f"{made} are predicted to {errors} (rms) {how} them, and to {plain} without a diagnosis.")
-        if not part.is_improved_by_counterfactual:
-            text.append("That is no better, so the effect may be a substitute for another cause.")
+        no_better = "That is no better, so the effect may be a substitute for another cause."
+        text += _applying([(not part.is_improved_by_counterfactual, no_better)])
     return text
