@@ -276,7 +276,8 @@ def _happened(
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.unknowns
     guesses = fit.evaluation.equilibrium_guesses
     judged, residual = fit.problem, fit.evaluation
-    if any(a.measurements is not b.measurements for a, b in zip(judged.episodes, own.episodes, strict=True)):
+    pairs, parts = zip(judged.episodes, own.episodes, strict=True), ("torque", "measurements")
+    if any(getattr(a, part) is not getattr(b, part) for a, b in pairs for part in parts):
         judged = problem_with_whitening_at(own, x, guesses)
         residual = judged.evaluate(x, False, guesses)
     if not residual.ok:
