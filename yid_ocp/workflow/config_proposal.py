@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import mean_sample_rate, seen_noise_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_RECORDING_GROUP
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
@@ -343,9 +343,12 @@ def _places(
     frames = {f"w_{name}" for name in names} | set(tree.frames)
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for group in recording.points:
-        placed, name = [], group.name
-        group = group if standing else _samples_to_place_by(tree, recording, group, branches, holder)
-        parts = None if standing else _parts_when_straight(tree, recording, group, branches, holder)
+        placed, positions, parts = [], group.position, None
+        if not standing:
+            poses = _poses(tree, recording, holder, group.t)
+            rows = _rows_to_place_by(group, poses, branches)
+            poses, positions = poses[rows], positions[rows]
+            parts = _parts_when_straight(positions, poses, branches)
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
             frame, reason, std = "", "its place is not known", 0.0
@@ -354,35 +357,31 @@ def _places(
             elif point in names:
                 frame, reason = f"w_{point}", "the end of the segment of its name"
             elif not standing:
-                seen = group.t, group.position[:, i], math.nan if parts is None else float(parts[i])
-                frame, reason = _near(tree, recording, *seen, branches, holder)
+                straight = math.nan if parts is None else float(parts[i])
+                frame, reason = _near(poses, positions[:, i], straight, branches, holder)
                 if frame and len(branches) == 1:
                     std = (_ROUNDED_PLACE_STD if parts is None else _PLACE_STD) * branches[0].length
             placed.append(_PointPlacement(point, frame, reason, std))
-        found[name] = tuple(placed)
+        found[group.name] = tuple(placed)
     return found
 
 
-def _samples_to_place_by(
-    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[FlexibleSegment], holder: str
-) -> PointGroup:
-    """Return the samples of a group; only those at standstill if a late clock puts points too far from the holder."""
-    at = _poses(tree, recording, holder, group.t)[:, :3, 3]
+def _rows_to_place_by(group: PointGroup, poses: Array, branches: Sequence[FlexibleSegment]) -> BoolArray:
+    """Mask (N,) of all samples; of those at standstill if a late clock puts points too far from the holder `poses`."""
+    at, whole = poses[:, :3, 3], np.ones(len(group.t), bool)
     apart = np.linalg.norm(group.position - at[:, None], axis=2)
     farthest = float(np.max(apart, initial=0.0, where=np.isfinite(apart)))
     if len(branches) != 1 or farthest < (1 + _MAX_BEYOND_LENGTH) * branches[0].length or len(group.t) < 2:
-        return group
+        return whole
     speed = np.linalg.norm(np.gradient(at, group.t, axis=0), axis=1)
     width = 2 * math.ceil(_MAX_LATENESS / float(np.median(np.diff(group.t)))) + 1
     still = maximum_filter1d(speed, width) < _POINT_REST_SPEED
-    return group if not still.any() else replace(group, t=group.t[still], position=group.position[still], std=None)
+    return still if still.any() else whole
 
 
-def _parts_when_straight(
-    tree: Mechanism, recording: Recording, group: PointGroup, branches: Sequence[FlexibleSegment], holder: str
-) -> Array | None:
+def _parts_when_straight(positions: Array, poses: Array, branches: Sequence[FlexibleSegment]) -> Array | None:
     """Positions (np,) of points as fractions of a single segment's length; None without a straight pose or an end."""
-    apart = np.linalg.norm(group.position - _poses(tree, recording, holder, group.t)[:, None, :3, 3], axis=2)
+    apart = np.linalg.norm(positions - poses[:, None, :3, 3], axis=2)
     farthest = np.max(apart, axis=0, initial=0.0, where=np.isfinite(apart))
     end = apart[:, int(np.argmax(farthest))]
     if len(branches) != 1 or abs(farthest.max() / branches[0].length - 1) > _MAX_STRAIGHT_DEVIATION:
@@ -393,19 +392,13 @@ def _parts_when_straight(
 
 
 def _near(
-    tree: Mechanism,
-    recording: Recording,
-    t: Array,
-    position: Array,
-    part_when_straight: float,
-    branches: Sequence[FlexibleSegment],
-    holder: str,
+    poses: Array, position: Array, part_when_straight: float, branches: Sequence[FlexibleSegment], holder: str
 ) -> tuple[str, str]:
     """Return the most probable frame of a point (empty if unknown), from its distance to the holder, and the reason."""
     seen = np.isfinite(position).all(axis=1)
     if not seen.any():
         return "", "it was never seen"
-    poses = _poses(tree, recording, holder, t[seen])
+    poses = poses[seen]
     from_holder = position[seen] - poses[:, :3, 3]
     if len(branches) == 1:
         # bending brings points nearer, never farther: the farthest position is the closest to the arc length
