@@ -36,7 +36,12 @@ from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.sensors.base import channel_kinds_of_sensor_group
 from yid_ocp.workflow import run_inputs
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role, unknown_name_error
+from yid_ocp.workflow.run_inputs import (
+    add_setting_location_to_errors,
+    read_recordings_of_role,
+    require_setting_names,
+    unknown_name_error,
+)
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping, next to the joints' keys
 _DEFAULT_JOINT_DAMPING = 0.05  # damping of joints without an entry [N m s/rad]
@@ -68,9 +73,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     with add_setting_location_to_errors(run, "model", "object"):
         objects = [] if item is None else [(item.build(of_object, link_division), *item.parent_frame_and_root_pose)]
     mode = "driven" if arms_are_estimated_states(run) else arms.mode
-    for i, name in enumerate(arms.passive_joints):
-        if name not in joints:
-            raise unknown_name_error(run, "joint", name, joints, "model", "arms", "passive_joints", i)
+    require_setting_names(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
     moved = tuple(name for name in joints if name not in arms.passive_joints)
     for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
         if given and robot is None:
@@ -156,9 +159,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     of_file = {name: own["damping"] for name, own in _robot_file_constants(run).items() if "damping" in own}
     if isinstance(said, Mapping):
         known = (*joints, _OBJECT_DAMPING_KEY) if has_object else joints
-        for name in said:
-            if name not in known:
-                raise unknown_name_error(run, "joint", name, known, "model", "damping", name)
+        require_setting_names(run, "joint", said, known, "model", "damping")
         if has_object and _OBJECT_DAMPING_KEY not in said:
             allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
             what = "model.damping lists dampings of joints, but not that of the object"
@@ -168,12 +169,9 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
         damping = {name: said.get(name, of_file.get(name, _DEFAULT_JOINT_DAMPING)) for name in joints}
     else:
         damping, of_object = {name: of_file.get(name, said) for name in joints}, said
-    for name, spring in run.model.joint_springs.items():
-        if name not in joints:
-            raise unknown_name_error(run, "joint", name, joints, "model", "joint_springs", name)
-        if spring.damping is not None:
-            damping[name] = spring.damping
-    return damping, of_object
+    springs = run.model.joint_springs
+    require_setting_names(run, "joint", springs, joints, "model", "joint_springs")
+    return damping | {name: own.damping for name, own in springs.items() if own.damping is not None}, of_object
 
 
 def _clamped_system(run: RunSettings, cable: CableTopology) -> System:
@@ -291,10 +289,9 @@ def friction_joint_names(run: RunSettings, system: System) -> tuple[str, ...]:
     if run.model.friction is None:
         return ()
     known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
-    for i, name in enumerate(run.model.friction.joints or ()):
-        if name not in known:
-            raise unknown_name_error(run, "joint", name, known, "model", "friction", "joints", i)
-    return known if run.model.friction.joints is None else run.model.friction.joints
+    chosen = known if run.model.friction.joints is None else run.model.friction.joints
+    require_setting_names(run, "joint", chosen, known, "model", "friction", "joints")
+    return chosen
 
 
 def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
@@ -404,21 +401,17 @@ def _with_extra_frames(
         pose = np.eye(4) if said.use_recorded_straight_position else transform_from_xyz_rpy(said.xyz, said.rpy)
         tree = tree.with_added_frame(name, parent, pose)
         if said.use_recorded_straight_position or said.position_std > 0:
-            tree = _with_estimable_position(tree, name, str(parent))
+            words = [(axis, f"{axis} of {name} in {parent}") for axis in _AXES]
+            entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=text) for axis, text in words]
+            offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
+            frame = Frame(tree.frames[name].joint_index, tree.frames[name].placement @ offset)
+            parameters = tree.parameters.with_added(entries)
+            tree = replace(tree, frames={**tree.frames, name: frame}, parameters=parameters)
         if owner is None:
             carrier = tree
         else:
             made[owner] = replace(made[owner], mechanism=tree)
     return carrier, made
-
-
-def _with_estimable_position(tree: Mechanism, name: str, parent: str) -> Mechanism:
-    """Return the mechanism with three parameters [m] that displace the frame `name` along its own axes."""
-    carrier = tree.frames[name]
-    entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {parent}") for axis in _AXES]
-    offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
-    frames = {**tree.frames, name: Frame(carrier.joint_index, carrier.placement @ offset)}
-    return replace(tree, frames=frames, parameters=tree.parameters.with_added(entries))
 
 
 def marker_positions_from_reference_pose(

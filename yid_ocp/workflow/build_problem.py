@@ -36,7 +36,7 @@ from yid_ocp.sensors.base import channel_kinds_of_sensor_group
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
-from yid_ocp.workflow.run_inputs import read_recordings_of_role, unknown_name_error
+from yid_ocp.workflow.run_inputs import read_recordings_of_role, require_setting_names
 
 log = logging.getLogger(__name__)
 _START_FRAMES = 2  # frames of a cable's free points from which predictions start
@@ -62,10 +62,8 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     """
     parameters = system.parameters
     chosen = build.settings_by_parameter_name(run, parameters)
-    for name in run.problem.initial_state_fit_parameters:
-        if name not in parameters:
-            where = ("problem", "initial_state_fit_parameters")
-            raise unknown_name_error(run, "parameter", name, parameters.names, *where)
+    where, wanted = ("problem", "initial_state_fit_parameters"), run.problem.initial_state_fit_parameters
+    require_setting_names(run, "parameter", wanted, parameters.names, *where)
     sensors = dict(run.sensors)
     groups = [group for recording in recordings for group in recording.points]
     if build.arms_are_estimated_states(run):
@@ -80,7 +78,11 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
     clamps: tuple[ClampPosePointNames, ...] = ()
-    if cable is not None and run.model.object is not None:
+    item, checked = run.model.object, run.output.discretisation_check
+    if checked is None:
+        checked = "both" if item is not None and item.default_link_refinement else "time_step"
+    kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
+    if cable is not None and item is not None:
         clamps = cable.clamp_pose_point_names
         for name in {group.name for group in groups}:
             said = sensors.setdefault(name, SensorOptions())
@@ -88,7 +90,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
                 sensors[name] = replace(said, used_points=cable.unclamped_vertex_names)
         for recording in recordings:
             lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording], _START_FRAMES)
-            if values := run.model.object.recording_edge_length_parameters(lengths):
+            if values := item.recording_edge_length_parameters(lengths):
                 own[recording.name] = values
     return replace(
         run.problem,
@@ -99,26 +101,16 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         parameters_by_recording=own,
         has_uncertain_point_clocks=not clamps,  # clamps follow the points' own clock
         excess_residual_criteria=run.diagnosis.fit_excess_residual_criteria,
-        checked_discretisations=_checked_discretisations(run),
+        checked_discretisations=kinds.get(checked, ()),
         divided_links_model=_divided_links_model(run, system),
         cable_topology=cable,
     )
-
-
-def _checked_discretisations(run: RunSettings) -> tuple[RefinementKind, ...]:
-    """Discretisations that are checked after a solve: from the settings, by default those relevant to the object."""
-    said, item = run.output.discretisation_check, run.model.object
-    if said is None:
-        said = "both" if item is not None and item.default_link_refinement else "time_step"
-    kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
-    return kinds.get(said, ())
 
 
 def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel | None:
     """The run's model with every link divided in two; None for an object without divisible links."""
     if run.model.object is None or run.model.object.uniform_or_total_link_count is None:
         return None
-
     factors = {name: float(build.divided_joint_parameter_scale(run, name, 2)) for name in system.parameters.names}
     return DividedLinksModel(partial(_divided_links_step, run), factors)
 

@@ -7,7 +7,7 @@ import functools
 import importlib.util
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import metadata, resources
 from pathlib import Path
@@ -128,6 +128,15 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
 def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
     """Make, but do not raise, a `ConfigError` about an unknown name in the settings, with the nearest known name."""
     return run.config_error(f"there is no {noun} '{name}'", *path, **unknown_name_error_arguments(name, known))
+
+
+def require_setting_names(
+    run: RunSettings, noun: str, names: Iterable[str], known: Collection[str], *path: str | int
+) -> None:
+    """Raise `unknown_name_error` if a list, or a section by name, under the key `path` has a name that is not known."""
+    for i, name in enumerate(names):
+        if name not in known:
+            raise unknown_name_error(run, noun, name, known, *path, name if isinstance(names, Mapping) else i)
 
 
 def input_files_by_name(run: RunSettings) -> dict[str, Path]:

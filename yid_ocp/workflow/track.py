@@ -38,7 +38,7 @@ from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import all_issues_of_one_recording, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_default_recording, unknown_name_error
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, require_setting_names, resolve_default_recording
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
@@ -194,12 +194,10 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         hint = "set track.frames_path to frames of a camera, or model.arms.mode: driven"
         raise run.config_error(what, "track", "virtual_frames", allowed=allowed, hint=hint)
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
-    for name in settings.gripper_start_offset_from_object_end:
-        if name not in grasps:
-            where = ("track", "virtual_frames", "gripper_start_offset_from_object_end", name)
-            raise unknown_name_error(run, "grasp", name, grasps, *where)
+    offsets, key = settings.gripper_start_offset_from_object_end, "gripper_start_offset_from_object_end"
+    require_setting_names(run, "grasp", offsets, grasps, "track", "virtual_frames", key)
     with add_setting_location_to_errors(run, "track", "virtual_frames"):
-        posture = grasping_joint_angles(system, offsets=settings.gripper_start_offset_from_object_end)
+        posture = grasping_joint_angles(system, offsets=offsets)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
         seed = settings.seed
