@@ -249,9 +249,6 @@ def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
 
-_EXPORT_FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
-
-
 def _print_schema(arguments: argparse.Namespace) -> int:
     from yid_ocp.config.schema import config_json_schema
     from yid_ocp.files import write_text
@@ -276,7 +273,7 @@ def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
         "runs": folders,
         "baseline": folders,
         "source": library.FilesCompleter(("h5", "hdf5")),
-        "format": library.ChoicesCompleter(_EXPORT_FORMATS),
+        "format": library.ChoicesCompleter(("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")),
         "overrides": _settings,
     }
     commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
@@ -454,25 +451,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         _print_shell_completions(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     with _reliable_streams():
-        return _parsed_and_carried_out(argv, as_json)
-
-
-def _parsed_and_carried_out(argv: Sequence[str] | None, as_json: bool) -> int:
-    try:
-        arguments = build_argument_parser().parse_args(argv)
-    except SystemExit as error:
-        return int(error.code or 0)
-    except ConfigError as error:
-        return _wrong(error, as_json)
-    try:
-        with interruption.raise_on_termination_signals(), _notices():
-            return _carried_out(arguments, as_json)
-    except KeyboardInterrupt as error:
-        what = f"interrupted ({str(error) or 'SIGINT'}); nothing half-finished was left"
-        code = error.signal_number + 128 if isinstance(error, interruption.InterruptedBySignal) else _EXIT_INTERRUPTED
-        print(what, file=sys.stderr)
-        _told(as_json, "Interrupted", what, code)
-        return code
+        try:
+            arguments = build_argument_parser().parse_args(argv)
+        except SystemExit as error:
+            return int(error.code or 0)
+        except ConfigError as error:
+            return _wrong(error, as_json)
+        try:
+            with interruption.raise_on_termination_signals(), _notices():
+                return _carried_out(arguments, as_json)
+        except KeyboardInterrupt as error:
+            what = f"interrupted ({str(error) or 'SIGINT'}); nothing half-finished was left"
+            number = getattr(error, "signal_number", None)  # of an `InterruptedBySignal`
+            code = _EXIT_INTERRUPTED if number is None else 128 + int(number)
+            print(what, file=sys.stderr)
+            _told(as_json, "Interrupted", what, code)
+            return code
 
 
 def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:

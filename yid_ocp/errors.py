@@ -31,10 +31,14 @@ class YidError(Exception):
             "allowed": self.allowed or self._usual_allowed,
             "hint": self.hint or self._usual_hint,
         }
-        shown = {key: _printable(text) for key, text in said.items()}
+        shown = {
+            key: "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+            for key, text in said.items()
+        }
         room, parts = _MAX_MESSAGE_LENGTH, len(shown)
         for key, text in sorted(shown.items(), key=lambda item: len(item[1])):  # short ones leave room to long ones
-            shown[key] = _shortened(text, room // parts)
+            half = (room // parts - 5) // 2
+            shown[key] = text if len(text) <= room // parts else f"{text[:half]} ... {text[-half:]}"
             room, parts = room - len(shown[key]), parts - 1
         return shown
 
@@ -105,17 +109,6 @@ class InsufficientMemoryError(YidError):
 
 
 _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
-
-
-def _printable(text: str) -> str:
-    """A text on one line, in which control characters are escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-
-
-def _shortened(text: str, length: int) -> str:
-    """A text of at most `length` characters, without its middle if it is longer."""
-    half = (length - 5) // 2
-    return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"
 
 
 # names listed in full where none is similar; characters of a list given in full in any case; names listed otherwise

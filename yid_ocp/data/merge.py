@@ -64,14 +64,19 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     if abs(begin) > _LARGEST_START:
         shifted = [_with_times_shifted(recording, -begin) for recording in shifted]
         notes.append(f"times count from the first sample, which was recorded at {begin:.9g} s")
-    joints, more = _merged_joints([(r.name, r.joints) for r in shifted if r.joints is not None], where)
+    groups, joints = [(r.name, r.joints) for r in shifted if r.joints is not None], None
+    if groups:
+        hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
+        joints, more = joints_on_fastest_clock(groups, where, hint)
+        rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
+        notes += [*([f"joints: {rates}"] if len(groups) > 1 else []), *more]
     merged = Recording(
         joints,
         _with_unique_names(shifted, [r.points for r in shifted]),
         next((r.description for r in recordings if r.description), ""),
         "; ".join(r.source for r in recordings if r.source),
         recordings[0].name,
-        notes=(*(note for recording in recordings for note in recording.notes), *notes, *more),
+        notes=(*(note for recording in recordings for note in recording.notes), *notes),
         channel_groups=_with_unique_names(shifted, [r.channel_groups for r in shifted]),
     )
     return validated_recording(merged, where=where)
@@ -195,15 +200,6 @@ def _with_times_shifted(recording: Recording, shift: float) -> Recording:
     points = tuple(replace(group, t=group.t + shift) for group in recording.points)
     channels = tuple(replace(group, t=group.t + shift) for group in recording.channel_groups)
     return replace(recording, joints=joints, points=points, channel_groups=channels)
-
-
-def _merged_joints(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup | None, tuple[str, ...]]:
-    if not groups:
-        return None, ()
-    hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
-    merged, notes = joints_on_fastest_clock(groups, where, hint)
-    rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
-    return merged, notes if len(groups) == 1 else (f"joints: {rates}", *notes)
 
 
 def _with_unique_names(recordings: Sequence[Recording], groups: Sequence[Sequence[Any]]) -> tuple[Any, ...]:

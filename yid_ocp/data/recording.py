@@ -93,7 +93,6 @@ class JointGroup(ReprMixin):
     clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t", *JOINT_CHANNEL_UNITS))
         for name in JOINT_NOISE_AND_SERVO_CONSTANT_NAMES:
             if getattr(self, name) is not None:
@@ -155,7 +154,6 @@ class PointGroup(ReprMixin):
     clock_offset_std: float | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t", "position", "std", "camera_pose"))
         if self.std is not None and self.std.ndim == 0:
             object.__setattr__(self, "std", np.full(self.position.shape, float(self.std)))
@@ -200,7 +198,6 @@ class SensorChannelGroup(ReprMixin):
     clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t",))
         values = {key: read_only_copy(value, f"{self.name}/{key}") for key, value in self.values_by_quantity.items()}
         known = self.noise_and_bias_stds_by_attribute.items()
@@ -394,7 +391,8 @@ def _constant(value: ArrayLike, where: str) -> float | Array:
 
 
 def _freeze_arrays(group: JointGroup | PointGroup | SensorChannelGroup, names: Iterable[str]) -> None:
-    """Convert the named fields of a new group to read-only arrays, except None."""
+    """Convert the named fields of a new group to read-only arrays, except None, and its `names` to a tuple."""
+    object.__setattr__(group, "names", tuple(group.names))
     for name in names:
         if getattr(group, name) is not None:
             object.__setattr__(group, name, read_only_copy(getattr(group, name), f"{group.name}/{name}"))

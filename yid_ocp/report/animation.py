@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, json_sha256, read_input_text, write_text
@@ -332,12 +333,15 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     fresh: dict[str, BoolArray] = {}
     for group in recording.points:
         near = np.ceil(np.interp(t, group.t, np.arange(len(group.t))) - 0.5).astype(int)
-        apart, period = np.abs(group.t[near] - t) - _TIME_TOLERANCE, max(_spacing(group.t), _spacing(t))
+        apart, period = (
+            np.abs(group.t[near] - t) - _TIME_TOLERANCE,
+            max(median_sample_period(group.t), median_sample_period(t)),
+        )
         after = np.searchsorted(group.t, t).clip(max=len(group.t) - 1)
-        is_ordinary = group.t[after] - group.t[after - 1] <= _MAX_ORDINARY_GAP * _spacing(group.t)
+        is_ordinary = group.t[after] - group.t[after - 1] <= _MAX_ORDINARY_GAP * median_sample_period(group.t)
         for i, name in enumerate(group.names):
             own = np.where((apart <= period / 2)[:, None], group.position[near, i], np.nan)
-            now = (apart <= _spacing(t) / 2) & np.isfinite(own).all(axis=1)
+            now = (apart <= median_sample_period(t) / 2) & np.isfinite(own).all(axis=1)
             # a frame between two measurements compares the model with the motion between them
             between = np.stack([np.interp(t, group.t, column) for column in group.position[:, i].T], axis=1)
             own = np.where((now & is_ordinary)[:, None] & np.isfinite(between), between, own)
@@ -347,10 +351,6 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     places = np.concatenate([places, *(own[:, None] for own in seen.values())], axis=1)
     now_measured = np.stack(list(fresh.values()), axis=1) if fresh else None
     return _AnimatedMotion("measured", sticks, places, indices, now_measured, arm=arm)
-
-
-def _spacing(t: Array) -> float:
-    return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
 
 
 def _frame_times(t: Array) -> Array:

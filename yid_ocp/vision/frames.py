@@ -86,20 +86,16 @@ class CameraIntrinsics:
 
         Pixels without depth (zero or NaN) give no point. Raises `DataError` if the image has not the camera's size.
         """
-        image = np.asarray(depth, float)
-        seen = np.flatnonzero(self._measured_depth_mask(image))
-        # a third of the time that a mask over rows takes
-        points = self.pixel_rays_at_unit_depth.reshape(-1, 3).take(seen, axis=0)
-        points *= image.ravel().take(seen)[:, None]
-        return points
-
-    def _measured_depth_mask(self, depth: Array) -> BoolArray:
-        """Mask (height, width) of measured pixels in a depth image. Raises `DataError` for another size."""
-        if depth.shape != (self.height, self.width):
+        image, rays = np.asarray(depth, float), self.pixel_rays_at_unit_depth
+        if image.shape != (self.height, self.width):
             allowed = f"({self.height}, {self.width}), as in the intrinsics"
             hint = "correct width and height of the intrinsics, or export the image in this size"
-            raise DataError(f"the image has shape {depth.shape}", where="depth image", allowed=allowed, hint=hint)
-        return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays_at_unit_depth[..., 0]))
+            raise DataError(f"the image has shape {image.shape}", where="depth image", allowed=allowed, hint=hint)
+        seen = np.flatnonzero(np.isfinite(image) & (image > 0) & np.isfinite(rays[..., 0]))
+        # a third of the time that a mask over rows takes
+        points = rays.reshape(-1, 3).take(seen, axis=0)
+        points *= image.ravel().take(seen)[:, None]
+        return points
 
     def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         square = x**2 + y**2

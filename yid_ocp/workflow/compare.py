@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
-from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodsComparisonResult, compare_methods
+from yid_ocp.analysis.compare import PAPER_ESTIMATES, compare_methods
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import Progress
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit
-from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
@@ -49,26 +47,24 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
         judged = comparison.verdict_solution
         own, checks = judged.problem or problem, judged.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions
-        about = {
+        methods = {}
+        for tried in comparison.method_results:
+            known = attributes_to_dict(tried, "whitened_cost wall_seconds cpu_seconds peak_memory_mib")
+            known["disagreements"] = comparison.disagreements[tried.method]
+            methods[tried.method] = solution_to_result_dict(problem, tried.solution, tried.held_out_predictions) | known
+        keys = "reference=reference_method agree=is_consistent explained=explanations disturbed=has_process_noise"
+        result = attributes_to_dict(comparison, keys) | {
+            "format": "yid-compare/1",
+            "methods": methods,
             "issues": issues_to_plain_data(checks.data_issues),
             "published": PAPER_ESTIMATES[experiment] if experiment else {},
             "truth": truth,
             "judged": solution_to_result_dict(own, judged, held_out),
         }
         known = {"problem": own, "solution": judged, "held_out": held_out, "section_data": {"comparison": comparison}}
-        written = folder.write_result_and_report(run, progress, _compare_result(problem, comparison) | about, **known)
+        written = folder.write_result_and_report(run, progress, result, **known)
     done = any(run.solution.status == Status.CONVERGED for run in comparison.method_results)
     return CommandOutcome(folder.path, written, None, done)
-
-
-def _compare_result(problem: EstimationProblem, comparison: MethodsComparisonResult) -> dict[str, Any]:
-    methods = {}
-    for run in comparison.method_results:
-        own = attributes_to_dict(run, "whitened_cost wall_seconds cpu_seconds peak_memory_mib")
-        own["disagreements"] = comparison.disagreements[run.method]
-        methods[run.method] = solution_to_result_dict(problem, run.solution, run.held_out_predictions) | own
-    names = "reference=reference_method agree=is_consistent explained=explanations disturbed=has_process_noise"
-    return {"format": "yid-compare/1", "methods": methods, **attributes_to_dict(comparison, names)}
 
 
 run_and_return_exit_code = make_command_function(_run_compare)
