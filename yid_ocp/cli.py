@@ -495,9 +495,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
         interruption.raise_if_interrupted()
         return code
     except Exception as error:
-        number = interruption.received_signal_number()
-        if number is not None:  # a library's error during an interruption is not the cause
-            raise interruption.InterruptedBySignal(number) from error
+        interruption.raise_if_interrupted()  # a library's error during an interruption is not the cause
         return _failed(error, as_json)
 
 

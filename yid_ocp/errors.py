@@ -109,8 +109,6 @@ class InsufficientMemoryError(YidError):
 
 
 _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
-
-
 # names listed in full where none is similar; characters of a list given in full in any case; names listed otherwise
 _MAX_LISTED_NAMES, _MAX_LISTED_CHARACTERS, _N_NEAREST_NAMES = 40, 240, 8
 

@@ -38,11 +38,6 @@ class _State:
 _STATE = _State()
 
 
-def received_signal_number() -> int | None:
-    """Return the number of the signal that requested the end of the command, or None."""
-    return _STATE.asked
-
-
 def raise_if_interrupted() -> None:
     """Raise `InterruptedBySignal` if a signal asked the command to end, but a library suppressed the signal."""
     if _STATE.asked is not None:

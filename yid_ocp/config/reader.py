@@ -267,7 +267,13 @@ class _Reader:
                 name: self._section(inner.variants_for_entry(name, self.where((*path, name))), own, (*path, name))
                 for name, own in (raw or {}).items()
             }
-        return self._leaf(hint, raw, path)
+        try:
+            text = json.dumps(raw)
+            json.loads(text, parse_constant=_refuse_nan)
+            value = _adapter(hint).validate_json(text, strict=True)
+        except (ValidationError, TypeError, ValueError) as error:
+            raise self._wrong(raw, hint, path) from error
+        return _absolute(value, hint, self.base)
 
     def _section(self, sections: schema.SectionVariants, raw: Any, path: _KeyPath) -> Any:
         raw = {} if raw is None else raw
@@ -294,15 +300,6 @@ class _Reader:
                 raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=allowed, hint=hint)
         return kind(**values)
 
-    def _leaf(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
-        try:
-            text = json.dumps(raw)
-            json.loads(text, parse_constant=_refuse_nan)
-            value = _adapter(hint).validate_json(text, strict=True)
-        except (ValidationError, TypeError, ValueError) as error:
-            raise self._wrong(raw, hint, path) from error
-        return _absolute(value, hint, self.base)
-
     def _wrong(self, raw: Any, hint: Any, path: _KeyPath) -> ConfigError:
         markers = options.split_annotated(hint)[1]
         unit = next((entry.unit for entry in markers if isinstance(entry, options.OptionInfo) and entry.unit), "")
@@ -326,9 +323,7 @@ def _key_meant(name: str, keys: Sequence[str]) -> str:
     return f"did you mean '{within}.{close[0]}'?" if close else f"add a key, as in {name}.{keys[0]}"
 
 
-@functools.cache
-def _adapter(hint: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(hint)
+_adapter = functools.cache(TypeAdapter)
 
 
 def _refuse_nan(word: str) -> float:

@@ -120,20 +120,15 @@ def _spelled_meaning(column: str) -> ColumnMeaning:
 _Rows = Iterable[tuple[int, list[str]]]
 _VICON_SECTIONS = ("Trajectories", "Devices", "Model Outputs", "Joints", "Segments")
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
-
-
 _MocapTable = tuple[PointGroup, str, tuple[str, ...]]
 """Points of a motion capture export in its own unit, this unit (mm, cm or m), and notes for the user."""
 
 
 def select_mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:
     """Return the reader of a motion capture export, chosen by the table's first row. Returns None for other tables."""
-    first = first_row[0].strip() if first_row else ""
-    if first == "Format Version":
-        return _read_motive
-    if first == "NO_OF_FRAMES":
-        return _read_qualisys
-    return _read_vicon if first in _VICON_SECTIONS else None
+    readers = {"Format Version": _read_motive, "NO_OF_FRAMES": _read_qualisys}
+    readers |= dict.fromkeys(_VICON_SECTIONS, _read_vicon)
+    return readers.get(first_row[0].strip()) if first_row else None
 
 
 def _read_motive(rows: _Rows, where: str) -> _MocapTable:
@@ -254,8 +249,6 @@ OTHER_JOINT_MESSAGE_TYPES = (
     "ur_msgs/msg/RobotStateRTMsg",
 )
 """Message types with joint values that can be read, other than JointState."""
-
-
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ESTIMATED_WRENCH_RECORDING_GROUP = "wrist_estimated"
 """Recording group of the external wrench that a driver estimates from joint torques, in the frame that it states."""

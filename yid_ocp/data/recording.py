@@ -344,18 +344,16 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
         raise_data_error_unless(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "a finite number")
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
-    names = [group.name for group in recording.points]
+    for noun, groups in (("points", recording.points), ("sensor channels", recording.channel_groups)):
+        for name, count in Counter(group.name for group in groups).items():
+            what = f"two groups of {noun} are called '{name}'"
+            raise_data_error_unless(count == 1, what, origin, "every name once", "rename one group")
     for group in recording.points:
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
         what, hint = f"a group of points is called '{group.name}'", f"rename it, for example to points_{group.name}"
         raise_data_error_unless(legal, what, origin, "points, points_<name>", hint)
-        what = f"two groups of points are called '{group.name}'"
-        raise_data_error_unless(names.count(group.name) == 1, what, origin, "every name once", "rename one group")
         _validate_points(group, f"{origin}: {group.name}")
-    names = [channels.name for channels in recording.channel_groups]
     for channels in recording.channel_groups:
-        what = f"two groups of sensor channels are called '{channels.name}'"
-        raise_data_error_unless(names.count(channels.name) == 1, what, origin, "every name once", "rename one group")
         _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")

@@ -139,8 +139,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             values, stds, clock = parts
             channels.append(SensorChannelGroup(name, found["names"], found["t"], values, stds, **clock))
         else:
-            required = ("names", "sensor", "frame")
-            own = _read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
+            own = _read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, ("names", "sensor", "frame"))
             points.append(PointGroup(name, sensor_name=own.pop("sensor"), camera_pose=own.pop("pose", None), **own))
     where, allowed = f"{origin}, attribute truth", '{"name": number, ...}'
     truth = _json(texts["truth"] or "{}", where, allowed)

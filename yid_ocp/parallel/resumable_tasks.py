@@ -261,13 +261,11 @@ def _drain(
     try:
         while (queue and not lost) or running:
             while queue and not lost and len(running) < at_once:
-                job = queue[0]
+                job = queue.popleft()
                 try:
-                    future = executor.submit(_perform, job)
+                    running[executor.submit(_perform, job)] = job
                 except BrokenExecutor:
-                    lost.append(queue.popleft())
-                else:
-                    running[future] = queue.popleft()
+                    lost.append(job)
             done = wait(running, None if look is None else _WORKER_CHECK_INTERVAL, FIRST_COMPLETED).done
             if not done and look is not None:
                 look()
@@ -411,9 +409,7 @@ def _question(module: str, probe: str) -> Callable[[], Any]:
                 importlib.import_module(module)
         except Exception as error:
             return f"{type(error).__name__}: {error}"
-        if probe and not os.path.exists(probe):
-            return f"it does not see {os.path.dirname(probe)}"
-        return made
+        return f"it does not see {os.path.dirname(probe)}" if probe and not os.path.exists(probe) else made
 
     return asked
 

@@ -35,7 +35,7 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item])
     if workers < 2:
         return [function(entry) for entry in entries]
     own = _max_threads() // workers
-    with ThreadPoolExecutor(max_workers=workers, initializer=_limit_max_threads, initargs=(own,)) as pool:
+    with ThreadPoolExecutor(max_workers=workers, initializer=setattr, initargs=(_THREAD_SHARE, "count", own)) as pool:
         return list(pool.map(function, entries))
 
 
@@ -52,10 +52,6 @@ def _max_threads() -> int:
         raise ConfigError(f"the number of threads is '{said}'", where=where, allowed="a whole number from 1", hint=hint)
     own = int(said) if said else available_processor_count()
     return min(own, getattr(_THREAD_SHARE, "count", own))
-
-
-def _limit_max_threads(count: int) -> None:
-    _THREAD_SHARE.count = count
 
 
 # CasADi marks the nodes of expressions during differentiation: two threads that differentiate expressions with shared
@@ -182,8 +178,7 @@ def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[
     errors: dict[int, BaseException] = {}
 
     def work() -> None:
-        _THREAD_SHARE.march = march
-        _limit_max_threads(1)
+        _THREAD_SHARE.march, _THREAD_SHARE.count = march, 1
         try:
             while not march.abandoned and not errors:
                 with guard:

@@ -333,15 +333,13 @@ def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Arr
     fresh: dict[str, BoolArray] = {}
     for group in recording.points:
         near = np.ceil(np.interp(t, group.t, np.arange(len(group.t))) - 0.5).astype(int)
-        apart, period = (
-            np.abs(group.t[near] - t) - _TIME_TOLERANCE,
-            max(median_sample_period(group.t), median_sample_period(t)),
-        )
+        period, own_period = median_sample_period(t), median_sample_period(group.t)
+        apart = np.abs(group.t[near] - t) - _TIME_TOLERANCE
         after = np.searchsorted(group.t, t).clip(max=len(group.t) - 1)
-        is_ordinary = group.t[after] - group.t[after - 1] <= _MAX_ORDINARY_GAP * median_sample_period(group.t)
+        is_ordinary = group.t[after] - group.t[after - 1] <= _MAX_ORDINARY_GAP * own_period
         for i, name in enumerate(group.names):
-            own = np.where((apart <= period / 2)[:, None], group.position[near, i], np.nan)
-            now = (apart <= median_sample_period(t) / 2) & np.isfinite(own).all(axis=1)
+            own = np.where((apart <= max(own_period, period) / 2)[:, None], group.position[near, i], np.nan)
+            now = (apart <= period / 2) & np.isfinite(own).all(axis=1)
             # a frame between two measurements compares the model with the motion between them
             between = np.stack([np.interp(t, group.t, column) for column in group.position[:, i].T], axis=1)
             own = np.where((now & is_ordinary)[:, None] & np.isfinite(between), between, own)

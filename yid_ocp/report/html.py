@@ -108,9 +108,7 @@ def _packed_script() -> str:
 
 
 def _format_number(value: object, digits: int = 4) -> str:
-    if value is None:
-        return "–"
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+    return "–" if value is None else f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def _column_classes(table: SummaryTable) -> list[str]:

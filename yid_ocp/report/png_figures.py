@@ -108,8 +108,7 @@ def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern
     rows = [kept for row in layout if (kept := [entry for entry in row if entry.nonzero_mask.size])]
     heights = [max(_inches(entry.nonzero_mask.shape[0]) for entry in row) for row in rows]
     widths = [[_inches(entry.nonzero_mask.shape[1]) for entry in row] for row in rows]
-    size = (max(map(sum, widths), default=4.0), max(sum(heights), 1.0))
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(max(map(sum, widths), default=4.0), max(sum(heights), 1.0)), layout="constrained")
     parts = figure.subfigures(max(len(rows), 1), 1, squeeze=False, height_ratios=heights or None)[:, 0]
     for part, row, shares in zip(parts, rows, widths, strict=False):
         for axes, entry in zip(part.subplots(1, len(row), squeeze=False, width_ratios=shares)[0], row, strict=True):

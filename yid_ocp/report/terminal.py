@@ -63,8 +63,6 @@ class CodeBlock:
 
 
 StatementTableOrCode = SummaryStatement | SummaryTable | CodeBlock
-
-
 SummaryBlockOrTextIterator = Iterator[StatementTableOrCode | str]
 """Blocks of a summary in their order. A string is a note; an empty string is omitted."""
 _Summary = Callable[[Mapping[str, Any]], list[StatementTableOrCode]]

@@ -364,8 +364,7 @@ def _mounted_sensors(
         topics = _names_of(bag, kind)
         for topic, name in topics.items():
             messages = [message for message in bag.mounted if message.source == topic]
-            own_name = group if len(topics) == 1 else f"{group}_{name}"
-            yield from _sensor_group(own_name, name, messages, seconds)
+            yield from _sensor_group(group if len(topics) == 1 else f"{group}_{name}", name, messages, seconds)
     told = ([replace(m, content=w) for m in e.messages if (w := getattr(m.content, "wrench", None))] for e in groups)
     yield from _sensor_group(ESTIMATED_WRENCH_RECORDING_GROUP, "", next(filter(None, told), []), seconds)
 
@@ -555,8 +554,7 @@ def _positions(
 
 
 def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> base.TopicOrColumnSummary:
-    messages = (*bag.states, *bag.places, *bag.mounted)
-    own = [m for m in messages if m.source.partition(":")[0] == topic.name]
+    own = [m for m in (*bag.states, *bag.places, *bag.mounted) if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")

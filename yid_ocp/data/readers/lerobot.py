@@ -142,14 +142,10 @@ def _widest(group: JointGroup) -> float:
 
 def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None:
     """Raise `DataError` if angles are in degrees or normalised units, or the robot is never recorded in radians."""
-    widest, robot = _widest(group), dataset.info.robot_type
-    if widest <= _MAX_RADIANS and not _NEVER_RADIANS.search(dataset.info.robot_type or ""):
+    widest, robot = _widest(group), dataset.info.robot_type or ""
+    of = f", and LeRobot does not record a {robot} in radians" if _NEVER_RADIANS.search(robot) else ""
+    if widest <= _MAX_RADIANS and not of:
         return
-    of = (
-        f", and LeRobot does not record a {robot} in radians"
-        if _NEVER_RADIANS.search(dataset.info.robot_type or "")
-        else ""
-    )
     what = f"the unit of the joint positions is unknown: the largest absolute value is {widest:.3g}{of}"
     allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "--units deg"
     if widest <= _MAX_NORMALISED:
