@@ -156,7 +156,12 @@ def recording_from_simulation(
     """Make a recording of a finished simulation `run` with the experiment's sensors and noise."""
     chosen, streams = experiment, _random_generators(experiment.seed)
     held, visible = _held_and_visible_points(system)
-    groups = [_arm_points(system, held, run, chosen.arm_noise, streams)] if held else []
+    groups = []
+    if held:
+        clean = run.point_positions[:, [system.point_frames.index(point) for point in held]]
+        position = _noisy(clean, chosen.arm_noise.point_std, streams["arm_points"])
+        std = np.full(clean.shape, chosen.arm_noise.point_std)
+        groups.append(PointGroup("points_arm", held, run.t, position, std, "arm"))
     if chosen.camera is not None and len(run.frame_times):
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
     theta = zip(system.parameters.names, map(float, system.parameters.vector(values)), strict=True)
@@ -209,14 +214,6 @@ def _by_joint(std: float | tuple[float, ...], joints: int, where: str) -> Array:
     return np.asarray(std, dtype=float)
 
 
-def _arm_points(
-    system: System, held: tuple[str, ...], run: SimulationResult, noise: ArmSensorNoise, streams: _Generators
-) -> PointGroup:
-    clean = run.point_positions[:, [system.point_frames.index(point) for point in held]]
-    position = _noisy(clean, noise.point_std, streams["arm_points"])
-    return PointGroup("points_arm", held, run.t, position, np.full(clean.shape, noise.point_std), sensor_name="arm")
-
-
 def _camera_points(
     system: System, visible: tuple[str, ...], run: SimulationResult, camera: PointCamera, streams: _Generators
 ) -> PointGroup:
@@ -254,8 +251,7 @@ def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera)
         number = max(1, round(duration / 2.5))
         starts = duration / number * (np.arange(number) + rng.uniform(0.15, 0.45, number))
         lengths = rng.uniform(1.0, 1.5, number)
-        lost = ((times[:, None] >= starts) & (times[:, None] <= starts + lengths)).any(1)
-        times = times[~lost]
+        times = times[~((times[:, None] >= starts) & (times[:, None] <= starts + lengths)).any(1)]
     return np.asarray(times)
 
 

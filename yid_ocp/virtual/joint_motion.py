@@ -134,8 +134,7 @@ def random_multisine_motion(
         motion = _scaled(motion, joints, np.full(len(joints), chosen.max_joint_speed / fastest))
     if chosen.shake_torque_rms == 0.0:
         return motion
-    rest = ca.SX(ca.DM.zeros(system.n_coordinates))
-    rigid = lagrangian_first_derivatives(kinematics, rest, ca.SX(ca.DM.zeros(3)))
+    rigid = lagrangian_first_derivatives(kinematics, ca.SX(ca.DM.zeros(len(q0))), ca.SX(ca.DM.zeros(3)))
     inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
     return _shaken(motion, chosen, inertia[list(system.actuated_coordinate_indices)], rng)
 

@@ -210,8 +210,7 @@ def _joint_terms(system: System, effect: Effect, value: ExpressionEvaluator) -> 
     ones = ca.SX.ones(n)
     by_q, by_v, inertia = ca.jacobian(force, q), ca.jacobian(force, v), ca.jacobian(momentum, v)
     second = ca.jtimes(ca.diag(by_q), q, ones)
-    third = ca.jtimes(second, q, ones)
-    slopes = [ca.diag(by_v), ca.diag(inertia), third]
+    slopes = [ca.diag(by_v), ca.diag(inertia), ca.jtimes(second, q, ones)]
     mixed = [ca.jacobian(momentum, q), *(full - ca.diag(ca.diag(full)) for full in (by_q, by_v, inertia))]
     at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, ca.diag(by_q), second, *slopes, *mixed)])
     rng = np.random.default_rng(0)
@@ -282,8 +281,7 @@ def mujoco_xml(
     # the twist of a thin tube has a damping time of some 10 us, which an explicit rule cannot follow
     rules = {"timestep": format_xml_numbers([time_step]), "integrator": "implicitfast"}
     rules["gravity"] = format_xml_numbers(value(system.gravity))
-    option = SubElement(root, "option", {**rules, **search})
-    SubElement(option, "flag", contact="disable")
+    SubElement(SubElement(root, "option", {**rules, **search}), "flag", contact="disable")
     sites = _sites(system, tree, value)
     base = SubElement(SubElement(root, "worldbody"), "body", name="world_base")
     SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # required by Pinocchio

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortSamplingKind
@@ -564,24 +564,16 @@ def _errors(
         level = np.zeros(1) if noise is None else np.broadcast_to(noise, (len(joints.names),))[columns]
         found[name] = ReplayErrorAgainstRecording(error, float(np.sqrt(np.mean(level**2))), unit)
     for group in recording.points:
+        t = group.t - joints.t[0]
         for i, point in enumerate(group.names):
-            if point in system.point_frames:
-                own = _point_error(group, i, joints.t[0], played, system.point_frames.index(point))
-                found |= {} if own is None else {f"{group.name}.{point}": own}
+            seen = (t >= 0) & (t <= played.t[-1]) & np.isfinite(group.position[:, i]).all(axis=1)
+            if point in system.point_frames and seen.any():
+                model = _at(t[seen], played.t, played.points[:, system.point_frames.index(point)])
+                square = np.sum((model - group.position[seen, i]) ** 2, axis=1).mean()
+                variance = 0.0 if group.std is None else np.nanmean(np.sum(group.std[seen, i] ** 2, axis=1))
+                rms, noise_rms = float(np.sqrt(square)), float(np.sqrt(variance))
+                found[f"{group.name}.{point}"] = ReplayErrorAgainstRecording(rms, noise_rms, "m")
     return found
-
-
-def _point_error(
-    group: PointGroup, i: int, start: float, played: _Played, column: int
-) -> ReplayErrorAgainstRecording | None:
-    t = group.t - start
-    seen = (t >= 0) & (t <= played.t[-1]) & np.isfinite(group.position[:, i]).all(axis=1)
-    if not seen.any():
-        return None
-    model = _at(t[seen], played.t, played.points[:, column])
-    square = np.sum((model - group.position[seen, i]) ** 2, axis=1)
-    noise = 0.0 if group.std is None else float(np.sqrt(np.nanmean(np.sum(group.std[seen, i] ** 2, axis=1))))
-    return ReplayErrorAgainstRecording(float(np.sqrt(square.mean())), noise, "m")
 
 
 def _at(t: Array, known: Array, values: Array) -> Array:

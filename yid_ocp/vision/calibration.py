@@ -249,21 +249,18 @@ def calibrate_camera(
     told = CameraState(pose, clock_offset=clock.initial_stamp_minus_joint_time, clock_reference_stamp=about)
     try:
         return _Calibrator(arm, told, rng, options, clock).run(frames)
-    except _UntoldError as reason:
+    except _UntoldError as error:
+        reason, advice = error.args
         if options.fix_pose and clock.search_half_width == 0:
-            return calibration_without_estimation(pose, clock, str(reason))
+            return calibration_without_estimation(pose, clock, reason)
         known = "track.options.calibration.fix_pose: true and track.options.clock_offset.search_half_width: 0"
-        hint = f"{reason.hint}; if pose and clock are known, set {known}"
+        hint = f"{advice}; if pose and clock are known, set {known}"
         what, allowed = f"the camera cannot be calibrated by the arm: {reason}", "frames that show the moving arm"
         raise DataError(what, where=source, allowed=allowed, hint=hint) from None
 
 
 class _UntoldError(Exception):
-    """Reason why the arm does not determine the calibration."""
-
-    def __init__(self, reason: str, hint: str) -> None:
-        super().__init__(reason)
-        self.hint = hint
+    """Reason why the arm does not determine the calibration, and advice."""
 
 
 @dataclass

@@ -138,11 +138,8 @@ class ShapeFitter:
         self.link_radii = np.concatenate([np.full(len(lengths), radius) for lengths, radius in sizes.values()])
         self.link_segments = tuple(name for name, (lengths, _) in sizes.items() for _ in lengths)
         q = ca.SX.sym("q", system.n_coordinates)
-
-        def at_values(function: ca.Function) -> ca.Function:
-            return ca.Function(function.name(), [q], function.call([q, ca.SX(ca.DM(theta))]))
-
-        own = {name: at_values(function) for name, function in self._symbolic.items()}
+        at = [q, ca.SX(ca.DM(theta))]
+        own = {name: ca.Function(name, [q], function.call(at)) for name, function in self._symbolic.items()}
         quick = (dense_function_evaluator(own[name]) for name in ("corners", "seen", "held", "holders"))
         self._corners, self._seen, self._held, self._holders = quick
         self._gap, self._grown = own["gap"], own["grown"]

@@ -31,8 +31,6 @@ _POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"  # arrays of an NPZ file
 _PCD_HEADER_BYTES = 10_000  # [bytes]; contain the number of points of a PCD file
 _PCD_POINT_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
 _MAX_FRAME_BYTES = 1 << 28  # largest size of one cloud or image
-
-
 _Cloud = tuple[Array, frames.PointColourArray | None]
 """Points (N, 3) in the file's unit, and their red, green and blue (N, 3) or None."""
 
@@ -42,8 +40,7 @@ def _read_cloud(path: Path, coloured: bool = False) -> _Cloud:
     files.check_input_file(path, _MAX_FRAME_BYTES)
     if path.suffix.lower() == ".ply":
         return _read_ply(path, coloured)
-    readers = {".npz": _read_npz, ".xyz": _read_xyz, ".pcd": _read_pcd}
-    points, colours = readers[path.suffix.lower()](path)
+    points, colours = {".npz": _read_npz, ".xyz": _read_xyz, ".pcd": _read_pcd}[path.suffix.lower()](path)
     if not len(points):
         raise _damaged(path, "it has no points")
     return points, colours

@@ -54,11 +54,6 @@ class BackgroundPoints:
             return np.zeros(len(points), bool)
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
 
-    def merged_with(self, other: BackgroundPoints) -> BackgroundPoints:
-        """Return the union of this background and another one."""
-        points = np.concatenate([self.points, other.points])
-        return BackgroundPoints(points, max(self.match_distance, other.match_distance))
-
     @staticmethod
     def from_point_clouds(
         clouds: Sequence[Array], voxel: float, noise: float, shapes: Sequence[TubeLinks] | None = None, near: float = 0

@@ -192,7 +192,8 @@ class FrameTracker:
             clouds = [look.sights[0].points for look in looks]
             near = self.shape_fitter.max_informative_surface_distance
             found = BackgroundPoints.from_point_clouds(clouds, 2 * filters.voxel_size, noise, shapes, near)
-            background = found.merged_with(background)
+            points = np.concatenate([found.points, background.points])
+            background = BackgroundPoints(points, max(found.match_distance, background.match_distance))
         return SequenceEstimates(calibration, sizes, background)
 
     def _calibration(self) -> CameraCalibration:
