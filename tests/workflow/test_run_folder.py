@@ -32,7 +32,7 @@ def settings(pendulum):
 def test_a_folder_appears_when_the_block_ends_and_not_when_it_is_left_by_an_error(settings, tmp_path):
     def write(out, error=None) -> None:
         with atomic_run_folder(settings, out) as folder:
-            folder.write_text_file("a.txt", "a")
+            write_text(folder.path / "a.txt", "a")
             assert not out.exists()
             assert folder.path != folder.final_path
             if error:
@@ -79,7 +79,7 @@ def test_an_unnamed_one_is_numbered_and_its_name_reserved_from_the_start(setting
     with contextlib.ExitStack() as runs:
         folders = [runs.enter_context(atomic_run_folder(settings, None, "check")) for _ in range(3)]
         for i, folder in enumerate(folders):
-            folder.write_text_file("number.txt", str(i))
+            write_text(folder.path / "number.txt", str(i))
     names = ["pendulum-check-now", "pendulum-check-now-2", "pendulum-check-now-3"]
     assert [(tmp_path / "runs" / name / "number.txt").read_text() for name in names] == ["0", "1", "2"]
     with atomic_run_folder(settings, None, "check") as folder:
@@ -96,7 +96,7 @@ def test_a_name_that_another_run_has_is_refused_before_the_work(settings, tmp_pa
 @pytest.mark.parametrize("kind", ["folder", "file"])
 def test_a_result_is_not_lost_because_its_name_was_taken(settings, tmp_path, caplog, kind):
     with atomic_run_folder(settings, tmp_path / "run") as folder:
-        folder.write_text_file("a.txt", "mine")
+        write_text(folder.path / "a.txt", "mine")
         taken = tmp_path / "run" / "theirs" if kind == "folder" else tmp_path / "run"
         taken.parent.mkdir(exist_ok=True)
         taken.write_text("theirs")
@@ -114,7 +114,7 @@ def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, t
     foreign = tmp_path / ".foreign.partial"
     foreign.mkdir()
     with atomic_run_folder(settings, tmp_path / "lives") as alive:
-        alive.write_text_file("a.txt", "a")
+        write_text(alive.path / "a.txt", "a")
         with atomic_run_folder(settings, tmp_path / "other"):
             assert (alive.path / "a.txt").is_file()
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} >= {"lives", "other", ".foreign.partial"}
@@ -177,7 +177,7 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
         pytest.raises(OutputError, match="No space left") as caught,
         atomic_run_folder(settings, tmp_path / "runs" / "run") as folder,
     ):
-        folder.write_text_file("a.txt", "a")
+        write_text(folder.path / "a.txt", "a")
     assert caught.value.where == str(tmp_path / "runs" / "run" / "a.txt")
     assert not (tmp_path / "runs").exists()
     with pytest.raises(ParallelWorkError) as caught, atomic_run_folder(settings, tmp_path / "run") as folder:

@@ -405,8 +405,7 @@ def _with_extra_frames(
             entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=text) for axis, text in words]
             offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
             frame = Frame(tree.frames[name].joint_index, tree.frames[name].placement @ offset)
-            parameters = tree.parameters.with_added(entries)
-            tree = replace(tree, frames={**tree.frames, name: frame}, parameters=parameters)
+            tree = replace(tree, frames={**tree.frames, name: frame}, parameters=tree.parameters.with_added(entries))
         if owner is None:
             carrier = tree
         else:

@@ -81,6 +81,10 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     item, checked = run.model.object, run.output.discretisation_check
     if checked is None:
         checked = "both" if item is not None and item.default_link_refinement else "time_step"
+    divided: DividedLinksModel | None = None
+    if item is not None and item.uniform_or_total_link_count is not None:
+        scales = {name: float(build.divided_joint_parameter_scale(run, name, 2)) for name in parameters.names}
+        divided = DividedLinksModel(partial(_divided_links_step, run), scales)
     kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
     if cable is not None and item is not None:
         clamps = cable.clamp_pose_point_names
@@ -102,17 +106,9 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         has_uncertain_point_clocks=not clamps,  # clamps follow the points' own clock
         excess_residual_criteria=run.diagnosis.fit_excess_residual_criteria,
         checked_discretisations=kinds.get(checked, ()),
-        divided_links_model=_divided_links_model(run, system),
+        divided_links_model=divided,
         cable_topology=cable,
     )
-
-
-def _divided_links_model(run: RunSettings, system: System) -> DividedLinksModel | None:
-    """The run's model with every link divided in two; None for an object without divisible links."""
-    if run.model.object is None or run.model.object.uniform_or_total_link_count is None:
-        return None
-    factors = {name: float(build.divided_joint_parameter_scale(run, name, 2)) for name in system.parameters.names}
-    return DividedLinksModel(partial(_divided_links_step, run), factors)
 
 
 def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:

@@ -362,7 +362,7 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
         ):
             if key in group and (key in ("q", "command") or len(group.attrs[names])):
                 values = np.array(group[key])
-                told = _texts(group.attrs[names])
+                told = [*map(str, group.attrs[names])]
                 yield RosTopicTimeSeries(f"/predicted/{topic}", "joints", t[: len(values)], {quantity: values}, told)
     for sensor in (entry for entry in group.values() if isinstance(entry, h5py.Group)):
         measured = np.array(sensor["measured"])
@@ -376,7 +376,7 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
 
 def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTopicTimeSeries]:
     """Yield the time series of a sensor: one topic for all joints, or one per point (residuals as vectors)."""
-    channels, t = _texts(sensor.attrs["channels"]), np.array(sensor["t"])
+    channels, t = [*map(str, sensor.attrs["channels"])], np.array(sensor["t"])
     if values.shape[1] == len(channels):
         quantity = channels[0].split(".")[1]
         names = [channel.rsplit(".", 1)[1] for channel in channels]
@@ -394,7 +394,7 @@ def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
     if not len(mean):
         return
     held = np.vstack([mean, mean[-1:]])
-    names, kinds = _texts(group.attrs["unknowns"]), _texts(group.attrs["kinds"])
+    names, kinds = ([*map(str, group.attrs[key])] for key in ("unknowns", "kinds"))
     kept = np.array(group["prior"]) > 0
     forces = [i for i, kind in enumerate(kinds) if kind == "force" and kept[i]]
     if forces:
@@ -415,7 +415,3 @@ def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
 
 def _topic(name: str) -> str:
     return "".join(c if c.isalnum() or c in "_/" else "_" for c in name.replace(".", "/"))
-
-
-def _texts(values: Any) -> list[str]:
-    return [value.decode() if isinstance(value, bytes) else str(value) for value in values]

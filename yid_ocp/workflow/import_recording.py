@@ -65,8 +65,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         write_recording(recording, arguments.out)
     out, issues = arguments.out, recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording), "issues": issues}
-    lines = [*recording_summary_lines(recording), *issues]
-    print_result(arguments, result, lambda: lines, f"recording: {out}", out)
+    print_result(arguments, result, lambda: [*recording_summary_lines(recording), *issues], f"recording: {out}", out)
     return EXIT_DONE
 
 

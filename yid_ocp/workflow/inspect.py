@@ -19,7 +19,7 @@ from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.display import Progress
 from yid_ocp.errors import ModelError
 from yid_ocp.export.equations import export_step_functions
-from yid_ocp.files import attributes_to_dict
+from yid_ocp.files import attributes_to_dict, write_text
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepResidualsAndJacobians
@@ -74,10 +74,9 @@ def _run_inspect(
         patterns = _patterns(symbols, matrices, rows, point)
         picture = folder.path / "sparsity.png"
         draw_sparsity_patterns(picture, [[patterns[name] for name in row] for row in _PATTERN_LAYOUT])
-        folder.write_text_file("equations.txt", "\n".join(symbols.text_lines()) + "\n")
-        files: tuple[Path, ...] = ()
-        if export is not None:
-            files = export_step_functions(symbols, Path(export), point.theta, step.time_step)
+        write_text(folder.path / "equations.txt", "\n".join(symbols.text_lines()) + "\n")
+        asked = point.theta, step.time_step
+        files = () if export is None else export_step_functions(symbols, Path(export), *asked)
         dependences = _dependence(step, symbols, problem, point, rows)
         driven, prescribed = step.system.driven, step.system.prescribed
         roles = dict.fromkeys(driven, "driven") | dict.fromkeys(prescribed, "prescribed")

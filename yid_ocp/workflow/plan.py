@@ -18,7 +18,7 @@ from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_record
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
-from yid_ocp.files import attributes_to_dict
+from yid_ocp.files import attributes_to_dict, write_text
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, TargetMotionPlan, plan_motion_to_target
@@ -62,7 +62,7 @@ def run_plan(
         export_recording_csv_files(recording, folder.path / "csv")
         rates = (found.joint_velocities, found.joint_accelerations, found.joint_efforts)
         trajectory = joint_trajectory_message(found.joint_names, found.t, found.joint_positions, *rates)
-        folder.write_text_file("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
+        write_text(folder.path / "trajectory.json", json.dumps(trajectory, indent=1) + "\n")
         folder.log_event("end", reached=found.is_successful, message=found.message)
         told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(run, found)
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]

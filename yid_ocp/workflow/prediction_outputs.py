@@ -81,19 +81,17 @@ def estimate_texts_by_format(
     links = {s.joint_name for s in springs if s.segment_name != s.joint_name}
     lines = [_mjcf_joint_line(joint, own) for joint, own in terms.items() if own and joint not in links]
     for layout in system.segment_layouts:
-        for deformation in ("bend", "twist"):
-            own = [
-                terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == (layout.name, deformation)
-            ]
-            sizes = {key: [at[key] for at in own if key in at] for key in ("stiffness", "damping")}
+        for key in ((layout.name, "bend"), (layout.name, "twist")):
+            own = [terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == key]
+            sizes = {term: [at[term] for at in own if term in at] for term in ("stiffness", "damping")}
             count = len(layout.link_joints)
-            note = f"{layout.name} {deformation}, {count} links; n links: times n/{count}"
+            note = f"{' '.join(key)}, {count} links; n links: times n/{count}"
             if stiffness := sizes["stiffness"]:
                 low, high = min(stiffness), max(stiffness)
-                known = {"segment": layout.name, "deformation": deformation, "links": count}
+                known = {"segment": key[0], "deformation": key[1], "links": count}
                 joints.append(known | {"lowest": low, "highest": high})
                 note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
-            shown = " ".join(f'{key}="{np.median(size):.4g}"' for key, size in sizes.items() if size)
+            shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}
     rows = [rf"{labels[n]} & ${e.value:.4g} \pm {e.std:.2g}$ & {e.unit} \\" for n, e in found.items()]

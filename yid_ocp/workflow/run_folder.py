@@ -48,7 +48,7 @@ class RunFolder:
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
         """Write config.yaml, hash the input files, and log the start of a command. Errors: `input_files_by_name`."""
-        self.write_text_file("config.yaml", config_yaml_with_defaults(run))
+        write_text(self.path / "config.yaml", config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
         said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.config_file]
@@ -67,9 +67,13 @@ class RunFolder:
         made = {"command": self._command_line, "date": current_local_time_text(), "inputs": self.input_hashes}
         notes: list[str] = []
         clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_and_plugin_versions()}, notes)
-        if notes:
-            clean["notes"] = _grouped(notes)
-        self.write_text_file(name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
+        if notes:  # many of one key are one note
+            groups: dict[str, list[str]] = {}
+            for note in notes:
+                groups.setdefault(note.rpartition(".")[2], []).append(note)
+            shown = ([f"{tail} ({len(own)} times)"] if len(own) > 3 else own for tail, own in groups.items())
+            clean["notes"] = [*itertools.chain.from_iterable(shown)]
+        write_text(self.path / name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
         return clean
 
     def write_result_and_report(
@@ -90,10 +94,6 @@ class RunFolder:
             self._log.write(json.dumps(to_json_types(line), allow_nan=False) + "\n")
             self._log.flush()
 
-    def write_text_file(self, name: str, text: str) -> None:
-        """Write a text file."""
-        write_text(self.path / name, text)
-
 
 class _Lines(logging.Handler):
     def __init__(self, folder: RunFolder) -> None:
@@ -102,14 +102,6 @@ class _Lines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._folder.log_event("message", level=record.levelname, source=record.name, text=record.getMessage())
-
-
-def _grouped(notes: list[str]) -> list[str]:
-    groups: dict[str, list[str]] = {}
-    for note in notes:
-        groups.setdefault(note.rpartition(".")[2], []).append(note)
-    merged = ([f"{tail} ({len(texts)} times)"] if len(texts) > 3 else texts for tail, texts in groups.items())
-    return list(itertools.chain.from_iterable(merged))
 
 
 @contextlib.contextmanager

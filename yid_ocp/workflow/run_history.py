@@ -153,8 +153,7 @@ def _dependent(folders: Sequence[str | Path]) -> str:
     """Return a message about a run that is the baseline of another one of `folders`. Empty if there is none."""
     known = [Path(folder).resolve() for folder in folders]
     for folder in known:
-        said = read_result_file(folder / "result.json").get("baseline") or {}
-        for own in said.get("runs", ()):
+        for own in (read_result_file(folder / "result.json").get("baseline") or {}).get("runs", ()):
             if Path(own).resolve() in known:
                 return f"{own} would count twice, because it is a baseline of {folder}"
     return ""

@@ -336,14 +336,12 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: calibrate the sequence. Returns the values common to all frames as plain data, or the error."""
     del inputs  # part of the key of the result
     try:
-        tracker = _frame_tracker(config)
-        return dict(files.to_lossless_plain_data(tracker.estimate_shared_values()))
+        return dict(files.to_lossless_plain_data(_frame_tracker(config).estimate_shared_values()))
     except DataError as error:
         return {"refused": files.attributes_to_dict(error, "what where allowed hint")}
 
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     del inputs
-    tracker = _frame_tracker(config)
-    found = tracker.process_frame(index, files.dataclass_from_plain_data(SequenceEstimates, common))
+    found = _frame_tracker(config).process_frame(index, files.dataclass_from_plain_data(SequenceEstimates, common))
     return dict(files.to_lossless_plain_data(found))
