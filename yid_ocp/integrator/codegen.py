@@ -24,8 +24,9 @@ _Indices = NDArray[np.int32]
 class StepFunctions:
     """The CasADi functions of one step, all with the inputs `DiscreteEquations.arguments`, and sparsity patterns.
 
-    Each function is built when it is first used, because a cached kernel needs none. If constraint forces act at the
-    node, the outputs that contain the constraint Jacobian at the midpoint or at the end of the step are empty.
+    `function` returns one by its name in `build_casadi_step_functions`, and builds it when it is first used, because a
+    cached kernel needs none. If constraint forces act at the node, the outputs that contain the constraint Jacobian at
+    the midpoint or at the end of the step are empty.
     """
 
     def __init__(
@@ -37,29 +38,14 @@ class StepFunctions:
         self.equations = equations
         self.sparsity_patterns = sparsity_patterns
         self._outputs = outputs
-        self._function = CasadiLockedCache[str, ca.Function](
+        self.function = CasadiLockedCache[str, ca.Function](
             lambda name: ca.Function(name, equations.arguments, ca.cse(list(outputs[name])))
         )
 
     @property
-    def sparse_jacobian_parts_function(self) -> ca.Function:
-        """The function that returns the parts of the step's sparse Jacobians.
-
-        Its outputs are the vectors per joint, then the nonzeros of the remaining entries of the residual, of p1 and of
-        the constraints, and the curvature. The curvature is the derivative of the midpoint's constraint force with
-        respect to q_k, which equals the one with respect to q_{k+1}.
-        """
-        return self._function("linear")
-
-    @property
-    def internal_residual_at_rest_function(self) -> ca.Function:
-        """The function of the internal equations at rest (nodes equal) and their derivatives by (q, z, lam, u)."""
-        return self._function("resting")
-
-    @property
     def all_functions(self) -> tuple[ca.Function, ...]:
         """All CasADi functions of the step, in the order of the generated C code."""
-        return tuple(map(self._function, self._outputs))
+        return tuple(map(self.function, self._outputs))
 
     def _expression_text(self) -> str:
         """Serialized graphs of the functions, which identify a compiled kernel in the cache."""
@@ -94,6 +80,8 @@ def build_casadi_step_functions(equations: DiscreteEquations) -> StepFunctions:
     outputs = {
         # balance and p1 without the constraints' pull; the share of Dphi(q_m)
         "residual": (balance, e.internal_residual, e.constraint_residual, p1, nonzeros(middle)),
+        # vectors per joint, the remaining entries of the Jacobians, and the derivative of the midpoint's constraint
+        # force by q_k, which equals the one by q_{k+1}
         "linear": (_pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown), nonzeros(curve)),
         # share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1
         "matrix": (nonzeros(pulls.start_share * pulls.before_jacobian),),
@@ -101,6 +89,7 @@ def build_casadi_step_functions(equations: DiscreteEquations) -> StepFunctions:
         # derivatives of the pull of the first of these two by (q_k, z_k), of the second by q_{k+1}
         "pull": (nonzeros(pull), nonzeros(after_curve)),
         "scales": (e.row_scale, e.h),
+        # internal equations with equal nodes, and their derivatives by (q, z, lam, u)
         "resting": (e.internal_residual_at_rest, nonzeros(at_rest)),
     }
     return StepFunctions(e, outputs, {name: matrix.sparsity() for name, matrix in matrices.items()})

@@ -124,11 +124,6 @@ def _version(path: str) -> str:
     return _said([path, "--version"], _VERSION_TIMEOUT)[1]
 
 
-def _flags(path: str) -> tuple[str, ...]:
-    """Flags of a compiler, independent of the machine."""
-    return (*_COMMON_FLAGS, *_GCC_FLAGS) if "Free Software Foundation" in _version(path) else _COMMON_FLAGS
-
-
 @functools.cache
 def _machine() -> str:
     processor = platform.processor() or platform.machine()
@@ -179,7 +174,7 @@ def _library_file(source: str, level: str, make: Callable[[], str | None] | None
     path = _compiler_path()
     if path is None or path in _HUNG_COMPILERS:
         return None
-    flags = _flags(path)
+    flags = (*_COMMON_FLAGS, *_GCC_FLAGS) if "Free Software Foundation" in _version(path) else _COMMON_FLAGS
     told = [source, level, *flags, *_NATIVE_FLAGS, _machine(), ca.CasadiMeta.version()]
     folder, key = private_cache_folder(), hashlib.sha256("\0".join(told).encode()).hexdigest()[:32]
     if (kept := _kept(folder, key)) is not None:

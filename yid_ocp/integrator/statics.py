@@ -256,7 +256,7 @@ class EquilibriumSolver:
             part[:n] += of_p
         if nz:
             inner, at = slice(n, n + nz), (q, q, none, z, z, lam, u, theta, step.time_step)
-            residual, nonzeros = (np.array(x).ravel() for x in step.functions.internal_residual_at_rest_function(*at))
+            residual, nonzeros = (np.array(x).ravel() for x in step.functions.function("resting")(*at))
             slopes = np.zeros((nz, n + nz + m + nu))
             slopes[nonzero_indices(step.functions.sparsity_patterns["resting"])] = nonzeros
             rows[0][inner], by_rows[inner], rows[2][inner] = residual, slopes[:, : n + nz + m], slopes[:, n + nz + m :]

@@ -211,7 +211,8 @@ class EpisodePredictor:
         if (lag := corrections.joint_delays_or_lag_times("torque_lag", theta, names)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
-            left = errors.remaining_torque_error_after_effects
+            # what is still to be subtracted after effects on torques were applied
+            left = errors.recorded_minus_true_torque - errors.transmitted_torque_noise
             torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
             angles, loads = np.hstack([arm, path]), episode.joint_loads
@@ -259,7 +260,10 @@ class EpisodePredictor:
             return start.failure_message
         by_start = start.state_sensitivity
         inputs = self.corrected_inputs_with_effect_momentum(episode, theta, wanted, start.state, by_start, inputs)
-        feedback, driven = episode.tracking_feedback_to_smoothed_reference, self.system.actuated_coordinate_indices
+        feedback, driven = episode.tracking_feedback, self.system.actuated_coordinate_indices
+        smoothed = None if episode.input_errors is None else episode.input_errors.smoothed_reference
+        if feedback is not None and smoothed is not None:
+            feedback = replace(feedback, reference=smoothed)
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity

@@ -109,11 +109,6 @@ class TorqueAndAngleErrorModel:
         return self.torque_bias + self.torque_noise
 
     @property
-    def remaining_torque_error_after_effects(self) -> Array:
-        """The torque error that is still to be subtracted after effects on torques were applied, (N, nu) [N m]."""
-        return self.recorded_minus_true_torque - self.transmitted_torque_noise
-
-    @property
     def with_torque_bias_only(self) -> TorqueAndAngleErrorModel:
         """The same error model with only the constant torque offset, without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
@@ -197,13 +192,6 @@ class Episode:
     # index of the estimation episode whose initial state and local parameters this held-out part of it shares
     initial_state_shared_with: int | None = None
     equilibrium_guess: Array | None = None  # near the initial equilibrium; None: that of least energy, (n,)
-
-    @property
-    def tracking_feedback_to_smoothed_reference(self) -> TrackingFeedback | None:
-        """The tracking filter, with the Kalman smoother's estimate as its reference if there is one."""
-        if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
-            return self.tracking_feedback
-        return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
 
     @property
     def has_biases_treated_as_noise(self) -> bool:
@@ -306,7 +294,7 @@ def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]
-    pairs = np.array(step.functions.sparse_jacobian_parts_function(*state, theta, step.time_step)[0]).ravel()
+    pairs = np.array(step.functions.function("linear")(*state, theta, step.time_step)[0]).ravel()
     plus, _, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
     mass = np.sum(plus * (upper - lower), axis=0) * step.time_step / 2
     return np.asarray(mass[[step.system.mechanism.joint_index(name) for name in names]])
