@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from yid_ocp.arrays import Array, BoolArray, IntArray
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -97,9 +97,8 @@ class ResidualDerivativesByStateAndEffort:
             before = 1 if read.needs_neighbours else 0
             slopes = np.zeros((2 * before + 1, *read.output.shape, nx))
             slopes[before, :, :, :n], slopes[before, :, :, 2 * n :] = read.by_q, read.by_z
-            for by_rate, stencil in ((read.by_v, (-0.5, 0.0, 0.5)), (read.by_a, (1.0, -2.0, 1.0))):
+            for order, by_rate, stencil in ((1, read.by_v, (-0.5, 0.0, 0.5)), (2, read.by_a, (1.0, -2.0, 1.0))):
                 if by_rate.shape[2]:
-                    order = 1 if by_rate is read.by_v else 2
                     slopes[:, :, :, :n] += np.multiply.outer(np.array(stencil) / step.time_step**order, by_rate)
             efforts = np.zeros((*read.output.shape, len(fixed) + n_forces))
             efforts[:, :, : len(fixed)] = read.by_load[:, :, fixed]
@@ -119,11 +118,6 @@ class ResidualDerivativesByStateAndEffort:
             parts.append((by_state, by_effort))
         arrays = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
         return ResidualDerivativesByStateAndEffort(np.concatenate(found), *arrays)
-
-    @property
-    def visible_state_mask(self) -> BoolArray:
-        """A mask of the states on which at least one residual depends, shape (nx,)."""
-        return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
     def select_states(self, kept: IntArray) -> ResidualDerivativesByStateAndEffort:
         """Return a copy with only the derivatives with respect to the states at the indices `kept`."""
@@ -147,11 +141,6 @@ class ResidualDerivativesByStateAndEffort:
             if effort.shape[1]:
                 found[used] += np.einsum("rx,rxd->rd", by_effort[used], effort[local])
         return found
-
-    def residual_indices_by_first_node(self, last: int) -> list[IntArray]:
-        """Group the residual indices by first node. The result has one array for each node from 0 to `last`."""
-        order = np.argsort(self.node, kind="stable")
-        return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
 
 # A fit is complete if no step predicts a larger cost reduction than this part of the cost, or this in noise units.

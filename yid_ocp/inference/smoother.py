@@ -339,13 +339,23 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
     return -float(outcome.fun), 10.0 ** float(outcome.x)
 
 
-def _select_and_smooth_unknowns(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float
+def smooth_unknowns_about_fit(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float = DEFAULT_MIN_LOG_BAYES_FACTOR
 ) -> SmoothedUnknownsResult:
-    """Select groups of unknown forces, offsets and biases that raise the log evidence at a fit `x`, and estimate them.
+    """Select and estimate unknown forces, offsets and biases that raise the log evidence at `x` by more than `least`.
 
-    A group is selected if the log evidence rises by more than `least` (5: odds of 150 to 1).
+    Torque noise is part of the unknown forces, and constant sensor errors are removed first.
     """
+    if problem.has_process_noise:
+        problem = problem_with_sensor_noise_only(problem)
+        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
+    if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
+        less = [
+            replace(e, measurements=subtract_estimated_bias_and_clock_errors(e.measurements, result.predicted_outputs))
+            for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
+        ]
+        problem = problem.with_episodes(less, ())
+        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
         models = residual_models_with_smoother_unknowns(problem, x, evaluation)
@@ -370,26 +380,6 @@ def _select_and_smooth_unknowns(
         detectable = {s: math.sqrt(_DETECTABLE_CHI2_RISE / score) for s, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
         return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
-
-
-def smooth_unknowns_about_fit(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float = DEFAULT_MIN_LOG_BAYES_FACTOR
-) -> SmoothedUnknownsResult:
-    """Select and estimate unknown forces, offsets and biases that raise the log evidence at `x` by more than `least`.
-
-    Torque noise is part of the unknown forces, and constant sensor errors are removed first.
-    """
-    if problem.has_process_noise:
-        problem = problem_with_sensor_noise_only(problem)
-        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
-    if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
-        less = [
-            replace(e, measurements=subtract_estimated_bias_and_clock_errors(e.measurements, result.predicted_outputs))
-            for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
-        ]
-        problem = problem.with_episodes(less, ())
-        evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
-    return _select_and_smooth_unknowns(problem, x, evaluation, least)
 
 
 def force_log_likelihood_coefficients(

@@ -236,7 +236,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
     If the cost rises to less than half of its prediction at an end of the 95 % interval, the standard deviation is that
     of a parabola through this point. It is very large if the cost does not rise.
     """
-    spread = _std_from_covariance(covariance, x)
+    spread = _std_from_covariance(covariance)
     lower, upper = problem.bounds
     scale = max(1.0, _chi2_per_dof(problem, evaluation))
     parameters = parameter_unknown_names(problem)
@@ -267,10 +267,8 @@ def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
     return tuple(name for name in problem.unknown_names if name.split("[")[0] in parameters)
 
 
-def _std_from_covariance(covariance: Array, x: Array) -> Array:
+def _std_from_covariance(covariance: Array) -> Array:
     """Standard deviations from a covariance, (nx,). They are infinite where the covariance is NaN."""
-    if not len(covariance):
-        return np.zeros(len(x))
     diagonal = np.diag(covariance)
     return np.where(np.isnan(diagonal), np.inf, np.sqrt(np.maximum(diagonal, 0.0)))
 
@@ -364,10 +362,6 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     It is the first of these that is available: the prior's standard deviation, half the distance of finite bounds, the
     median of other parameters of the same kind (such as `bend`), or else unit, and the scale of the unknown.
     """
-
-    def kind(name: str) -> str:
-        return name.rpartition(".")[2]
-
     (theta, _), entries = problem.unpack_episode_unknowns(x, 0), list(problem.system.parameters)
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
     scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
@@ -381,7 +375,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
             continue
         width = entry.upper - entry.lower
         alike = [o for o in entries if o.name != entry.name and o.unit == entry.unit and "@" not in o.name]
-        own = [o for o in alike if kind(o.name) == kind(entry.name)]
+        own = [o for o in alike if o.name.rpartition(".")[2] == entry.name.rpartition(".")[2]]
         others = [float(sizes[o.name]) for o in own or alike if sizes[o.name] > 0]
         if entry.name in known:
             found[entry.name] = float(known[entry.name])
@@ -400,7 +394,7 @@ def parameter_estimates(
     Local parameters are listed by recording. If `x` is not a fit, `fit` is None, and misfit and bounds are ignored.
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
-    spread = _cost_checked_std(problem, x, evaluation, covariance) if known else _std_from_covariance(covariance, x)
+    spread = _cost_checked_std(problem, x, evaluation, covariance) if known else _std_from_covariance(covariance)
     sizes, theta = typical_parameter_magnitudes(problem, x), problem.unpack_episode_unknowns(x, 0)[0]
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}

@@ -69,21 +69,6 @@ class _FilterPart(NamedTuple):
     kalman: FixedGainKalmanFilter
     by_torque: Array  # derivatives of the rows by a known torque of their step, shape (r, nu)
 
-    def fresh_noise(self, noise: Array) -> Array:
-        """The entry of `noise` (N, nu) for the sample that begins after each step, else zero, and zeros: (k, 2 nu)."""
-        found = np.zeros_like(self.kalman.decay)
-        behind = self.first + 1 + np.flatnonzero(self.kalman.decay[:, 0] == 0)
-        found[behind - self.first - 1, : noise.shape[1]] = noise[behind]
-        return found
-
-
-class _SmoothedInputErrors(NamedTuple):
-    """Smoothed input errors of a recording."""
-
-    torque_bias: Array  # b, shape (nu,) [N m]
-    torque_noise: Array  # w, shape (N, nu) [N m]
-    state_error: Array  # with encoder measurements: rollout minus truth, shape (N + 1, nx)
-
 
 @dataclass(frozen=True)
 class WhiteningFilter:
@@ -108,8 +93,8 @@ class WhiteningFilter:
         bias[:, 0] += self.input_error_model.torque_bias
         return result, bias
 
-    def _smooth_input_errors(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
-        """Smoothed torque and state errors given all measurements (Bryson, Frazier 1963)."""
+    def _smooth_input_errors(self, rows: Array, push: Array | None) -> tuple[Array, Array, Array]:
+        """Smoothed b (nu,) and w (N, nu) [N m] and, with encoder measurements, rollout minus truth (N + 1, nx)."""
         errors, (count, nu) = self.input_error_model, self.input_error_model.torque_noise.shape
         ns = int(np.count_nonzero(self.state_mask))
         torque = slice(ns, ns + nu)
@@ -130,7 +115,7 @@ class WhiteningFilter:
             _, mean, before = self._updated(part, mean, rows[part.rows, None] - noise[part.rows], push, white)
             assert before is not None
             error[part.first : part.first + len(before), self.state_mask] = before[:, :ns, 0]
-        return _SmoothedInputErrors(bias[:, 0], white, error)
+        return bias[:, 0], white, error
 
     def _expected(self, columns: int) -> Array:
         """Mean of (d, w, b) before all measurements, (na, columns). Only the first column is nonzero."""
@@ -151,7 +136,10 @@ class WhiteningFilter:
             for first in range(0, len(own), _ROWS_PER_BLOCK):
                 rows = slice(first, first + _ROWS_PER_BLOCK)
                 own[rows] -= np.einsum("ru,ruc->rc", part.by_torque[rows], push[part.step_of_row[rows]])
-        shift = part.fresh_noise(-noise if white is None else white - noise)
+        # after each step, the noise of the sample that begins then, else zero
+        shift, begins = np.zeros_like(part.kalman.decay), np.flatnonzero(part.kalman.decay[:, 0] == 0)
+        fresh = -noise if white is None else white - noise
+        shift[begins, : noise.shape[1]] = fresh[part.first + 1 + begins]
         return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known, white is not None)
 
 
@@ -160,10 +148,12 @@ def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErr
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     slopes = ResidualDerivativesByStateAndEffort.from_nominal_trajectory(course)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
-    ends = {"seen": slopes.visible_state_mask, "disturbed": np.any(np.abs(start) > _MIN_START_SLOPE, axis=1)}
-    live = reachable_and_observable_state_mask(step, course.theta, course.rollout, **ends)
+    seen, disturbed = np.any(slopes.by_state != 0, axis=(0, 1)), np.any(np.abs(start) > _MIN_START_SLOPE, axis=1)
+    live = reachable_and_observable_state_mask(step, course.theta, course.rollout, seen=seen, disturbed=disturbed)
     kept = np.flatnonzero(live)
-    rows_of_node, slopes = slopes.residual_indices_by_first_node(count), slopes.select_states(kept)
+    order = np.argsort(slopes.node, kind="stable")
+    rows_of_node = np.split(order, np.searchsorted(slopes.node[order], np.arange(1, count + 1)))
+    slopes = slopes.select_states(kept)
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
     first = unit @ unit.T
@@ -257,7 +247,7 @@ def _whitened_episode(
     at: tuple[Array, Array],
     guess: Array | None,
     before: WhiteningFilter | None,
-    result: EpisodePrediction | str | None = None,
+    result: EpisodePrediction | str | None,
     keep_weights: bool = False,
 ) -> tuple[Episode, WhiteningFilter | None]:
     """Episode with estimated input errors, and the filter that whitens its residual at (theta, offset).
@@ -287,16 +277,17 @@ def _about_smoothed(
     """Episode with smoothed torque errors and, if encoders are measurements, a smoothed reference motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
-    found = before._smooth_input_errors(_plain(episode, result), result.feedback_torque_and_sensitivity)
+    plain, push = _plain(episode, result), result.feedback_torque_and_sensitivity
+    bias, noise, state_error = before._smooth_input_errors(plain, push)
     own = predictor.theta_with_episode_values(episode, theta)
-    errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
+    errors = replace(errors, torque_bias=bias, torque_noise=noise)
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
         inputs = predictor.corrected_inputs_with_effect_momentum(episode, own, (), result.rollout.state[0])
         driven = predictor.system.actuated_coordinate_indices
         guided = inputs.tracking_feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         assert guided is not None
-        true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
+        true = (result.rollout.state - state_error)[:-1, feedback.state_indices]
         errors = replace(errors, smoothed_reference=true - (guided.reference - feedback.reference))
     return replace(episode, input_errors=errors)
 
