@@ -226,7 +226,6 @@ class SolverWithCheckedSettings:
 
 
 SOLVERS: Registry[type[Solver]] = Registry("solver")
-_DEFAULT_SOLVER = "gauss_newton"
 
 
 @dataclass
@@ -312,7 +311,7 @@ def fit_problem(
             start = unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns)
         else:
             start = np.clip(np.asarray(initial_unknowns, float), *problem.bounds)
-        search = _MultiStartSearch(problem, solver or SOLVERS[_DEFAULT_SOLVER](), callback, start)
+        search = _MultiStartSearch(problem, solver or SOLVERS["gauss_newton"](), callback, start)
         if restarts:
             search.restart(start, limits)
         return search.solution(limits, verdicts)

@@ -194,8 +194,12 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             gradient = now.jacobian.T @ now.residual
             recorder.record_iterate(now.cost, x, projected_gradient_norm(x, gradient, *problem.bounds, size))
             closed = now.residual + now.by_defect
-            bounds = _step_bounds(problem, x, size)
-            step = size * bounded_levenberg_marquardt_step(now.jacobian * size, closed, mu, *bounds)
+            # the linear model holds for changes by a factor, not to a bound
+            (low, high), positive = problem.bounds, problem.positive_unknowns_mask
+            largest = np.maximum(x, 1e-3 * problem.unknown_scales) * _MAX_CHANGE_FACTOR
+            low = (np.where(positive, np.maximum(low, x / _MAX_CHANGE_FACTOR), low) - x) / size
+            high = (np.where(positive, np.minimum(high, largest), high) - x) / size
+            step = size * bounded_levenberg_marquardt_step(now.jacobian * size, closed, mu, low, high)
             promised = predicted_cost_reduction_by_step(now.jacobian, closed, step)
             moved = float(np.max(np.abs(step) / size, initial=0.0))
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
@@ -329,14 +333,6 @@ class _StepFilter:
             self._points.append((now.defect, now.cost))
             return True
         return False
-
-
-def _step_bounds(problem: EstimationProblem, x: Array, size: Array) -> tuple[Array, Array]:
-    """Bounds of a step in units of `size`: the linear model holds for changes by a factor, not to a bound."""
-    lower, upper = problem.bounds
-    largest = np.maximum(x, 1e-3 * problem.unknown_scales) * _MAX_CHANGE_FACTOR
-    low = np.where(problem.positive_unknowns_mask, np.maximum(lower, x / _MAX_CHANGE_FACTOR), lower)
-    return (low - x) / size, (np.where(problem.positive_unknowns_mask, np.minimum(upper, largest), upper) - x) / size
 
 
 class _ShootingIntervals:

@@ -534,9 +534,13 @@ class NonlinearProgram(ReprMixin):
         """
         with CASADI_LOCK:
             options = {**QUIET_NLPSOL_OPTIONS, **options}
+            fitting = {name: value for name, value in options.items() if name not in _SIZE_DEPENDENT_OPTIONS}
+            x, p = ca.MX.sym("x"), ca.MX.sym("p")
             try:
-                asked = _asked_for(plugin, options)
-                made = {name: self._derivatives(name, *ends, hessian) for name, ends in asked.items()}
+                # a program of one unknown tells which functions the plug-in asks for
+                tiny = ca.nlpsol("tiny", plugin, {"x": x, "p": p, "f": x**2, "g": x}, fitting)
+                asked = ((name, tiny.get_function(name)) for name in tiny.get_function())
+                made = {name: self._derivatives(name, f.name_in(), f.name_out(), hessian) for name, f in asked}
                 cache = {name: function for name, function in made.items() if function is not None}
                 return ca.nlpsol("program", plugin, self.nlp, {**options, "cache": cache})
             except RuntimeError as error:
@@ -560,12 +564,3 @@ class NonlinearProgram(ReprMixin):
         if not set(outputs) <= set(known) or not set(inputs) <= set(symbols):
             return None
         return ca.Function(name, [symbols[i] for i in inputs], [known[o]() for o in outputs], inputs, outputs)
-
-
-def _asked_for(plugin: str, options: Mapping[str, Any]) -> dict[str, tuple[list[str], list[str]]]:
-    """Inputs and outputs of the functions that a plug-in requests, found with a program of one unknown."""
-    x, p = ca.MX.sym("x"), ca.MX.sym("p")
-    fitting = {name: value for name, value in options.items() if name not in _SIZE_DEPENDENT_OPTIONS}
-    tiny = ca.nlpsol("tiny", plugin, {"x": x, "p": p, "f": x**2, "g": x}, fitting)
-    functions = {name: tiny.get_function(name) for name in tiny.get_function()}
-    return {name: (f.name_in(), f.name_out()) for name, f in functions.items()}

@@ -443,16 +443,16 @@ class _Maker:
             if any(function.size2_out(name) for name in ("by_v", "by_a", "by_lam")):
                 raise sensor_not_predictable_at_nodes_error(sensor.group_name)
             loaded = function.nnz_out("by_load") > 0
-            made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function)
+            if loaded:
+                made = self._loaded(function, self._driven(episode))
+            else:
+                q, z = ca.SX.sym("q", self._sizes["n"]), ca.SX.sym("z", self._sizes["nz"])
+                read = function(q=q, z=z, theta=self._freed.theta)
+                inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
+                slopes = ca.horzcat(read["by_theta"], read["by_q"], read["by_z"])
+                made = LocalVariableFunction("reading", inputs, read["y"], slopes)
             self._sensors[key] = made, loaded
         return self._sensors[key]
-
-    def _unloaded(self, function: ca.Function) -> LocalVariableFunction:
-        q, z = ca.SX.sym("q", self._sizes["n"]), ca.SX.sym("z", self._sizes["nz"])
-        read = function(q=q, z=z, theta=self._freed.theta)
-        inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
-        slopes = ca.horzcat(read["by_theta"], read["by_q"], read["by_z"])
-        return LocalVariableFunction("reading", inputs, read["y"], slopes)
 
     def _loaded(self, function: ca.Function, step: _DrivenStage) -> LocalVariableFunction:
         system, n, nx = self._problem.system, self._sizes["n"], self._sizes["nx"]
