@@ -66,7 +66,15 @@ def solve(
         Receives every `Iterate`.
     """
     if initial_unknowns is not None:
-        _check_start(problem, initial_unknowns)
+        names, known = problem.unknown_names, problem.system.parameters
+        if len(initial_unknowns) != len(names):
+            what, allowed = f"{len(initial_unknowns)} values for {len(names)} unknowns", abbreviated_names_text(names)
+            hint = "use problem.unknown_vector({NAME: VALUE, ...})"
+            raise ConfigError(what, where="initial_unknowns", allowed=f"values of {allowed}", hint=hint)
+        for name, value, lower, upper in zip(names, initial_unknowns, *problem.bounds, strict=True):
+            shared = name.partition("[")[0]
+            unit = known[shared].unit if shared in known else "1"
+            Parameter(name, float(value), unit, lower, upper)  # checks its bounds
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
@@ -77,17 +85,6 @@ def solve(
     solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
     checks = replace(solution.checks or EstimateChecksBeyondFit(), cable_memory_message=safe.message)
     return replace(solution, checks=checks)
-
-
-def _check_start(problem: EstimationProblem, start: Sequence[float]) -> None:
-    names, known = problem.unknown_names, problem.system.parameters
-    if len(start) != len(names):
-        what, hint = f"{len(start)} values for {len(names)} unknowns", "use problem.unknown_vector({NAME: VALUE, ...})"
-        allowed = f"values of {abbreviated_names_text(names)}"
-        raise ConfigError(what, where="initial_unknowns", allowed=allowed, hint=hint)
-    for name, value, lower, upper in zip(names, start, *problem.bounds, strict=True):
-        shared = name.partition("[")[0]
-        Parameter(name, float(value), known[shared].unit if shared in known else "1", lower, upper)  # checks its bounds
 
 
 def add_intervals_and_checks(
@@ -212,8 +209,10 @@ def choose_cable_memory_fit(
     decides: each such recording is predicted from all others, with and without memory (by one Gauss-Newton step from
     the fit of all). The memory is kept if its total error is smaller; it is dropped if only one recording moves.
     """
-    memory, moving = _memory_parameters(problem), _moving(problem)
-    if not memory or not moving or solution.evaluation is None:
+    starts = [episode.fixed_initial_state for episode in problem.episodes]
+    speeds = [0.0 if s is None else s.fitted_parameters.get(INITIAL_RMS_SPEED_PARAMETER, 0.0) for s in starts]
+    moving = [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]
+    if not _memory_parameters(problem) or not moving or solution.evaluation is None:
         return CableMemoryChoice(problem, solution)
     without = problem_without_cable_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
@@ -240,12 +239,6 @@ def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProble
 
 def _memory_parameters(problem: EstimationProblem) -> list[str]:
     return [name for name in problem.shared_parameters if name.endswith(_MEMORY_SUFFIX)]
-
-
-def _moving(problem: EstimationProblem) -> list[int]:
-    starts = [episode.fixed_initial_state for episode in problem.episodes]
-    speeds = [0.0 if s is None else s.fitted_parameters.get(INITIAL_RMS_SPEED_PARAMETER, 0.0) for s in starts]
-    return [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]
 
 
 def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int]) -> float:

@@ -357,7 +357,12 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
     needed = arm._inverse_dynamics(motion.q, motion.v, motion.a)
     largest = np.array([joint.effort_limit for joint in arm.joints])
     size = np.where(np.isfinite(largest), largest, np.maximum(np.max(np.abs(needed), axis=0), 1e-9))
-    found = list(_limits(arm, motion.effort, largest))
+    found, ratio = list[Issue](), np.percentile(np.abs(motion.effort), 99, axis=0) / largest
+    if np.any(ratio > _MAX_EFFORT_RATIO):
+        j = int(np.argmax(ratio))
+        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times its effort limit ({largest[j]:.3g} N m)"
+        advice = "check the unit of efforts (N m) and the robot's description"
+        found.append(_issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j]))
     most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
     if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
         commanded = joints.effort_sampling_kind_or_default == "command"
@@ -366,7 +371,11 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
         wanted = np.sqrt(np.mean(needed**2, axis=0))
         dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
         if dead.any():
-            found.append(_zero(arm, dead))
+            which = "all joints" if dead.all() else ", ".join(np.array(arm.joint_names)[dead])
+            words = f"the effort of {which} is zero throughout, although gravity and motion require more"
+            advice = "record efforts, or use none: prescribe the motion of the arms and switch their effort sensor off"
+            setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
+            found.append(_issue("effort_zero", words, 1e3, advice, setting=setting))
         else:
             # a delayed oscillation looks like a flipped sign, so delays are tested first
             data = _Data(arm, motion, motion.effort, needed, size)
@@ -378,24 +387,6 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
 def _issue(cause: str, words: str, depth: float, advice: str, joint: str = "", setting: str = "") -> Issue:
     channel = f"effort.{joint}" if joint else "effort"
     return Issue(cause, words, "not_trusted", depth, advice, "", "joints", channel, setting=setting)
-
-
-def _limits(arm: RecordedJointsModel, effort: Array, largest: Array) -> Iterator[Issue]:
-    ratio = np.percentile(np.abs(effort), 99, axis=0) / largest
-    if np.any(ratio > _MAX_EFFORT_RATIO):
-        j = int(np.argmax(ratio))
-        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times its effort limit ({largest[j]:.3g} N m)"
-        advice = "check the unit of efforts (N m) and the robot's description"
-        yield _issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j])
-
-
-def _zero(arm: RecordedJointsModel, dead: BoolArray) -> Issue:
-    names = [name for name, off in zip(arm.joint_names, dead, strict=True) if off]
-    which = "all joints" if dead.all() else ", ".join(names)
-    words = f"the effort of {which} is zero throughout, although gravity and motion require more"
-    advice = "record efforts, or use none: prescribe the motion of the arms and switch their effort sensor off"
-    setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
-    return _issue("effort_zero", words, 1e3, advice, setting=setting)
 
 
 def _by_joint(data: _Data, fit: _Fit) -> Iterator[Issue]:

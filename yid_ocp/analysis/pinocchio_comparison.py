@@ -61,7 +61,10 @@ def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) 
 
     The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations.
     """
-    built = _with_numeric_parameters(system, theta)
+    internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
+    symbols = ca.vertcat(system.parameters.symbols, internal)
+    values = np.concatenate([theta, np.zeros(internal.numel())])
+    built = system.map_expressions(lambda x: ca.SX(ca.densify(ca.Function("number", [symbols], [x])(values))))
     gravity = np.array(ca.DM(built.gravity)).ravel()
     inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))
     return _compared("the built model", built.mechanism, gravity, inert, heavy, posture)
@@ -119,18 +122,6 @@ def _link(joint: ElementTree.Element, end: str) -> str:
 def _place(configuration: Array, joint: Any, value: float) -> None:
     """Set a joint in a configuration of Pinocchio, in which a cosine and a sine represent a continuous joint."""
     configuration[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-
-
-def _with_numeric_parameters(system: System, theta: Array) -> System:
-    """Return the system with the numbers `theta` instead of its parameters, and zero internal coordinates."""
-    inner = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
-    symbols = ca.vertcat(system.parameters.symbols, inner)
-    values = np.concatenate([theta, np.zeros(inner.numel())])
-
-    def number(expression: ca.SX) -> ca.SX:
-        return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(values)))
-
-    return system.map_expressions(number)
 
 
 def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:

@@ -73,7 +73,11 @@ def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Se
         elif op == ca.OP_CONST:
             written.append((f"{value:.12g}", _SUM if value < 0 else _ATOM))
         else:
-            text, tightness = _written(op, [written[part] for part in parts])
+            # a function without a template binds like an atom, and its operands stand between commas
+            template, tightness, asked = _TEXT_TEMPLATES.get(op, ("", _ATOM, (_COMPARISON,) * len(parts)))
+            pairs = zip((written[part] for part in parts), asked, strict=True)
+            texts = [text if has >= wants else f"({text})" for (text, has), wants in pairs]
+            text = template.format(*texts) if template else f"{_FUNCTION_NAMES[op]}({', '.join(texts)})"
             simple = op == ca.OP_NEG and nodes[parts[0]][0] in _LEAF_OPERATIONS
             if uses[i] > 1 and not simple:
                 name_of = f"c{len(shared) + 1}"
@@ -112,14 +116,6 @@ def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
         at[given[0]] = len(nodes)
         nodes.append((op, parts, float(value)))
     return nodes, results
-
-
-def _written(op: int, parts: list[tuple[str, int]]) -> tuple[str, int]:
-    if op not in _TEXT_TEMPLATES:
-        return f"{_FUNCTION_NAMES[op]}({', '.join(text for text, _ in parts)})", _ATOM
-    template, tightness, asked = _TEXT_TEMPLATES[op]
-    texts = [text if has >= wants else f"({text})" for (text, has), wants in zip(parts, asked, strict=True)]
-    return template.format(*texts), tightness
 
 
 _MAX_PRINTED_OPERATIONS = 80  # longer equations are printed only on request

@@ -157,16 +157,14 @@ def _smallest(
     if base._is_complete:
         return [base]
     for size in range(1, _MAX_CHANGE_SET_SIZE + 1) if changes else ():
-        found = outcomes.of_all(list(filter(_are_compatible, itertools.combinations(changes, size))))
+        sets = itertools.combinations(changes, size)
+        # at most one camera rate and one other motion
+        able = [own for own in sets if sum(change.camera_rate is not None for change in own) <= 1]
+        able = [own for own in able if sum(change.setup_change in ("motion", "travel") for change in own) <= 1]
+        found = outcomes.of_all(able)
         if complete := [outcome for outcome in found if outcome._is_complete]:
             return complete
     return []
-
-
-def _are_compatible(changes: Sequence[ExperimentChange]) -> bool:
-    """Check whether changes can be combined: at most one camera rate and one other motion."""
-    rates = sum(change.camera_rate is not None for change in changes)
-    return rates <= 1 and sum(change.setup_change in ("motion", "travel") for change in changes) <= 1
 
 
 def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedExperimentResult]:
