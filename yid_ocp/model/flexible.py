@@ -162,7 +162,13 @@ def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravi
     own = _segment_parameters(segment)
     parts.parameters.extend(own.values())
     mass, shares = own["mass"].symbol, _length_shares(segment)
-    square_x, square_y, radius = _cross_section(own)
+    # mean squares of x and of y over a cross-section, and its equivalent radius
+    if "radius" in own:
+        radius = own["radius"].symbol
+        square_x = square_y = radius**2 / 4
+    else:
+        x, y = own["size_x"].symbol, own["size_y"].symbol
+        square_x, square_y, radius = x**2 / 12, y**2 / 12, ca.sqrt(x**2 + y**2) / 2
     if segment.has_length_parameter_per_link:
         lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
     else:
@@ -242,15 +248,6 @@ def _length_shares(segment: FlexibleSegment) -> tuple[float, ...]:
         return (1.0 / segment.links,) * segment.links
     lengths = np.asarray(segment.link_lengths, float)
     return tuple(map(float, lengths / lengths.sum()))
-
-
-def _cross_section(own: Mapping[str, Parameter]) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Mean squares of x and of y over a cross-section [m^2], and its equivalent radius [m]."""
-    if "radius" in own:
-        radius = own["radius"].symbol
-        return radius**2 / 4, radius**2 / 4, radius
-    x, y = own["size_x"].symbol, own["size_y"].symbol
-    return x**2 / 12, y**2 / 12, ca.sqrt(x**2 + y**2) / 2
 
 
 def _segment_parameters(segment: FlexibleSegment) -> dict[str, Parameter]:

@@ -61,12 +61,9 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {_joint_name(model, j): {} for j in range(model.njnt)}
     for j in range(model.njnt):
         dof, own = int(model.jnt_dofadr[j]), found[_joint_name(model, j)]
-        for name, values in (
-            ("armature", model.dof_armature),
-            ("damping", model.dof_damping),
-            ("frictionloss", model.dof_frictionloss),
-        ):
-            own |= {name: float(np.ravel(values[dof])[0])} if np.ravel(values[dof])[0] > 0 else {}
+        for name in ("armature", "damping", "frictionloss"):
+            value = float(np.ravel(getattr(model, f"dof_{name}")[dof])[0])
+            own |= {name: value} if value > 0 else {}
     for i in filter(lambda i: _is_position_actuator(model, i), range(model.nu)):
         gain, damping = float(model.actuator_gainprm[i, 0]), -float(model.actuator_biasprm[i, 2])
         found[_joint_name(model, int(model.actuator_trnid[i, 0]))] |= {"servo_gain": gain, "servo_damping": damping}
@@ -125,12 +122,9 @@ def _body(
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
         if carried != name:
             links.append(SimpleNamespace(name=carried, inertial=None))
-        made: dict[str, Any] = {
-            "name": label,
-            "type": kind if model.jnt_limited[j] or kind == "prismatic" else "continuous",
-        }
-        made |= {"axis": np.array(axis), "limit": _limits(model, j), "mimic": follows.get(label)}
-        joints.append(SimpleNamespace(**made, origin=origin, parent=parent, child=carried))
+        urdf_type = kind if model.jnt_limited[j] or kind == "prismatic" else "continuous"
+        made = {"axis": np.array(axis), "limit": _limits(model, j), "mimic": follows.get(label)}
+        joints.append(SimpleNamespace(name=label, type=urdf_type, origin=origin, parent=parent, child=carried, **made))
         parent, at, last = carried, np.eye(4), place
     if parent != name:
         joints.append(_fixed(f"{name}_fixed", parent, name, at @ _shift(-last)))

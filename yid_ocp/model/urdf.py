@@ -475,7 +475,14 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
     links = [link_name("world", -1)] + [link_name(f"{joint.name}_link", i) for i, joint in enumerate(mechanism.joints)]
     ElementTree.SubElement(robot, "link", name=links[0])
     for i, joint in enumerate(mechanism.joints):
-        _write_link(robot, links[i + 1], joint)
+        link, body = ElementTree.SubElement(robot, "link", name=links[i + 1]), merge_bodies(joint.bodies)
+        if body is not None:
+            inertial, tensor = ElementTree.SubElement(link, "inertial"), np.array(ca.DM(body.inertia_about_com))
+            com = _digits(np.array(ca.DM(body.center_of_mass)).ravel())
+            ElementTree.SubElement(inertial, "origin", xyz=com, rpy="0 0 0")
+            ElementTree.SubElement(inertial, "mass", value=_digits([float(body.mass)]))
+            moments = {key: _digits([tensor[ij]]) for key, ij in _TENSOR_KEYS.items()}
+            ElementTree.SubElement(inertial, "inertia", moments)
         _write_joint(robot, joint, links[joint.parent_index + 1], links[i + 1])
     for name, frame in mechanism.frames.items():
         if name in links:
@@ -488,18 +495,6 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
         _connect(element, frame.placement, links[frame.joint_index + 1], name)
     ElementTree.indent(robot)
     return ElementTree.tostring(robot, encoding="unicode") + "\n"
-
-
-def _write_link(robot: ElementTree.Element, name: str, joint: Joint) -> None:
-    link = ElementTree.SubElement(robot, "link", name=name)
-    body = merge_bodies(joint.bodies)
-    if body is None:
-        return
-    inertial = ElementTree.SubElement(link, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=_digits(np.array(ca.DM(body.center_of_mass)).ravel()), rpy="0 0 0")
-    ElementTree.SubElement(inertial, "mass", value=_digits([float(body.mass)]))
-    tensor = np.array(ca.DM(body.inertia_about_com))
-    ElementTree.SubElement(inertial, "inertia", {key: _digits([tensor[ij]]) for key, ij in _TENSOR_KEYS.items()})
 
 
 def _write_joint(robot: ElementTree.Element, joint: Joint, parent: str, child: str) -> None:
