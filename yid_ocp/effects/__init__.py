@@ -66,7 +66,6 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
             if cls.is_at_recorded_sensor or cls.is_at_point_groups:
                 places = [place for place in places if place in present]
             if cls.is_at_point_groups:
-                kinds_and_groups = (name.split(":") for name in sorted(present) if ":" in name)
-                places += [group for signal, group in kinds_and_groups if signal == "points"]
+                places += [name.removeprefix("points:") for name in sorted(present) if name.startswith("points:")]
             found += [(kind, place) for place in places if place not in unseen]
     return found

@@ -138,10 +138,8 @@ class _Backlash(_DistortedReading):
         servo, command = state.system.servos[self.location], state.u[state.system.driven.index(self.location)]
         free, geared = (servo.torque(command, state.q[index] + give, state.v[index]) for give in (0, play))
         taken = play - self["width"] / 2 * ca.tanh(geared / _PLAY_TORQUE)
-        return EffectStepTerms(
-            generalized_force=base.generalized_force_at_joint(state.system, self.location, geared - free),
-            internal_equations={name: taken},
-        )
+        force = base.generalized_force_at_joint(state.system, self.location, geared - free)
+        return EffectStepTerms(generalized_force=force, internal_equations={name: taken})
 
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["width"] / 2 * ca.tanh(effort / _PLAY_TORQUE)

@@ -132,20 +132,17 @@ class _JointLoadFriction(_JointFriction):
         ParameterDefinition("share", "1", 0.0, 0.0, 2.0, (0.0, 0.5), "friction per torque through the gear"),
     )
 
-    def _load(self, state: MidpointStateSymbols) -> ca.SX:
-        """Torque through the gear [N m]."""
-        system, index = state.system, state.system.mechanism.joint_index(self.location)
-        if self.location not in system.driven:  # its motor is assumed to balance the external torque
-            return -2 * system.gravity_and_grasp_force_on_coordinate(state, index)
-        return system.gear_torque_on_coordinate(state, index)
-
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
-        load = self._load(state)
+        system, index = state.system, state.system.mechanism.joint_index(self.location)
+        if self.location in system.driven:
+            load = system.gear_torque_on_coordinate(state, index)
+        else:  # its motor is assumed to balance the external torque
+            load = -2 * system.gravity_and_grasp_force_on_coordinate(state, index)
         size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
-        v = state.v[state.system.mechanism.joint_index(self.location)]
-        friction = self["share"] * size * ca.tanh(v / min(self.sign_smoothing_speed, _LOAD_SIGN_SMOOTHING_SPEED))
+        smoothing_speed = min(self.sign_smoothing_speed, _LOAD_SIGN_SMOOTHING_SPEED)
+        friction = self["share"] * size * ca.tanh(state.v[index] / smoothing_speed)
         # it dissipates energy, but is not a dissipative force of the speed alone: its size depends on weight and motor
-        force = base.generalized_force_at_joint(state.system, self.location, -friction)
+        force = base.generalized_force_at_joint(system, self.location, -friction)
         return EffectStepTerms(generalized_force=force)
 
 

@@ -179,7 +179,5 @@ class _GraspSlip(_GraspChange):
         first = sum(grasp.n_constraint_equations for grasp in grasps[:at])
         axis = state.kinematics.frame_pose(grasps[at].held_frame).rotation[:, 2]
         load = ca.dot(axis, state.constraint_force[first : first + 3])
-        return EffectStepTerms(
-            internal_equations={name: state.z_rate[row] - self["slip_per_load"] * load},
-            static_equations={name: state.z[row]},
-        )
+        creep = state.z_rate[row] - self["slip_per_load"] * load
+        return EffectStepTerms(internal_equations={name: creep}, static_equations={name: state.z[row]})

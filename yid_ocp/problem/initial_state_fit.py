@@ -225,10 +225,8 @@ class InitialStateFitter:
             own = np.where(turns, low + (own - low) % np.where(turns, span, 1.0), np.clip(own, low, high))
             return np.concatenate([x[: len(free)], own])
 
-        def rows(x: Array) -> tuple[Array, Array]:
-            return self._rows(*spread(x), task)
-
-        found = levenberg_marquardt(rows, np.concatenate([q[free], theta[wanted]]), projection=allowed)
+        begin = np.concatenate([q[free], theta[wanted]])
+        found = levenberg_marquardt(lambda x: self._rows(*spread(x), task), begin, projection=allowed)
         q, theta = spread(found.x)
         return q, theta[index], found.final_model.cost
 

@@ -285,12 +285,6 @@ def whiten_against_sensor_biases(slopes: Array, columns: Array) -> Array:
     return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
 
 
-def _estimated_constant_errors(slopes: Array, residual: Array) -> Array:
-    """Constant sensor errors (m,), measured minus true, from a residual and its `slopes` (r, m), all in stds."""
-    left, size, right = np.linalg.svd(slopes, full_matrices=False)
-    return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
-
-
 def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements]) -> Array:
     """Return derivatives (r, m) of whitened measurements with respect to sensor and clock errors of unit variance.
 
@@ -316,7 +310,8 @@ def subtract_estimated_bias_and_clock_errors(
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)
     residual = np.concatenate([s.whitened_residual(y)[s.positive_weight_mask] for s, y in pairs])
-    left = _estimated_constant_errors(slopes, residual)
+    columns, size, right = np.linalg.svd(slopes, full_matrices=False)
+    left = -right.T @ ((size / (1 + size**2)) * (columns.T @ residual))  # errors, measured minus true, in stds
     made = []
     for s in samples:
         directions = s.output_changes_per_bias_and_clock_std

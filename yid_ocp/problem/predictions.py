@@ -21,20 +21,6 @@ from yid_ocp.problem.signal_filters import FirstOrderLag
 from yid_ocp.sensors import joints as joint_sensors
 from yid_ocp.sensors.base import EffortSamplingKind, expand_to_joint_values
 
-
-def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGroup:
-    """Point group of a recording that contains all given points. Raises `DataError` if there is none."""
-    for group in recording.points:
-        if set(points) <= set(group.names):
-            return group
-    what, where = f"no point group contains all of {', '.join(points)}", f"recording '{recording.name}'"
-    said = {"allowed": "points of one group", "hint": "put the points of one object in one group"}
-    if missing := [point for point in points if point not in recording.point_names]:
-        what = f"point '{missing[0]}' is not recorded"
-        said = unknown_name_error_arguments(missing[0], recording.point_names)
-    raise DataError(what, where=where, **said)
-
-
 _GIVEN_FRAMES = 2  # number of measured frames that predictions without a model use, like the fit of the initial state
 
 
@@ -69,9 +55,16 @@ def naive_cable_predictions(
 
 
 def measured_point_positions(recording: Recording, points: Sequence[str]) -> Array:
-    """Return the measured positions (M, len(points), 3) [m] of points in one group of a recording."""
-    group = _group_with_points(recording, points)
-    return group.position[:, [group.names.index(point) for point in points]]
+    """Return the measured positions (M, len(points), 3) [m] of points in one group of a recording, or `DataError`."""
+    for group in recording.points:
+        if set(points) <= set(group.names):
+            return group.position[:, [group.names.index(point) for point in points]]
+    what, where = f"no point group contains all of {', '.join(points)}", f"recording '{recording.name}'"
+    said = {"allowed": "points of one group", "hint": "put the points of one object in one group"}
+    if missing := [point for point in points if point not in recording.point_names]:
+        what = f"point '{missing[0]}' is not recorded"
+        said = unknown_name_error_arguments(missing[0], recording.point_names)
+    raise DataError(what, where=where, **said)
 
 
 def _start_frame(recording: Recording, points: Sequence[str]) -> Array:

@@ -117,10 +117,8 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
 def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     """Measured efforts of prescribed joints, low-pass filtered and thinned to independent samples."""
     joints, choice = around.recording.joints, around.sensor_usage(JOINT_EFFORT_SENSOR_KEY)
-    if joints is None or joints.effort is None or choice.use is False:
-        return []
-    names = tuple(name for name in around.system.prescribed if name in joints.names)
-    if not names:
+    names = () if joints is None else tuple(name for name in around.system.prescribed if name in joints.names)
+    if joints is None or joints.effort is None or choice.use is False or not names:
         return []
     effort = joints.effort[:, recorded_joint_column_indices(joints, names, around.recording.name)]
     given = choice.std if choice.std is not None else joints.effort_std
