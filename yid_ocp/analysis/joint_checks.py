@@ -229,11 +229,16 @@ def slow_motion_excitation_issues(
     """
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
-    if joints is None or motion is None or motion.effort is None or effort.use is False:
+    if joints is None or joints.effort is None or motion is None or motion.effort is None or effort.use is False:
         return
     if float(np.max(np.ptp(motion.q, axis=0))) < QUALITY_LIMITS.min_joint_motion:
         return  # another check reports a standstill
-    noise = _noise(joints, arm.joint_names, effort)
+    names = arm.joint_names
+    given = effort.std if effort.std is not None else joints.effort_std
+    if given is None:
+        noise = np.array([white_noise_std(joints.t, joints.effort[:, joints.names.index(name)]) for name in names])
+    else:
+        noise = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_SENSOR_KEY}.std")
     if not np.all(noise > 0):
         return
     still = np.zeros_like(motion.q)
@@ -249,15 +254,6 @@ def slow_motion_excitation_issues(
         advice = "move faster; static configurations determine weight and stiffness, not damping, friction or inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
-
-
-def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> Array:
-    """Return the std of white noise (k,) of efforts [N m] as stated or, if none is stated, as measured."""
-    given = effort.std if effort.std is not None else joints.effort_std
-    if given is not None:
-        return expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_SENSOR_KEY}.std")
-    assert joints.effort is not None
-    return np.array([white_noise_std(joints.t, joints.effort[:, joints.names.index(name)]) for name in names])
 
 
 def joint_excitation_issues(

@@ -182,7 +182,10 @@ def recording_from_prediction(
     channels = _channel_groups(predictor, episode, outcome, own, rng)
     said = (text, "yid_ocp simulate", f"{episode.name}_simulated")
     made = Recording(joints, tuple(groups), *said, true_parameters=truth, channel_groups=channels)
-    return validated_recording(replace(made, marker_reference_pose=_straight(made, source)))
+    if source.marker_reference_pose is not None and groups and groups[0].name == source.points[0].name:
+        at = [source.points[0].names.index(name) for name in groups[0].names]
+        made = replace(made, marker_reference_pose=source.marker_reference_pose[at])
+    return validated_recording(made)
 
 
 def synthesize_recording(
@@ -247,13 +250,6 @@ def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recordi
     assert group.std is not None
     std = np.concatenate([group.std, np.full((len(group.t), len(at), 3), np.median(group.std))], axis=1)
     return replace(group, names=(*group.names, *names), position=position, std=std)
-
-
-def _straight(made: Recording, source: Recording) -> Array | None:
-    """Positions of the first group's points while the object was held straight, if the source has them."""
-    if source.marker_reference_pose is None or not made.points or made.points[0].name != source.points[0].name:
-        return None
-    return source.marker_reference_pose[[source.points[0].names.index(name) for name in made.points[0].names]]
 
 
 def _joints(
