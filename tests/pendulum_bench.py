@@ -47,8 +47,7 @@ class Bench:
         if torque is not None:
             effort = effort + torque(t)
         measured = effort + noise * rng.standard_normal(effort.shape)
-        joints = JointGroup(JOINTS, t, path, effort=measured, effort_std=NOISE)
-        return Recording(joints, name=f"run_{seed}")
+        return Recording(JointGroup(JOINTS, t, path, effort=measured, effort_std=NOISE), name=f"run_{seed}")
 
     def problem(self, recordings, held_out=(), free=FREE, options: ProblemOptions | None = None) -> EstimationProblem:
         options = options or ProblemOptions(path_cutoff=float("inf"))
@@ -57,8 +56,7 @@ class Bench:
 
 @lru_cache(maxsize=1)
 def _bench(file: str) -> Bench:
-    tree = read_urdf(file)
-    system = System.build(tree, prescribed=JOINTS, damping=dict.fromkeys(JOINTS, 0.05))
+    system = System.build(read_urdf(file), prescribed=JOINTS, damping=dict.fromkeys(JOINTS, 0.05))
     return Bench(system, compile_step(system, TIME_STEP))
 
 

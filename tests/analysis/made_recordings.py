@@ -16,8 +16,7 @@ GRID = TimeGrid(10.0, 0.1, 20)
 
 
 def group(name="points_camera", names=("a", "b"), t=(10.0, 10.5, 11.0), std=2e-3, **more):
-    position = np.ones((len(t), len(names), 3))
-    return PointGroup(name, tuple(names), np.array(t), position, std, **more)
+    return PointGroup(name, tuple(names), np.array(t), np.ones((len(t), len(names), 3)), std, **more)
 
 
 def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):

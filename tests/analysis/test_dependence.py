@@ -187,8 +187,7 @@ def held_pendulum(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
     held = {"grasps": [Grasp("hand", "tip", "w_T1")], "prescribed": ["shoulder", "elbow"]}
-    system = System.build(robot, objects=[(rod, None, None)], **held)
-    return compile_step(system, 0.01, use_compiler=False)
+    return compile_step(System.build(robot, objects=[(rod, None, None)], **held), 0.01, use_compiler=False)
 
 
 def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder, held_pendulum):

@@ -291,8 +291,7 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
         free.problem.episodes[0], *free.problem.unpack_episode_unknowns(free.x, 0)
     )
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
-    tree = system.numeric_mechanism()
-    kinematics = forward_kinematics(tree, symbol)
+    kinematics = forward_kinematics(system.numeric_mechanism(), symbol)
     turn = kinematics.frame_pose(grasp.holder_frame).rotation.T @ kinematics.frame_pose(grasp.held_frame).rotation
     wanted = np.array(ca.Function("turn", [symbol], [turn])(start.state[: system.n_coordinates]))
     np.testing.assert_allclose(np.array(ca.DM(grasp.held_orientation)), wanted, atol=1e-9)

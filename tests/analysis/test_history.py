@@ -119,8 +119,7 @@ def test_each_run_is_tested_against_all_others_at_its_share_of_the_level():
 
 
 def test_the_run_that_stands_apart_is_the_one_to_distrust():
-    rng = np.random.default_rng(5)
-    runs = drawn(rng, [1.0, 2.0], 4)
+    runs = drawn(np.random.default_rng(5), [1.0, 2.0], 4)
     runs[2] = run("day2", runs[2].values + np.array([0.2, 0.0]))
     found = assess_drift_and_outlier_runs(runs)
     assert (outliers(found), drifted(found)) == (["day2"], ["a"])

@@ -634,8 +634,7 @@ def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):
     assert list(joint_excitation_issues([held, recording], asked, USUAL)) == []
     assert list(joint_excitation_issues([recording, held], asked, USUAL)) == []
     assert list(joint_excitation_issues([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
-    coarse = replace(USUAL, std=0.2)
-    (doubt,) = joint_excitation_issues([held, recording], asked, coarse)
+    (doubt,) = joint_excitation_issues([held, recording], asked, replace(USUAL, std=0.2))
     assert (doubt.recording, doubt.limit_violation_ratio) == ("run", pytest.approx(6 * 0.2 / 0.6, rel=1e-3))
 
 

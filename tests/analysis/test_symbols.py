@@ -25,10 +25,8 @@ def symbols(urdf_folder):
 
 
 def point(symbols):
-    rng = np.random.default_rng(3)
-    values = rng.uniform(0.2, 0.6, len(symbols.all_variable_names))
-    span = symbols.row_or_column_block_slice("theta")
-    values[span] = symbols.equations.system.parameters.vector() + 0.1
+    values = np.random.default_rng(3).uniform(0.2, 0.6, len(symbols.all_variable_names))
+    values[symbols.row_or_column_block_slice("theta")] = symbols.equations.system.parameters.vector() + 0.1
     values[symbols.all_variable_names.index("h")] = 0.02
     return values
 

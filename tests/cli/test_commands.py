@@ -366,8 +366,7 @@ def test_what_is_simulated_is_exported_and_imported(cli, pendulum_data, tmp_path
     assert cli("export", pendulum_data.folder / "estimate.h5", "--out", tmp_path / "csv").code == 0
     done = cli("import", next((tmp_path / "csv").glob("*.csv")), "--out", tmp_path / "back.h5")
     assert done.code == 0, done.err
-    back = read_recording(tmp_path / "back.h5", allow_nan_effort=True)
-    assert back.joint_names == ("shoulder", "elbow")
+    assert read_recording(tmp_path / "back.h5", allow_nan_effort=True).joint_names == ("shoulder", "elbow")
     assert "back.h5" in done.out
 
 
@@ -387,8 +386,7 @@ def asked(line, tmp_path):
     answer = tmp_path / "answer"
     asking = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(answer)}
     asking |= {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_COMP_WORDBREAKS": "\"'><=;|&(:"}
-    code = "import sys; from yid_ocp.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", code, "yid-ocp"]
+    command = [sys.executable, "-c", "import sys; from yid_ocp.cli import main; sys.exit(main())", "yid-ocp"]
     done = subprocess.run(command, env=os.environ | asking, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return {word.strip() for word in answer.read_text().splitlines()}

@@ -76,8 +76,7 @@ def fields_of(bag: Bag, kind: str, k: int) -> dict[str, Any]:
         values.append(bag.of("control_msgs/msg/InterfaceValue", ["force"], np.array([1.0])))
         return {"header": header, "joint_names": [*JOINTS, "sensor"], "interface_values": values}
     if kind == "lab_msgs/msg/Arm":
-        inner = bag.of("lab_msgs/msg/Inner", q, 3 * one, "x")
-        return {"state": inner, "temperature": 20.0}
+        return {"state": bag.of("lab_msgs/msg/Inner", q, 3 * one, "x"), "temperature": 20.0}
     duration = bag.of("builtin_interfaces/msg/Duration", 0, 0)
     point = "trajectory_msgs/msg/JointTrajectoryPoint"
     actual, desired, error = (

@@ -48,8 +48,7 @@ def swing(folder, name, seed, effects="[]"):
     empty = Recording(None, (PointGroup("points", ("w_beam",), t, np.zeros((161, 1, 3)), NOISE),))
     write_recording(empty, folder / "bare.h5")
     (folder / "beam.yaml").write_text(BEAM, encoding="utf-8")
-    run = load_config(folder / "beam.yaml", (f"model.effects={effects}",))
-    problem = build_problem(run)
+    problem = build_problem(load_config(folder / "beam.yaml", (f"model.effects={effects}",)))
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
     values = problem.unknowns.named_values(problem.unknown_vector({**TRUTH, **start}))
     theta, offset = problem.unpack_episode_unknowns(problem.unknown_vector(values), 0)

@@ -30,8 +30,7 @@ def robot(side: str):
     system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
     model = pin.buildModelFromUrdf(str(urdf_path_from_robot_name("package:baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
-    step = compile_step(system, TIME_STEP)
-    return names, step, pin.buildReducedModel(model, locked, pin.neutral(model))
+    return names, compile_step(system, TIME_STEP), pin.buildReducedModel(model, locked, pin.neutral(model))
 
 
 def recording(side: str, seed: int, extra) -> Recording:
@@ -90,5 +89,4 @@ def test_dry_friction_is_told_from_a_spring():
 
 
 def test_an_arm_as_the_model_says_has_no_gap():
-    finding = diagnosed("left", lambda names, q, v: np.zeros_like(q))
-    assert finding.verdict == "no_gap"
+    assert diagnosed("left", lambda names, q, v: np.zeros_like(q)).verdict == "no_gap"

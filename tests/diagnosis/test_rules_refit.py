@@ -188,8 +188,7 @@ def test_amplitudes_are_judged_together_as_a_load_is_known_that_each_of_them_cou
 def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatch):
     # of ten samples chi2 is above 23.2 in one of a hundred, and costs are half of it
     monkeypatch.setattr(type(FRICTION), "alternative_start", lambda self, start: {A: -start[A]}, raising=False)
-    cases = {11.5: (11.5, 0.75), 11.7: (5.0, -0.75), None: (5.0, -0.75)}
-    for first, (cost, value) in cases.items():
+    for first, (cost, value) in {11.5: (11.5, 0.75), 11.7: (5.0, -0.75), None: (5.0, -0.75)}.items():
         there = {0.75: first, -0.75: 5.0}
         problem = Problem(lambda values, there=there: there.get(values[A]))
         found = refit_with_effects(problem, [FRICTION], {"k": 2.0, A: 0.75})
@@ -341,8 +340,7 @@ def predicting(monkeypatch):
 
 
 def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
-    nan = math.nan
-    value, weight = [[1, 1], [2, nan], [3, 3], [4, 4], [5, 5]], [[1, 1], [2, 0], [1, 1], [1, 1], [1, 2]]
+    value, weight = [[1, 1], [2, math.nan], [3, 3], [4, 4], [5, 5]], [[1, 1], [2, 0], [1, 1], [1, 1], [1, 2]]
     group, more = measured([0.0, 0.49, 0.5, 0.99, 1.0], value, weight), measured([0.2], [[0, 0]], [[3, 3]])
     predicted = np.array([[2.0, 1.0], [3.0, 9.0], [3.0, 1.0], [4.0, 5.0], [6.0, 6.0]])
     outputs = SimpleNamespace(predicted_outputs=(predicted, np.array([[1.0, 2.0]])))

@@ -65,8 +65,7 @@ def overlaps(at):
     },
 )
 def test_shapes_are_tried_evenly_over_their_range(expected, count, values):
-    of = effect("branch@T1", amplitude(), shape("s", expected=expected))
-    found = _shape_grid(of, count)
+    found = _shape_grid(effect("branch@T1", amplitude(), shape("s", expected=expected)), count)
     assert [entry["branch@T1.s"] for entry in found] == pytest.approx(values)
     assert all(len(entry) == 1 for entry in found)
 
@@ -250,8 +249,7 @@ def test_a_score_is_that_of_the_lagrange_multiplier_test():
 def test_stated_priors_scatter_as_stated_where_they_decide_a_score():
     """A load that the uncertain mass of a link imitates shows in the prior of that mass more than in the data."""
     x, r = np.array([0.1, -0.1, 0.1, 5.0]), np.array([0.1, 0.2, -0.1, -0.8])
-    at = point(r, signature(TWO_SIDED, x, noise=1e-9, priors=25.0))
-    [found] = scored(at, range(3))
+    [found] = scored(point(r, signature(TWO_SIDED, x, noise=1e-9, priors=25.0)), range(3))
     assert found.lm_statistic == pytest.approx(float(x @ r) ** 2 / 25.0, rel=1e-2)
 
 

@@ -37,8 +37,7 @@ def loads(folder):
 
 
 def test_the_bare_run_gives_the_modulus_that_others_found(bare):
-    entry = bare.output.parameters["beam.bend"]
-    assert entry.value / SECOND_MOMENT == pytest.approx(264e3, rel=0.08)
+    assert bare.output.parameters["beam.bend"].value / SECOND_MOMENT == pytest.approx(264e3, rel=0.08)
     assert bare.output.goodness_of_fit.explains
     assert max(channel["rmse"] for channel in bare.result["residuals"].values()) < 3e-4
 
@@ -49,8 +48,7 @@ def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, 
         run = load_config(repository / "configs" / "soft_beam.yaml", (*QUIET, *said))
         finding = run_diagnose(run, tmp_path / f"load{i}").output
         assert finding.accepted_effects[0].label == "point_mass@w_beam"
-        found = finding.final_model.values["point_mass@w_beam.mass"]
-        assert found == pytest.approx(mass, rel=0.1)
+        assert finding.final_model.values["point_mass@w_beam.mass"] == pytest.approx(mass, rel=0.1)
         assert finding.counterfactual is not None
         # of a swing of 9 mm; without a diagnosis it is as little or 11 mm, by where the nominal fit ends
         [(_, without)] = finding.counterfactual.effects_removed.rmse_by_unit.values()

@@ -188,8 +188,7 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
 
 def test_what_parameters_are_unsure_of_is_no_gap(step):
     """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
-    made = composed(step, True)
-    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
+    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), composed(step, True))
     spread = noise_only_covariance_sqrt(fit.problem, fit.evaluation)
     off = fit.problem.unknown_vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     moved = replace(fit, values=fit.problem.unknowns.named_values(off))

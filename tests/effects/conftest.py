@@ -90,8 +90,7 @@ class Bench:
         self.torque = self.rest.holding_torque + size * np.sin(30 * t[:-1] + 1)
         self.path = POSTURE + 0.03 * np.sin(25 * t + np.arange(3)) - 0.03 * np.sin(np.arange(3))
         self.path = self.path[:, : len(system.prescribed)]
-        rng = np.random.default_rng(3)
-        self.kick = 1e-3 * rng.normal(size=system.n_coordinates)
+        self.kick = 1e-3 * np.random.default_rng(3).normal(size=system.n_coordinates)
 
     def step(self, *effects: EffectBase) -> Step:
         return compile_step(self.system.with_effects(effects), H, use_compiler=False)
@@ -115,8 +114,7 @@ class Bench:
         directions = SensitivityDirections(tuple(names), np.zeros((len(begin), len(names)))) if names else None
         count = steps or self.steps
         inputs = self.torque[:count], self.path[: count + 1]
-        rollout = simulate(step, theta, begin, count, *inputs, directions=directions)
-        return Run(step, theta, begin, rollout)
+        return Run(step, theta, begin, simulate(step, theta, begin, count, *inputs, directions=directions))
 
     def nominal_part(self, run: Run) -> np.ndarray:
         """Coordinates and momenta of the joints that the nominal model has."""

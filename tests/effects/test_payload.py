@@ -159,8 +159,7 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
 )
 def test_a_search_begins_with_the_other_sign_too(mass, moments, other) -> None:
     effect = make_effect("payload", "hand", arm())
-    start = dict(zip(effect.parameters.names, (mass, *moments), strict=True))
-    found = effect.alternative_start(start)
+    found = effect.alternative_start(dict(zip(effect.parameters.names, (mass, *moments), strict=True)))
     assert found == (None if other is None else {"payload@hand.mass": pytest.approx(other)})
 
 
@@ -196,8 +195,7 @@ def test_ranges_of_strong_joints_follow_their_limits() -> None:
     strong = replace(system, mechanism=replace(system.mechanism, joints=joints))
     assert [effort_limit_ratio_to_baxter(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
     for kind in ("joint_coulomb", "joint_presliding"):
-        tau_c = make_effect(kind, "j0", strong).definitions[0]
-        assert tau_c.upper == pytest.approx(0.2 * 300.0)
+        assert make_effect(kind, "j0", strong).definitions[0].upper == pytest.approx(0.2 * 300.0)
         assert make_effect(kind, "j1", strong).definitions[0] == make_effect(kind, "j1", system).definitions[0]
     for kind in ("joint_viscous", "joint_stribeck", "joint_spring", "rotor_inertia", "effort_offset"):
         first, plain = (make_effect(kind, "j0", s).definitions[0] for s in (strong, system))

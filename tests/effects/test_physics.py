@@ -70,8 +70,7 @@ def turning(rate: float, steps: int = 8, angle: float = 0.0) -> np.ndarray:
 def swing(system, effects, angle: float, steps: int):
     """Free motion of an undriven system from a bent start: the bent joint's angle, shape (steps + 1,)."""
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
-    sizes = step.sizes
-    start = np.zeros(sizes["nx"])
+    start = np.zeros(step.sizes["nx"])
     index = step.system.mechanism.joint_index("T1_0_y")
     start[index] = angle
     rollout = simulate(step, step.system.parameters.vector(), start, steps)
@@ -186,8 +185,7 @@ def rest_of(system: System, *effects):
 
 def test_a_mount_is_a_spring_in_series() -> None:
     system = link(gravity=(0.3, 0, 0), prescribed=())
-    effect = make_effect("mount_compliance", "base", system, {"stiffness": 12.0})
-    step, rest = rest_of(system, effect)
+    step, rest = rest_of(system, make_effect("mount_compliance", "base", system, {"stiffness": 12.0}))
     names = step.system.mechanism.joint_names
     assert names == ("mount_compliance@base_x", "mount_compliance@base_y", "T1_0_x", "T1_0_y", "T1_0_z")
     mount, bend = rest.state[1], rest.state[3]
@@ -356,8 +354,7 @@ def test_a_resting_joint_is_as_stiff_as_the_friction_before_it_yields() -> None:
 
 def test_where_it_begins_is_estimated_with_every_recording() -> None:
     system = hinge()
-    effect = make_effect("joint_presliding", "left_a", system)
-    whole = system.with_effects([effect])
+    whole = system.with_effects([make_effect("joint_presliding", "left_a", system)])
     theta, options = whole.parameters.vector(), ProblemOptions()
     assert estimated_initial_state_names(whole, options, (), theta) == ()
     [name] = estimated_initial_state_names(whole, options, ("joint_presliding@left_a.tau_c",), theta)
@@ -422,8 +419,7 @@ def test_cameras_see_points_elsewhere() -> None:
 
 
 def test_latency_belongs_to_cameras_and_late_torque_to_arms() -> None:
-    system = hinge("driven")
-    late = make_effect("effort_delay", "left", system, {"delay": 0.03})
+    late = make_effect("effort_delay", "left", hinge("driven"), {"delay": 0.03})
 
     def seconds(effect, channel: str, camera: bool = False) -> float:
         values = ca.DM([p.value for p in effect.parameters])
@@ -433,8 +429,7 @@ def test_latency_belongs_to_cameras_and_late_torque_to_arms() -> None:
     assert seconds(late, "torque.left_a") == 0.03
     assert seconds(late, "joints.effort.left_a") == -0.03
     assert seconds(late, "joints.position.left_a") == seconds(late, "torque.right_a") == 0.0
-    tube = link(prescribed=())
-    latency = make_effect("camera_latency", "camera", tube, {"delay": 0.05})
+    latency = make_effect("camera_latency", "camera", link(prescribed=()), {"delay": 0.05})
     assert seconds(latency, "points_camera.w_T1", True) == 0.05
     assert seconds(latency, "points_mocap.w_T1", False) == 0.0
 

@@ -191,8 +191,7 @@ def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
-        step = compile_step(one, H, use_compiler=False)
-        found = EstimationProblem(step, [made], ("parent.bend",), options)
+        found = EstimationProblem(compile_step(one, H, use_compiler=False), [made], ("parent.bend",), options)
         result = found.evaluate(found.initial_unknowns)
         assert result.ok, result.message
         residuals.append(np.column_stack([result.residual, result.jacobian]))
@@ -317,8 +316,7 @@ def test_at_neutral_parameters_they_change_nothing(mode, benches, all_effects, s
     assert full.rollout.status.newton_iterations <= 1.5 * plain.rollout.status.newton_iterations
     assert largest(bench.nominal_part(full) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
     assert largest(full.rollout.multipliers - plain.rollout.multipliers, plain.rollout.multipliers) < 1e-10
-    watched = [sensors.camera, sensors.arm] + ([sensors.effort] if mode == "prescribed" else [])
-    for sensor in watched:
+    for sensor in [sensors.camera, sensors.arm] + ([sensors.effort] if mode == "prescribed" else []):
         nominal = bench.reading(plain, sensor)
         assert largest(bench.reading(full, sensor) - nominal, nominal) < 1e-10
 

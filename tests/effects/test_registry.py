@@ -60,8 +60,7 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     for kind in EFFECTS:
         row = next(cells for name, cells in table.items() if kind in map(str.strip, name.split(",")))
         system, place = places[kind]
-        effect = make_effect(kind, place, system)
-        for quantity in effect.definitions:
+        for quantity in make_effect(kind, place, system).definitions:
             name, _ = quantity.reported_name_and_unit
             name = "bias per component" if kind == "sensor_bias" else name
             assert re.search(rf"\b{name}\b", row[2]), f"{kind}: {name} not in {row[2]}"

@@ -44,8 +44,7 @@ def arguments(step, seed=0):
     """Values of `rows`' arguments: any state, any parameters near their own."""
     rng = np.random.default_rng(seed)
     values = [rng.uniform(-0.5, 0.5, x.numel()) for x in step.equations.arguments[:7]]
-    theta = step.system.parameters.vector() * rng.uniform(0.9, 1.1, step.sizes["ntheta"])
-    return [*values, theta, 0.01]
+    return [*values, step.system.parameters.vector() * rng.uniform(0.9, 1.1, step.sizes["ntheta"]), 0.01]
 
 
 def loaded(folder, name):

@@ -149,8 +149,7 @@ def test_a_diagnosis_says_what_it_could_not_explain(tmp_path, cli):
         points["t"], points["measured"], points["before"], points["after"] = np.arange(6.0), seen, before, after
         event = file.create_group("events/b/elbow")
         event["t"], event["value"] = np.arange(3.0), np.array([0.0, 2.0, 0.0])
-    done = cli("export", run, "--format", "mcap", "--out", tmp_path / "out", "--json")
-    told = json.loads(done.out)
+    told = json.loads(cli("export", run, "--format", "mcap", "--out", tmp_path / "out", "--json").out)
     assert {path.rpartition("/")[2] for path in told["file"]} == {"a.mcap", "b.mcap"}
     assert told["notes"] == []
     found = read(tmp_path / "out" / "a.mcap")

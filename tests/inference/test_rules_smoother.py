@@ -213,8 +213,7 @@ def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch
 
 
 def test_noise_alone_takes_nothing_in(monkeypatch):
-    models = [made(9, size=np.zeros(3), loose=0.0)]
-    found = smoothed(monkeypatch, models)
+    found = smoothed(monkeypatch, [made(9, size=np.zeros(3), loose=0.0)])
     assert found.plant_or_sensor_origin == "none"
     assert not any(found.group_variance.values())
     assert found.log_evidence_drop == NOTHING

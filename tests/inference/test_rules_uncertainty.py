@@ -118,8 +118,7 @@ WIDE = [([[2.0, 0]], (0.25, None)), ([[0, 2.0]], (None, 0.25)), (np.zeros((0, 2)
 
 @pytest.mark.parametrize(("matrix", "known"), [*TALL, *WIDE])
 def test_what_the_data_do_not_inform_gets_a_huge_variance_in_units_of_its_size(matrix, known):
-    problem = MadeUp(linear(matrix), (3.0, 50.0))
-    covariance, _ = judged(problem)
+    covariance, _ = judged(MadeUp(linear(matrix), (3.0, 50.0)))
     for i, (variance, size) in enumerate(zip(known, (3.0, 50.0), strict=True)):
         assert covariance[i, i] == pytest.approx(variance if variance is not None else (1e8 * size) ** 2, rel=1e-9)
     assert covariance[0, 1] == pytest.approx(0.0, abs=1e-6 * np.sqrt(covariance[0, 0] * covariance[1, 1]))
@@ -299,8 +298,7 @@ def saturating(top):
 def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, kept):
     problem = MadeUp(saturating(top), lower=-np.inf, scales=(1.0,), priors={"k0": 100.0})
     x = np.zeros(1)
-    found = problem.evaluate(x)
-    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, found)
+    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, problem.evaluate(x))
     # at 1.96 standard deviations the cost is that of a saturated prediction: 0.5^2 in place of 3.84
     said = [estimated(problem, x, covariance, fit)["k0"].std for fit in (GOOD, None)]
     assert said == [pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01), 1.0]
@@ -491,8 +489,7 @@ def test_more_than_noise_is_sure_among_all_tests_and_worth_a_word(tests, said):
 
 
 def test_what_other_errors_did_is_whitened_and_the_rest_left_as_it_is():
-    rng = np.random.default_rng(0)
-    spread = rng.standard_normal((7, 3)) * [0.1, 3.0, 1e6]
+    spread = np.random.default_rng(0).standard_normal((7, 3)) * [0.1, 3.0, 1e6]
     root = np.array([whiten_with_extra_errors(unit, spread) for unit in np.eye(7)])
     np.testing.assert_allclose(root @ (np.eye(7) + spread @ spread.T) @ root.T, np.eye(7), atol=1e-4)
     spread = np.array([[2.0], [0.0], [0.0]])

@@ -85,8 +85,7 @@ def test_a_batch_is_its_members_one_by_one(parts, urdf_folder, monkeypatch, name
     assert all(rollout.status.is_converged for rollout in single)
     calls = watched(monkeypatch, case.step.kernel)
     for some in (members, [replace(member, directions=None) for member in members]):
-        together = case.step.kernel.rollout_batch(some)
-        for one, member, other in zip(together, some, single, strict=True):
+        for one, member, other in zip(case.step.kernel.rollout_batch(some), some, single, strict=True):
             expected = other if member.directions is not None else alone(case, member)
             assert_same(one, expected, TOLERANCE)
             # at a tolerance of 1e-14 rounding decides about the last iteration

@@ -282,8 +282,7 @@ def test_values_at_every_point(use_compiler, monkeypatch):
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     sparse = ca.SX(3, 4)
     sparse[0, 1], sparse[2, 3] = x[0] * y[1], 7
-    dense = x @ y.T
-    function = ca.Function("products", [x, y], [dense, sparse, ca.SX(0, 2)])
+    function = ca.Function("products", [x, y], [x @ y.T, sparse, ca.SX(0, 2)])
     points, shared = np.arange(12.0).reshape(4, 3), np.array([2.0, 5.0])
     one, two, none = MappedFunction(function, shared_inputs=(1,), use_compiler=use_compiler)(points, shared)
     np.testing.assert_array_equal(one, points[:, :, None] * shared)

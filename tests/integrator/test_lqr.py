@@ -136,8 +136,7 @@ def moved(step, values=None, remembered=0.6):
     time = np.arange(STEPS) * TIME_STEP
     torque = np.stack([3.0 * np.sin(2 * time), np.cos(3 * time)], axis=1)
     internal = np.full(step.sizes["nz"], remembered)
-    start = np.concatenate([[0.3, -0.2, 0.0, 0.0], internal])
-    swung = simulate(step, theta, start, STEPS, torque)
+    swung = simulate(step, theta, np.concatenate([[0.3, -0.2, 0.0, 0.0], internal]), STEPS, torque)
     assert swung.status.is_converged
     return step, theta, (swung.state, torque, internal), EffectMomentumCalculator(step)
 

@@ -126,8 +126,7 @@ def test_without_compliance_a_coordinate_stays_at_zero(parts, roll):
     system = parts.cable(effects=[parts.soft_joint("C_1_y", 0.0)])
     assert system.mechanism.joint_index("C_1_y") == index
     step = compile_step(system, 1e-3)
-    theta = system.parameters.vector()
-    rollout = roll(step, theta, q, np.zeros(9), 200)
+    rollout = roll(step, system.parameters.vector(), q, np.zeros(9), 200)
     assert rollout.status.is_converged, rollout.status.message
     # exactly in compiled code, whose elimination does not pivot
     assert np.max(np.abs(rollout.state[:, [index, 9 + index]])) <= (0.0 if step.is_compiled else 1e-18)

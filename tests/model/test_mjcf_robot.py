@@ -132,8 +132,7 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     assert [joint.effort_limit for joint in mechanism.joints[:2]] == [87, 40]
     assert mechanism.joints[0].upper_limit == 2.5
     assert "tcp" in mechanism.frames
-    locked = read_urdf(file, joints=["joint1", "joint2"])
-    assert locked.joint_names == ("joint1", "joint2")
+    assert read_urdf(file, joints=["joint1", "joint2"]).joint_names == ("joint1", "joint2")
     with caplog.at_level(logging.WARNING):
         file.write_text(MODELS["rail with references"])
         read_urdf(file)

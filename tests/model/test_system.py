@@ -75,8 +75,7 @@ def test_grasp_equations(kind, count):
     system = System.build(tree, grasps=[grasp])
     assert grasp.n_constraint_equations == system.n_constraints == count
     # `two` turned as Rx Ry Rz, its origin 0.05 m ahead of the grasped point along its own z
-    ry = np.arcsin(turn[0, 2])
-    angles = [np.arctan2(-turn[1, 2], turn[2, 2]), ry, np.arctan2(-turn[0, 1], turn[0, 0])]
+    angles = [np.arctan2(-turn[1, 2], turn[2, 2]), np.arcsin(turn[0, 2]), np.arctan2(-turn[0, 1], turn[0, 0])]
     q = np.concatenate([np.zeros(6), np.array([0.1, 0.2, 0.3]) + 0.05 * turn[:, 2], angles])
 
     def residual(q):

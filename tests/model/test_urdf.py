@@ -61,8 +61,7 @@ def assert_equal_mechanisms(one, two, tolerance=1e-12):
 
 
 def test_kept_joints_in_the_order_given(urdf_folder):
-    names = ["swing", "nod", "slide", "spin"]
-    robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=names)
+    robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=["swing", "nod", "slide", "spin"])
     # parents come first, the rest as given
     assert robot.joint_names == ("slide", "swing", "nod", "spin")
     assert [joint.parent_index for joint in robot.joints] == [-1, 0, 1, 0]
@@ -114,8 +113,7 @@ def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
     "robot", ["package:baxter", "package:panda", "package:ur5", "package:so101", "mixed_joints", "turntable"]
 )
 def test_urdf_round_trip(robot, urdf_folder, tmp_path):
-    source = robot if robot.startswith("package:") else urdf_folder / f"{robot}.urdf"
-    mechanism = read_urdf(source)
+    mechanism = read_urdf(robot if robot.startswith("package:") else urdf_folder / f"{robot}.urdf")
     path = tmp_path / "again.urdf"
     path.write_text(mechanism_to_urdf(mechanism), encoding="utf-8")
     again = read_urdf(path).with_numeric_values()

@@ -134,8 +134,7 @@ def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
 
 
 def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, found):
-    top = np.abs(found.joint_accelerations).max()
-    bound = 0.8 * top
+    bound = 0.8 * np.abs(found.joint_accelerations).max()
     calm = plan_motion_to_target(moved, replace(wanted, duration=0.8, limits=PlanLimits(max_acceleration=bound)))
     assert calm.is_successful, calm.message
     assert np.abs(calm.joint_accelerations).max() <= bound * 1.001

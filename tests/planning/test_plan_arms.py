@@ -120,8 +120,7 @@ def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit,
 
 
 def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):
-    file = repository / "configs" / "deft_bdlo1.yaml"
-    run = load_config(file)
+    run = load_config(repository / "configs" / "deft_bdlo1.yaml")
     if not resolve_default_recording(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, point_target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"

@@ -98,8 +98,7 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
 
     file = outcome.folder / "recording.h5"
     planned = read_recording(file)
-    again = load_config(config, [f"recordings.estimate=[{file}]"])
-    done = run_simulate(again, tmp_path / "again")
+    done = run_simulate(load_config(config, [f"recordings.estimate=[{file}]"]), tmp_path / "again")
     assert done.is_successful, done.result["message"]
     np.testing.assert_allclose(done.output.points[0].position, planned.points[0].position, atol=1e-6)
 
@@ -150,8 +149,7 @@ def test_a_run_that_failed_and_one_of_another_command_are_refused(config, tmp_pa
 
 
 def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
-    more = {"point_mass@tip.mass": {"value": 0.1, "free": True}}
-    folder = solved(tmp_path / "solved", 4.0, 0.1, **more)
+    folder = solved(tmp_path / "solved", 4.0, 0.1, **{"point_mass@tip.mass": {"value": 0.1, "free": True}})
     chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run_folder={folder}")
     assert main(list(chosen)) == 2
     told = capsys.readouterr().err

@@ -227,8 +227,7 @@ REPEATS = 60
 @pytest.fixture(scope="module")
 def efforts_of(urdf_folder):
     """efforts_of(effort, cutoff): both joints moved as measured for six seconds at 100 Hz, their efforts measured."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, prescribed=JOINTS, damping=0.1)
+    system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), prescribed=JOINTS, damping=0.1)
     steps = {h: compile_step(system, h, use_compiler=h == 0.01) for h in (0.02, 0.01, 0.005, 0.0025)}
     t = 0.01 * np.arange(601)
     path = np.stack([0.6 * np.sin(2.9 * t), 0.5 * np.sin(3.7 * t + 1)], axis=1)

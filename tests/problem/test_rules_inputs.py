@@ -210,8 +210,7 @@ def test_a_transported_clamp_does_not_turn_about_its_axis():
     steps = 400
     angle = np.linspace(0.0, 2 * np.pi, steps + 1)
     direction = np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), np.ones(steps + 1)], axis=1)
-    t = np.linspace(0.0, 1.0, steps + 1)
-    made = clamped(np.zeros((steps + 1, 3)), direction, t)
+    made = clamped(np.zeros((steps + 1, 3)), direction, np.linspace(0.0, 1.0, steps + 1))
     path = path_of(made, TimeGrid(0.0, 1.0 / steps, steps))
     frames = Rotation.from_euler("XYZ", path[:, 3:])
     turns = (frames[:-1].inv() * frames[1:]).as_rotvec()

@@ -46,8 +46,7 @@ def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
 
 
 def test_hubers_loss_is_square_first_and_then_straight():
-    residual = np.array([-1.0, 2.0, 3.0, -8.0, 0.0])
-    cost, factor = huber_loss_and_sqrt_weights(residual, 2.0)
+    cost, factor = huber_loss_and_sqrt_weights(np.array([-1.0, 2.0, 3.0, -8.0, 0.0]), 2.0)
     assert cost == pytest.approx(0.5 + 2.0 + 2.0 * (3.0 - 1.0) + 2.0 * (8.0 - 1.0))
     assert factor == pytest.approx([1.0, 1.0, math.sqrt(2 / 3), 0.5, 1.0])
     for scale, cost, factor in ((math.inf, 0.5e12, 1.0), (0.0, 0.0, 0.0)):

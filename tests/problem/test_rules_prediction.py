@@ -143,8 +143,7 @@ def test_an_elastic_gear_gives_under_the_recorded_effort(urdf_folder):
     problem = problem_of(urdf_folder, "prescribed gears", seeds=(1,))
     episode = problem.episodes[0]
     values = {"series_elasticity@shoulder.compliance": 0.004, "backlash@shoulder.width": 0.0}
-    theta = problem.system.parameters.vector(values)
-    inputs = problem.predictor.corrected_inputs(episode, theta, ())
+    inputs = problem.predictor.corrected_inputs(episode, problem.system.parameters.vector(values), ())
     effort = episode.recording.joints.effort
     np.testing.assert_allclose(episode.joint_loads, effort, atol=1e-12)
     np.testing.assert_allclose(inputs.prescribed_path, episode.prescribed_path - 0.004 * effort, atol=1e-12)
@@ -176,8 +175,7 @@ def keeps_inputs(made) -> bool:
 
 
 def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
-    plain = problem_of(urdf_folder, "free", seeds=(1,))
-    assert keeps_inputs(plain)
+    assert keeps_inputs(problem_of(urdf_folder, "free", seeds=(1,)))
     for case in ("prescribed", "prescribed gears", "driven", "driven, filtered", "robust"):
         assert not keeps_inputs(problem_of(urdf_folder, case, seeds=(1,))), case
     neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.inverse": 1.0}
@@ -358,8 +356,7 @@ def test_predicted_efforts_have_the_noise_of_encoders_in_them(urdf_folder, posit
     step = pendulum_step(urdf_folder, prescribed=("shoulder",))
     made = taken(step, 1)
     made = replace(made, joints=replace(made.joints, position_std=position_std))
-    sensors = {"joints.position": SensorOptions(std=stated)}
-    options = ProblemOptions(path_cutoff=math.inf, sensors=sensors)
+    options = ProblemOptions(path_cutoff=math.inf, sensors={"joints.position": SensorOptions(std=stated)})
     problem = EstimationProblem(step, [made], ("elbow.damping",), options)
     effort = next(s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     # a second difference of white noise is larger by the root of 1 + 4 + 1

@@ -54,8 +54,7 @@ def test_unknowns_are_shared_ones_then_those_of_every_recording():
 
 
 def test_blocks_and_values_find_their_places():
-    block = np.arange(10.0).reshape(2, 5)
-    wide = LAYOUT.scatter_to_unknown_columns(block, 1)
+    wide = LAYOUT.scatter_to_unknown_columns(np.arange(10.0).reshape(2, 5), 1)
     np.testing.assert_array_equal(wide[1], [5, 6, 0, 0, 0, 7, 8, 9])
     packed = LAYOUT.pack_same_for_all_recordings({"a": 1, "b": 2, "l": 3}.get, np.array([4, 5]))
     assert packed.tolist() == [1, 2, 3, 4, 5, 3, 4, 5]
@@ -111,8 +110,7 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
 
 def test_stated_priors_are_gaussian_about_the_start(make):
     problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_geometric_std=0.0)
-    x = np.array([7.0, 4.0, 0.14])
-    residual, rows = problem.priors.residual_and_jacobian(x)
+    residual, rows = problem.priors.residual_and_jacobian(np.array([7.0, 4.0, 0.14]))
     np.testing.assert_allclose(residual, [2.0, 2.0])
     np.testing.assert_allclose(rows, [[0.0, 2.0, 0.0], [0.0, 0.0, 50.0]])
     assert problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start == 2
@@ -121,8 +119,7 @@ def test_stated_priors_are_gaussian_about_the_start(make):
 
 def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
     problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_geometric_std=10.0)
-    x = np.array([7.0, 30.0, 0.5])
-    residual, rows = problem.priors.residual_and_jacobian(x)
+    residual, rows = problem.priors.residual_and_jacobian(np.array([7.0, 30.0, 0.5]))
     np.testing.assert_allclose(residual, [0.5, 1.0])
     np.testing.assert_allclose(rows, [[0.5, 0.0, 0.0], [0.0, 1 / (math.log(10.0) * 30.0), 0.0]])
     assert problem.positive_unknowns_mask.tolist() == [True, True, False]

@@ -65,8 +65,7 @@ def test_what_the_points_leave_open_has_the_least_elastic_energy(step, std, soft
 
 
 def test_known_joints_stay_where_they_are_known_to_be(urdf_folder):
-    driven = pendulum_step(urdf_folder, driven=("shoulder",))
-    found = solved(driven, [at(0, [0.5, -0.4])], posture=[0.5])
+    found = solved(pendulum_step(urdf_folder, driven=("shoulder",)), [at(0, [0.5, -0.4])], posture=[0.5])
     np.testing.assert_allclose(found.state[:2], [0.5, -0.4], atol=1e-4)
     prescribed = pendulum_step(urdf_folder, prescribed=("shoulder",))
     path = 0.5 + 0.1 * np.arange(30.0)[:, None]
@@ -78,8 +77,7 @@ def test_known_joints_stay_where_they_are_known_to_be(urdf_folder):
 def test_a_joint_without_a_spring_is_held_a_little(urdf_folder):
     loose = pendulum_step(urdf_folder, driven=("elbow",))
     hidden = measured(points("lower"), [0], [0.0], [elbow([0.3, 0.0])], np.full((1, 3), 1e3))
-    found = solved(loose, [hidden], posture=[0.7])
-    np.testing.assert_allclose(found.state[:2], [0.3, 0.7], atol=1e-4)
+    np.testing.assert_allclose(solved(loose, [hidden], posture=[0.7]).state[:2], [0.3, 0.7], atol=1e-4)
 
 
 def test_two_frames_give_a_velocity_and_the_start_before_the_first(step, momentum):
@@ -117,8 +115,7 @@ def test_frames_count_at_their_nearest_node_and_hidden_ones_do_not(step):
 def test_a_rate_that_points_leave_open_is_small(step, momentum):
     """Three radians a second are one standard deviation."""
     q = np.array([0.6, -0.9])
-    vague = at([0, 2], [q, q + 0.1], std=0.05)
-    found = solved(step, [vague])
+    found = solved(step, [at([0, 2], [q, q + 0.1], std=0.05)])
     rows = [at(0, q, std=0.05), at(0, q + 0.1, std=0.05)]
     first = solved(step, rows[:1]).state[:2]
 
@@ -189,8 +186,7 @@ def test_the_points_of_a_start_may_have_a_noise_of_their_own(step):
     misses = [np.linalg.norm(tip(q) - problem.episodes[0].measurements[0].value[0]) for q in states]
     assert misses[1] < misses[0]
     again = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), sharp)
-    weight = np.full((25, 3), 1e4)
-    exact = replace(again.episodes[0].measurements[0], weight=weight)
+    exact = replace(again.episodes[0].measurements[0], weight=np.full((25, 3), 1e4))
     np.testing.assert_allclose(states[1], solved(step, [exact], 0.01).state[:2], atol=1e-9)
 
 

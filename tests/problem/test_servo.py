@@ -123,8 +123,7 @@ def test_a_controller_that_carries_the_arm_leaves_no_sag(urdf_folder) -> None:
 def test_a_servo_far_stiffer_than_the_step_is_stable(step) -> None:
     stiff = {f"{joint}.servo_gain": 1e6 for joint in PENDULUM} | {f"{joint}.servo_damping": 2e3 for joint in PENDULUM}
     theta = step.system.parameters.vector(VALUES | stiff | {f"{joint}.servo_torque_limit": 1e5 for joint in PENDULUM})
-    command = np.tile([0.5, 0.5], (60, 1))
-    run = simulate(step, theta, np.zeros(step.sizes["nx"]), 60, command)
+    run = simulate(step, theta, np.zeros(step.sizes["nx"]), 60, np.tile([0.5, 0.5], (60, 1)))
     assert run.status.is_converged
     assert np.abs(run.state[:, :2]).max() < 1.1
     np.testing.assert_allclose(run.state[-1, :2], 0.5, atol=2e-3)
@@ -157,8 +156,7 @@ def test_slopes_are_those_of_differences(urdf_folder, commands, period) -> None:
 
 
 def test_nothing_drives_it_wrong_and_no_filter_follows_its_encoders(step) -> None:
-    made = problem_of(step, commanded(), ["shoulder.servo_gain"])
-    [episode] = made.episodes
+    [episode] = problem_of(step, commanded(), ["shoulder.servo_gain"]).episodes
     assert episode.tracking_feedback is None
     assert episode.input_errors is None
     assert [samples.sensor.group_name for samples in episode.measurements] == ["joints.position"]

@@ -119,8 +119,7 @@ def test_frames_and_their_jacobians(twin):
     frames, poses, jacobians, _ = twin.functions()
     data = twin.model.createData()
     for q, _, _ in states(twin, 3, seed=1):
-        at = twin.configuration(q)
-        pin.computeJointJacobians(twin.model, data, at)
+        pin.computeJointJacobians(twin.model, data, twin.configuration(q))
         pin.updateFramePlacements(twin.model, data)
         for name, pose, jacobian in zip(frames, poses.call([q]), jacobians.call([q]), strict=True):
             assert twin.model.existFrame(name) or name == "object_root"

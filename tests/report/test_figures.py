@@ -202,8 +202,7 @@ def test_what_acts_is_where_it_acts(single_arm):
     n, t = single_arm.n_coordinates, np.array([0.0, 1.0, 2.0])
     q = np.random.default_rng(0).uniform(-0.4, 0.4, size=(3, n))
     push = np.arange(9.0).reshape(3, 3)
-    places = ("T1", "left_e0", "left", "camera_group")
-    acting = [(f"on {place}", place, "N", push) for place in places]
+    acting = [(f"on {place}", place, "N", push) for place in ("T1", "left_e0", "left", "camera_group")]
     told = ConfigurationTrajectory("p", single_arm, single_arm.parameters.vector(), t, q, acting)
     [motion] = animation_of_trajectories("a", [told]).motions
     at = {label: (k, values) for label, k, _, values in motion.acting}

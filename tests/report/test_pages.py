@@ -131,8 +131,7 @@ def test_a_failed_solve_gets_no_verdicts(solved_pendulum, tmp_path):
 
 
 def test_sections_may_have_nothing_to_say():
-    empty = ReportData("x", "", {"format": "other/1"})
-    assert render_sections(empty, environment=None) == []
+    assert render_sections(ReportData("x", "", {"format": "other/1"}), environment=None) == []
 
 
 def test_a_new_section_is_a_file_and_a_template(solved_pendulum, tmp_path, monkeypatch):

@@ -163,8 +163,7 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
     said = "these estimates change by more than their standard deviation"
     at = lines.index(f"with twice the links {said}: p.a by -5.5 (± 0.073 from the data)")
-    same = "with half the time step no estimate changes by more than its standard deviation"
-    assert lines[at + 1] == same
+    assert lines[at + 1] == "with half the time step no estimate changes by more than its standard deviation"
     assert lines.index("it snaps") < at
     moved = {name: own | {"links": None} for name, own in moved.items()}
     assert not any("twice the links" in line for line in told("yid-solve/1", solved(discretisation=moved)))

@@ -93,8 +93,7 @@ def test_encoders_are_as_noisy_however_often_currents_are_read(step, made):
 
 
 def test_a_synthetic_recording_holds_currents(step, made):
-    problem = problem_of(step, made)
-    again = problem.simulate_synthetic_recording(TRUTH, seed=1)
+    again = problem_of(step, made).simulate_synthetic_recording(TRUTH, seed=1)
     [motors] = again.channel_groups
     assert (motors.name, motors.names) == ("motors_left", PENDULUM)
     assert motors.values_by_quantity["current"].shape == (401, 2)
@@ -105,8 +104,7 @@ def test_a_synthetic_recording_holds_currents(step, made):
 
 def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, made):
     write_recording(made, tmp_path / "run.h5")
-    again = read_recording(tmp_path / "run.h5")
-    [one], [other] = made.channel_groups, again.channel_groups
+    [one], [other] = made.channel_groups, read_recording(tmp_path / "run.h5").channel_groups
     for field in ("name", "names", "noise_and_bias_stds_by_attribute", "clock"):
         assert getattr(one, field) == getattr(other, field)
     np.testing.assert_array_equal(one.values_by_quantity["current"], other.values_by_quantity["current"])

@@ -160,8 +160,7 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.5)
     system = problem.system
     entries = Parameters(replace(p, upper=15.0) if p.name == "T1.bend" else p for p in system.parameters)
-    narrow = replace(system, parameters=entries)
-    step = compile_step_like(problem.step, narrow)
+    step = compile_step_like(problem.step, replace(system, parameters=entries))
     problem = EstimationProblem(step, [recording], problem.free, problem.options)
     for solver in (GaussNewton(), SingleShooting(), CONDENSED):
         solution = fit_problem(problem, solver)

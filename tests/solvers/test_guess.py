@@ -142,8 +142,7 @@ def test_an_amplitude_seen_at_its_neutral_value_begins_there_and_one_given_at_it
     problem = moved("joint_viscous", {"b": 0.3}, ("b",))
     fixed = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ())
     free = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
-    given = free.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})
-    for begun in (problem, fixed, given):
+    for begun in (problem, fixed, free.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})):
         x = begun.initial_unknowns
         np.testing.assert_array_equal(unknowns_with_neutral_effects_activated(begun, x), x)
 

@@ -127,9 +127,7 @@ def test_new_starts_stay_within_bounds_and_move_positive_unknowns_only(bounds, g
 
 
 def test_a_fit_that_cannot_be_evaluated_has_failed():
-    at = {1.0: 2.0}
-    problem = MadeUp(misfit(at.get))
-    solution = fit_problem(problem, Steps([[9.0]], [[9.0]], [[9.0]], [[9.0]]))
+    solution = fit_problem(MadeUp(misfit({1.0: 2.0}.get)), Steps([[9.0]], [[9.0]], [[9.0]], [[9.0]]))
     assert (solution.status, solution.message, solution.evaluation) == (Status.FAILED, "it snaps", None)
     assert solution.cost == math.inf
     assert replace(solution, history=()).n_iterations == 0
@@ -388,8 +386,7 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
     solution = fit_problem(Disturbed(rows), poor)
     assert "(best of 3 starts)" in solution.message
     assert [3.2] in [start for start, _ in poor.runs]
-    single = Carrying(there)
-    assert "best of" not in fit_problem(Disturbed(rows), single, restarts=False).message
+    assert "best of" not in fit_problem(Disturbed(rows), Carrying(there), restarts=False).message
 
 
 def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
@@ -479,8 +476,7 @@ def with_weak_prior(target, std=0.1, start=3.0):
 
 
 def test_an_unknown_clipped_to_its_bound_at_zero_comes_back():
-    problem = with_weak_prior(2.0)
-    found = GaussNewton().minimize_cost(problem, np.zeros(1), None)
+    found = GaussNewton().minimize_cost(with_weak_prior(2.0), np.zeros(1), None)
     assert found.status == Status.CONVERGED
     assert found.x[0] == pytest.approx(2.0, abs=1e-2)
 
@@ -505,8 +501,7 @@ def test_a_rejected_step_is_followed_by_one_that_is_shorter_along_what_is_weakly
 
 
 def test_at_the_edge_of_what_can_be_predicted_the_search_stalls_soon():
-    problem = edge(1.0)
-    found = GaussNewton().minimize_cost(problem, np.array([1.0, 0.0]), None)
+    found = GaussNewton().minimize_cost(edge(1.0), np.array([1.0, 0.0]), None)
     assert found.status == Status.STALLED
     assert "it snaps" in found.message
     assert found.n_evaluations <= 10

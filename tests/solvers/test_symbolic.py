@@ -172,8 +172,7 @@ def test_it_solves_what_gauss_newton_solves(urdf_folder, case):
 
 
 def test_what_it_does_not_do_is_refused(urdf_folder):
-    late = (("camera_latency", "camera", {"delay": 0.0137}),)
-    step = pendulum_step(urdf_folder, late)
+    step = pendulum_step(urdf_folder, (("camera_latency", "camera", {"delay": 0.0137}),))
     with pytest.raises(SolverError, match="an effect changes recorded inputs, times"):
         transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",)))
 
@@ -326,8 +325,7 @@ def test_placed_derivatives_are_those_that_casadi_finds(use_compiler, threshold)
 
 
 def test_gauss_newton_leaves_out_curvature_but_not_that_of_what_was_added():
-    ridge = GaussNewtonHessianRidge(np.array([0]), np.array([0.5]), 0.2)
-    program = chain(ridge=ridge)
+    program = chain(ridge=GaussNewtonHessianRidge(np.array([0]), np.array([0.5]), 0.2))
     w = program.w
     slope, cost, first = at(program, program.jac_r, program.f, w[0])
     expected = 0.7 * slope.T @ slope

@@ -76,8 +76,7 @@ def clouds(robot, times, rng, motion=lively, scale=1.0, pose=POSE):
     for t in times:
         depth, cosine, _ = robot.render_depth_incidence_and_part(LENS, pose, motion(t))
         depth = np.where(np.isfinite(depth), depth, 3.2)
-        flying = rng.random(depth.shape) < 0.02
-        depth = np.where(flying, depth + rng.uniform(-0.3, 0.3, depth.shape), depth)
+        depth = np.where(rng.random(depth.shape) < 0.02, depth + rng.uniform(-0.3, 0.3, depth.shape), depth)
         depth = depth + NOISE * rng.standard_normal(depth.shape)
         found.append(LENS.points_from_depth(np.where(cosine > 0.12, depth * scale, 3.2 * scale)))
     return found
@@ -142,8 +141,7 @@ def test_slopes_of_the_state_are_derivatives():
 
 
 def test_slopes_of_the_rows_are_derivatives(robot):
-    rng = np.random.default_rng(1)
-    [cloud] = clouds(robot, [1.7], rng)
+    [cloud] = clouds(robot, [1.7], np.random.default_rng(1))
     state, arm = CameraState(POSE, clock_reference_stamp=1.2), arm_of(robot)
     points = state.measured_to_world_points(cloud)
     glimpse = StampedCloud(1.7, cloud[arm.near_moving_surface_off_grasps_mask(points, 1.7, 0.02)][::7])

@@ -93,8 +93,7 @@ def test_estimated_radii_are_used(track):
 def test_an_end_outside_of_the_filters_box_tells_nothing_of_a_length(track):
     """What was cut off by a filter is no missing end."""
     found, _ = track(filters=CloudFilterOptions(box_lower=(0.0, -0.45, -2.0), box_upper=(2.0, 2.0, 2.0)))
-    i = found.dimensions.names.index("T3.length")
-    assert not found.dimensions.contradicted_model_value_mask[i]
+    assert not found.dimensions.contradicted_model_value_mask[found.dimensions.names.index("T3.length")]
     assert all(np.isnan(frame.shape_fit.end_offsets[1]) for frame in found.frame_reports if frame.shape_fit is not None)
 
 

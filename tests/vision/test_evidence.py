@@ -37,8 +37,7 @@ def wall(x, y, z, step=0.006):
 
 
 def asked(points, behind=None, removed=None):
-    everything = points if behind is None else np.concatenate([points, behind])
-    view = OcclusionMap(everything, np.eye(4))
+    view = OcclusionMap(points if behind is None else np.concatenate([points, behind]), np.eye(4))
     return fit_quality_and_point_classes(
         TUBES, ProcessedFrameCloud(points, np.ones(len(points)), points[::50], CAMERA, view, removed), NEAR
     )

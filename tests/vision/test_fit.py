@@ -27,8 +27,7 @@ def seen(shape, q, count=250, noise=0.0, seed=0):
     points, nodes = [], []
     for (start, end), radius in zip(shape.tube_links_at_configuration(q).link_ends, shape.link_radii, strict=True):
         axis = (end - start) / np.linalg.norm(end - start)
-        middle = 0.5 * (start + end)
-        front = CAMERA - middle
+        front = CAMERA - (0.5 * (start + end))
         front = front - (front @ axis) * axis
         front /= np.linalg.norm(front)
         side = np.cross(axis, front)

@@ -16,8 +16,7 @@ CAMERA = np.array([2.6, 0.0, 0.45])
 
 
 def test_voxels_keep_weight_and_centroid():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.3, 0.3, (5000, 3))
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (5000, 3))
     cloud = voxel_averages(points, 0.05)
     assert cloud.point_weights.sum() == 5000
     assert np.allclose(np.average(cloud.points, axis=0, weights=cloud.point_weights), points.mean(0))

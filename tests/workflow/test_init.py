@@ -300,8 +300,7 @@ def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, r
 def pushed_pendulum(folder: Path, phases: Sequence[float], name: str) -> None:
     """A double pendulum in free air, its efforts by Pinocchio with friction, rotors, zeros of sensors and a payload."""
     pin = pytest.importorskip("pinocchio")
-    urdf = urdf_path_from_robot_name("default:double_pendulum.urdf")
-    model = pin.buildModelFromUrdf(str(urdf))
+    model = pin.buildModelFromUrdf(str(urdf_path_from_robot_name("default:double_pendulum.urdf")))
     rng, t = np.random.default_rng(len(name)), np.arange(0, 6, 0.005)
     model.appendBodyToJoint(2, pin.Inertia(0.3, np.array([0.0, 0.05, -0.4]), np.zeros((3, 3))), pin.SE3.Identity())
     model.armature = np.array([0.05, 0.02])

@@ -111,8 +111,7 @@ def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, t
     left.mkdir()
     (left / "yid-ocp.lock").touch()
     (left / "big").write_text("x")
-    foreign = tmp_path / ".foreign.partial"
-    foreign.mkdir()
+    (tmp_path / ".foreign.partial").mkdir()
     with atomic_run_folder(settings, tmp_path / "lives") as alive:
         write_text(alive.path / "a.txt", "a")
         with atomic_run_folder(settings, tmp_path / "other"):
