@@ -22,6 +22,7 @@ from pendulum_run import cli as cli
 from pendulum_run import left_nothing as left_nothing
 from pendulum_run import pendulum as pendulum
 from pendulum_run import pendulum_data as pendulum_data
+from pendulum_run import printed as printed
 from pendulum_run import rubbing as rubbing
 from pendulum_run import solved_pendulum as solved_pendulum
 from sound_findings import assert_sound

@@ -69,6 +69,18 @@ def cli(capsys):
 
 
 @pytest.fixture
+def printed(cli):
+    """Run a command that ends with a code; what it prints, or the message where it fails."""
+
+    def run(*arguments: object, code: int = 0, settings: Sequence[str] = ()) -> str:
+        done = cli(*arguments, settings=settings)
+        assert done.code == code, done.err
+        return done.err if code else done.out
+
+    return run
+
+
+@pytest.fixture
 def carried_out(cli, tmp_path):
     """Run a command that succeeds, into the folder `out`; what `cli` returns, with the folder and its result."""
 

@@ -1,6 +1,5 @@
 """Several methods on one problem: cost in time, agreement, and what is said of parameters that nothing informs."""
 
-import json
 import math
 import mmap
 import re
@@ -21,7 +20,6 @@ from yid_ocp.analysis.estimation import (
     choose_cable_memory_fit,
     prediction_errors_units_and_fit_errors,
 )
-from yid_ocp.cli import main
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -48,10 +46,8 @@ def test_methods_agree_on_what_the_data_inform(problem):
     found = compare_methods(problem, [GaussNewton(), SingleShooting()], TRUTH, lambda name, _: told.append(name))
     assert found.is_consistent
     assert {run.method for run in found.method_results} == set(told) == {"gauss_newton", "single_shooting"}
-    [sentence] = found.explanations
-    assert (
-        sentence == "shoulder.damping (truth 0.1) cannot be found: the data do not determine it, so no value is shown"
-    )
+    [told_of] = found.explanations
+    assert told_of == "shoulder.damping (truth 0.1) cannot be found: the data do not determine it, so no value is shown"
     for run in found.method_results:
         assert run.wall_seconds > 0
         assert run.peak_memory_mib > 10
@@ -80,22 +76,21 @@ def test_a_method_that_stops_early_is_said_to_differ(problem):
     assert "does not find it: the method ended too early (iteration_limit)" in found.explanations[-1]
 
 
-def test_nothing_to_agree_on(repository, tmp_path, capsys):
+def test_nothing_to_agree_on(repository, carried_out):
     config = repository / "configs" / "springs_series_ends.yaml"
     methods = "compare.methods={gauss_newton: {}, single_shooting: {max_iterations: 3}, "
     methods += "multiple_shooting: {max_iterations: 2}}"
-    assert main(["compare", str(config), "--out", str(tmp_path / "run"), "--set", methods]) == 0
-    text = capsys.readouterr().out
+    done = carried_out("compare", config, settings=[methods])
+    text = done.out
     assert "single_shooting did not converge" in text
     assert "multiple_shooting did not converge: IPOPT stopped after 2 iterations" in text
     assert "no parameter can be found from these recordings, so there is nothing to agree on" in text
-    result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
-    values = [entry["parameters"]["spring_1.stiffness"]["value"] for entry in result["methods"].values()]
-    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8").partition("<script")[0]
+    values = [entry["parameters"]["spring_1.stiffness"]["value"] for entry in done.result["methods"].values()]
+    page = (done.folder / "report.html").read_text(encoding="utf-8").partition("<script")[0]
     assert not [value for value in values if value <= 0 or f"{value:.3g}" in text + page]  # no digits mean nothing
 
 
-def test_command(repository, clean, tmp_path, capsys):
+def test_command(repository, clean, carried_out):
     config = repository / "configs" / "single_arm_no_vision.yaml"
     settings = ["problem.duration=0.3", "problem.use_compiler=false", "model.object.links=1", "parameters={}"]
     settings += [
@@ -104,13 +99,11 @@ def test_command(repository, clean, tmp_path, capsys):
         "T2.twist: {initial: 8.2}, T3.bend: {initial: 11.5}, T3.twist: {initial: 9.7}}",
         *(f"recordings.{purpose}=[{clean}/single_arm_no_vision_{purpose}.h5]" for purpose in ("estimate", "held_out")),
     ]
-    arguments = [part for setting in settings for part in ("--set", setting)]
-    assert main(["compare", str(config), "--out", str(tmp_path / "run"), *arguments]) == 0
-    text = capsys.readouterr().out
-    assert "published" in text
-    assert "truth" in text
-    assert "noise that drives" not in text
-    result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
+    done = carried_out("compare", config, settings=settings)
+    assert "published" in done.out
+    assert "truth" in done.out
+    assert "noise that drives" not in done.out
+    result = done.result
     assert result["format"] == "yid-compare/1"
     assert set(result["methods"]) == {"gauss_newton", "single_shooting"}
     assert result["methods"]["gauss_newton"]["format"] == "yid-solve/1"
@@ -119,17 +112,16 @@ def test_command(repository, clean, tmp_path, capsys):
         assert (own["value"], own["verdict"]) == (entry["value"], entry["verdict"])
         assert (own["std"] or 0.0) >= (entry["std"] or 0.0)  # the discretisation counts
     assert result["published"] == PAPER_ESTIMATES["single_arm_no_vision"]
-    assert "Cost over time" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "Cost over time" in (done.folder / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
-def test_command_weighs_all_noise_of_the_embedded_recordings(repository, tmp_path, capsys):
+def test_command_weighs_all_noise_of_the_embedded_recordings(repository, carried_out):
     """Torques with offsets mislead what takes them as true; the verdicts do not follow it."""
     config = repository / "configs" / "dual_arm_no_vision.yaml"
-    arguments = ["--out", str(tmp_path / "run"), "--set", "compare.methods={single_shooting: {}}"]
-    assert main(["compare", str(config), *arguments]) == 0
-    assert capsys.readouterr().out.startswith("values by single_shooting are not trusted, as they ignore the noise")
-    result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
+    done = carried_out("compare", config, settings=["compare.methods={single_shooting: {}}"])
+    assert done.out.startswith("values by single_shooting are not trusted, as they ignore the noise")
+    result = done.result
     assert result["judged"]["fit"]["explains"]
     assert not result["methods"]["single_shooting"]["fit"]["explains"]
     found = {name: e for name, e in result["judged"]["parameters"].items() if e["verdict"] == "identifiable"}
@@ -139,11 +131,10 @@ def test_command_weighs_all_noise_of_the_embedded_recordings(repository, tmp_pat
 
 
 @pytest.mark.parametrize("methods", ["{newton: {}}", "{gauss_newton: {iteration: 3}}", "{}"])
-def test_wrong_methods_are_refused(repository, tmp_path, capsys, methods):
+def test_wrong_methods_are_refused(repository, tmp_path, printed, methods):
     config = repository / "configs" / "single_arm_no_vision.yaml"
-    arguments = ["compare", str(config), "--out", str(tmp_path / "run"), "--set", f"compare.methods={methods}"]
-    assert main(arguments) == 2
-    assert "compare.methods" in capsys.readouterr().err
+    told = printed("compare", config, "--out", tmp_path / "run", "--set", f"compare.methods={methods}", code=2)
+    assert "compare.methods" in told
     assert not (tmp_path / "run").exists()
 
 

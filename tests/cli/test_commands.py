@@ -321,53 +321,48 @@ def test_inspect_without_recordings(carried_out, written, urdf_folder):
         ("del[elbow], h, h", "ROW (an equation), or ROW, COLUMN (its derivative"),
     ],
 )
-def test_a_wrong_entry_leaves_nothing_behind(cli, pendulum, tmp_path, entry, said):
-    done = cli("inspect", pendulum, "--out", "i", "--entry", entry, "--export", "eq")
-    assert done.code == 2
-    assert said in done.err
+def test_a_wrong_entry_leaves_nothing_behind(printed, pendulum, tmp_path, entry, said):
+    assert said in printed("inspect", pendulum, "--out", "i", "--entry", entry, "--export", "eq", code=2)
     assert not (tmp_path / "i").exists()
     assert not (tmp_path / "eq").exists()
 
 
-def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):
+def test_check_warns_of_a_file_that_another_library_reads_otherwise(printed, pendulum, monkeypatch):
     def otherwise(*arguments, **more):
         return replace(compare_urdf_with_pinocchio(*arguments, **more), mass=0.03)
 
     monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", otherwise)
-    done = cli("check", pendulum, "--out", "c")
-    assert done.code == 0, done.err
-    assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in done.out
+    told = printed("check", pendulum, "--out", "c")
+    assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in told
     unread = Mock(side_effect=ValueError("no such joint type"))
     monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", unread)
-    done = cli("check", pendulum, "--out", "d")
-    assert "warning: double_pendulum.urdf is not compared, because Pinocchio cannot read it: no such joint" in done.out
+    told = printed("check", pendulum, "--out", "d")
+    assert "warning: double_pendulum.urdf is not compared, because Pinocchio cannot read it: no such joint" in told
 
 
-def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(cli, tmp_path):
+def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(printed, tmp_path):
     pytest.importorskip("mujoco")
     body = (
         "<body><joint name='j' axis='0 1 0'/><geom type='capsule' fromto='0 0 0 0 0 -0.3' size='0.02' mass='1'/></body>"
     )
     (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     (tmp_path / "arm.yaml").write_text("model: {robot: arm.xml, arms: {joints: [j], mode: driven}}\n")
-    done = cli("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
-    assert done.code == 0, done.err
-    assert "is not compared" not in done.out
-    assert "the built model: mass matrix, weight and inverse dynamics agree with Pinocchio's" in done.out
+    told = printed("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
+    assert "is not compared" not in told
+    assert "the built model: mass matrix, weight and inverse dynamics agree with Pinocchio's" in told
 
 
-def test_what_is_simulated_is_exported_and_imported(cli, pendulum_data, tmp_path):
+def test_what_is_simulated_is_exported_and_imported(printed, pendulum_data, tmp_path):
     recording = read_recording(pendulum_data.folder / "estimate.h5")
     assert recording.joint_names == ("shoulder", "elbow")
     assert abs(recording.joints.effort).max() > 0.5
     # of prescribed joints: what they need at the nodes
     assert recording.joints.effort_kind == "sample"
     assert recording.true_parameters["shoulder.stiffness"] == pendulum_data.truth["shoulder.stiffness"]
-    assert cli("export", pendulum_data.folder / "estimate.h5", "--out", tmp_path / "csv").code == 0
-    done = cli("import", next((tmp_path / "csv").glob("*.csv")), "--out", tmp_path / "back.h5")
-    assert done.code == 0, done.err
+    printed("export", pendulum_data.folder / "estimate.h5", "--out", tmp_path / "csv")
+    told = printed("import", next((tmp_path / "csv").glob("*.csv")), "--out", tmp_path / "back.h5")
     assert read_recording(tmp_path / "back.h5", allow_nan_effort=True).joint_names == ("shoulder", "elbow")
-    assert "back.h5" in done.out
+    assert "back.h5" in told
 
 
 def test_schema_is_the_one_beside_the_configurations(cli, repository, tmp_path):

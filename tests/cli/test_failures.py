@@ -46,13 +46,12 @@ def test_a_rollout_that_fails_leaves_reason_and_best_point(carried_out, pendulum
     assert (done.folder / "report.html").is_file()
 
 
-def test_a_bug_is_told_from_wrong_input(cli, pendulum, left_nothing, monkeypatch):
+def test_a_bug_is_told_from_wrong_input(printed, pendulum, left_nothing, monkeypatch):
     monkeypatch.setattr(estimation, "solve", Mock(side_effect=ZeroDivisionError("a mistake of ours")))
-    done = cli("solve", pendulum)
-    assert done.code == 3
-    assert "Traceback" not in done.err
-    assert "a mistake of ours" in done.err
-    log = Path(done.err.rsplit(maxsplit=1)[1])
+    told = printed("solve", pendulum, code=3)
+    assert "Traceback" not in told
+    assert "a mistake of ours" in told
+    log = Path(told.rsplit(maxsplit=1)[1])
     assert "ZeroDivisionError" in log.read_text()
     log.unlink()
     left_nothing()
@@ -105,14 +104,14 @@ def test_an_interrupted_or_killed_run_does_not_look_finished(pendulum, tmp_path,
     assert not list(tmp_path.rglob("result.json"))
 
 
-def test_a_full_disk_is_the_users_business(cli, pendulum, left_nothing, monkeypatch):
+def test_a_full_disk_is_the_users_business(printed, pendulum, left_nothing, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(estimation, "solve", Mock(side_effect=FileNotFoundError(2, "No such file", "a")))
-        assert re.search("reports: No such file\n.*: a\n.*\n  try: check the path\n", cli("solve", pendulum).err)
+        assert re.search(
+            "reports: No such file\n.*: a\n.*\n  try: check the path\n", printed("solve", pendulum, code=2)
+        )
     monkeypatch.setattr("yid_ocp.workflow.run_folder.os.replace", Mock(side_effect=OSError(28, "No space left on")))
-    done = cli("solve", pendulum)
-    assert done.code == 2
-    assert "No space left on device" in done.err
+    assert "No space left on device" in printed("solve", pendulum, code=2)
     left_nothing()
 
 

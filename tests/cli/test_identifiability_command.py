@@ -81,11 +81,9 @@ def test_judged_at_the_initial_values_without_solving(carried_out, repository):
         (("--set", "model.arms.passive_joints=[spring_1, spring_9]"), "there is no joint 'spring_9'"),
     ],
 )
-def test_names_that_are_not_there_are_refused(cli, repository, tmp_path, left_nothing, options, said):
+def test_names_that_are_not_there_are_refused(printed, repository, tmp_path, left_nothing, options, said):
     file = repository / "configs" / "springs_series_ends.yaml"
-    done = cli("identifiability", file, "--out", tmp_path / "run", *options)
-    assert done.code == 2
-    assert said in done.err
+    assert said in printed("identifiability", file, "--out", tmp_path / "run", *options, code=2)
     left_nothing()
 
 

@@ -11,7 +11,6 @@ import pytest
 from recording_examples import joints_of
 from ros_bags import SECOND, START, Bag
 
-from yid_ocp.cli import main
 from yid_ocp.data import read_recording
 from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.errors import DataError
@@ -123,7 +122,6 @@ def test_joints_of_messages_of_real_labs(
     for channel, value in {"velocity": 2.0, "effort": 3.0, **more}.items():
         assert np.all(joints.values_by_channel[channel] == value)
     if command is not None:
-        assert joints.position_command is not None
         assert np.allclose(joints.position_command, joints.position + command)
     assert preview_file(path).sources[0].imported_as == f"joints {', '.join(JOINTS)}"
 
@@ -149,7 +147,6 @@ def test_the_state_of_a_ur_becomes_joints_of_its_usual_names(tmp_path: Path) -> 
     assert joints.names[0] == "shoulder_pan_joint"
     assert len(joints.names) == 6
     assert np.allclose(joints.position, 0.01 * np.arange(30)[:, None] + 0.1 * ANGLES[:6])
-    assert joints.position_command is not None
     assert np.allclose(joints.position_command, joints.position + 0.5)
     assert joints.effort is None
 
@@ -161,27 +158,17 @@ def test_joint_states_go_before_them_unless_they_are_chosen(tmp_path: Path) -> N
     assert joints_of(read_any(path, joint_topics=["/arm"])).names == tuple(JOINTS)
 
 
-def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without(tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
     path = write(tmp_path, "lab_msgs/msg/Arm")
-    assert main(["import", str(path), "--preview"]) == 0
-    told = capsys.readouterr().out
+    told = printed("import", path, "--preview")
     assert "needs more information" in told
     assert "--field position=" in told
     assert "\n  yid-ocp import" not in told
-    words = [
-        "--field",
-        "position=/arm.state.q",
-        "--field",
-        "effort=/arm.state.torque",
-        "--joints",
-        "1=shoulder,2=elbow",
-    ]
-    assert main(["import", str(path), "--preview", *words]) == 0
-    *_, said = capsys.readouterr().out.strip().splitlines()
-    assert main(shlex.split(said)[1:]) == 0
+    fields = ("position=/arm.state.q", "effort=/arm.state.torque")
+    words = [*(word for field in fields for word in ("--field", field)), "--joints", "1=shoulder,2=elbow"]
+    *_, said = printed("import", path, "--preview", *words).strip().splitlines()
+    printed(*shlex.split(said)[1:])
     joints = joints_of(read_recording(tmp_path / f"{path.stem}.h5"))
     assert joints.names == ("shoulder", "elbow")
     assert np.allclose(joints.position[:, 1], 0.01 * np.arange(30) + 0.1)

@@ -110,11 +110,10 @@ def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
     assert (tmp_path / "joints.csv").read_text() == "measured"
 
 
-def test_a_solve_says_what_it_measured_and_predicted(pendulum, cli, tmp_path):
-    assert cli("solve", pendulum, "--out", "run", "--set", "output.write_report=false").code == 0
-    done = cli("export", "run", "--format", "mcap", "--out", "signals")
-    assert done.code == 0, done.err
-    assert done.out.split() == ["signals/estimate.mcap", "signals/held_out.mcap"]
+def test_a_solve_says_what_it_measured_and_predicted(pendulum, printed, tmp_path):
+    printed("solve", pendulum, "--out", "run", "--set", "output.write_report=false")
+    told = printed("export", "run", "--format", "mcap", "--out", "signals")
+    assert told.split() == ["signals/estimate.mcap", "signals/held_out.mcap"]
     found = read(tmp_path / "signals" / "held_out.mcap")
     with h5py.File(tmp_path / "run" / "trajectories.h5") as file:
         own = file["recordings/held_out"]
@@ -126,7 +125,7 @@ def test_a_solve_says_what_it_measured_and_predicted(pendulum, cli, tmp_path):
         np.testing.assert_array_equal([told.effort for *_, told in entries], values)
     np.testing.assert_array_equal([told.position for *_, told in found["/predicted/joint_states"]], q)
     np.testing.assert_array_equal([told.effort for *_, told in found["/predicted/prescribed_efforts"]], effort)
-    assert cli("export", "run", "--format", "csv", "--out", "x").code == 2
+    printed("export", "run", "--format", "csv", "--out", "x", code=2)
 
 
 def test_a_diagnosis_says_what_it_could_not_explain(tmp_path, cli):

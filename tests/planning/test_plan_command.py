@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step, taken
 
-from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
@@ -121,12 +120,11 @@ def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_p
     assert source["uncertainty_unknown"] == ["elbow.stiffness"]
 
 
-def test_a_plan_that_fails_says_so(config, tmp_path, capsys):
-    assert main(["plan", str(config), "--out", str(tmp_path / "out"), "--set", "plan.duration=0.1"]) == 1
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert result["status"] == "failed"
-    assert result["message"] in capsys.readouterr().out
-    assert result["message"] in html.unescape((tmp_path / "out" / "report.html").read_text())
+def test_a_plan_that_fails_says_so(config, carried_out):
+    done = carried_out("plan", config, settings=["plan.duration=0.1"], codes=(1,))
+    assert done.result["status"] == "failed"
+    assert done.result["message"] in done.out
+    assert done.result["message"] in html.unescape((done.folder / "report.html").read_text())
 
 
 @pytest.mark.parametrize(
@@ -148,14 +146,13 @@ def test_a_run_that_failed_and_one_of_another_command_are_refused(config, tmp_pa
     refused(config, [f"plan.parameter_run_folder={other}"], ("result of another command (format yid-diagnosis/2)",))
 
 
-def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
+def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, printed):
     folder = solved(tmp_path / "solved", 4.0, 0.1, **{"point_mass@tip.mass": {"value": 0.1, "free": True}})
-    chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run_folder={folder}")
-    assert main(list(chosen)) == 2
-    told = capsys.readouterr().err
+    chosen = ("plan", config, "--out", tmp_path / "out", "--set", f"plan.parameter_run_folder={folder}")
+    told = printed(*chosen, code=2)
     assert "has effects that this one lacks: point_mass@tip" in told
     assert "model.effects" in told
-    assert main([*chosen, "--set", "model.effects=[{kind: point_mass, location: tip}]"]) == 0
+    printed(*chosen, "--set", "model.effects=[{kind: point_mass, location: tip}]")
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["from"]["parameters"]["point_mass@tip.mass"] == 0.1
 
@@ -181,11 +178,8 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
     section = discrimination_plan_settings([[pair(label) for label in PAIR]], folder)
-    assert section == {
-        "goal": "information",
-        "effects_to_discriminate": list(PAIR),
-        "parameter_run_folder": str(folder),
-    }
+    found = {"effects_to_discriminate": list(PAIR), "parameter_run_folder": str(folder)}
+    assert section == {"goal": "information", **found}
     assert discrimination_plan_settings([], folder) is None
     command = _planning_command(section)
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")

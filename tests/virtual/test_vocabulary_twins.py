@@ -87,7 +87,6 @@ def agrees(found: tuple[float, float], true: float, rel: float = 0.0) -> bool:
 def test_friction_that_the_engines_solver_holds_is_found(kind, values) -> None:
     held = [InjectedEffect(kind, "shoulder", {"v_stribeck": 0.1, **values} if "tau_s" in values else values)]
     made = recorded([], friction=held)
-    assert made.joints is not None
     # where it has not broken loose it does not creep
     assert np.ptp(made.joints.position[made.joints.t < 0.1, 0]) < 4e-4
     [amplitude] = values
@@ -100,8 +99,6 @@ def test_what_is_injected_adds_to_ordinary_friction() -> None:
         recorded(parts[1:], friction=parts[:1]),
         recorded([], friction=[replace(parts[0], values={"tau_c": 0.6})]),
     )
-    assert both.joints is not None
-    assert whole.joints is not None
     assert np.array_equal(both.joints.position, whole.joints.position)
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from yid_ocp.cli import build_argument_parser, main
+from yid_ocp.cli import build_argument_parser
 from yid_ocp.data import read_recording
 from yid_ocp.files import file_sha256
 
@@ -24,15 +23,14 @@ FLAGS = [
 
 
 @pytest.fixture
-def odd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def odd(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.csv").write_text(ODD)
     return tmp_path
 
 
-def check_odd(file: Path, source: Path) -> None:
+def check_odd(file: Path, source: Path):
     recording = read_recording(file)
-    assert recording.joints is not None
     assert recording.joints.names == ("shoulder", "elbow")
     assert np.allclose(recording.joints.t, 0.01 * np.arange(20))
     assert np.allclose(recording.joints.position[:, 1], np.radians(2 * np.arange(20)))
@@ -41,50 +39,47 @@ def check_odd(file: Path, source: Path) -> None:
     assert file_sha256(source) in recording.source
 
 
-def test_flags_say_what_columns_and_units_mean(odd: Path) -> None:
-    assert main(["import", "run.csv", "--out", "run.h5", *FLAGS]) == 0
+def test_flags_say_what_columns_and_units_mean(odd, printed):
+    printed("import", "run.csv", "--out", "run.h5", *FLAGS)
     check_odd(odd / "run.h5", odd / "run.csv")
 
 
-def test_a_section_of_a_configuration_does_the_same_and_flags_go_before_it(odd: Path) -> None:
+def test_a_section_of_a_configuration_does_the_same_and_flags_go_before_it(odd, printed):
     columns = '{stamp: t, j1: "position:shoulder", j2: "position:elbow", mx: "x:tip", my: "y:tip", mz: "z:tip"}'
     more = '  units: {t: ms, position: deg, points: mm}\n  point_names: {tip: "cable:100%"}\n'
     (odd / "run.yaml").write_text(f"import:\n  column_meanings: {columns}\n{more}")
-    assert main(["import", "run.csv", "--out", "run.h5", "--config", "run.yaml"]) == 0
+    printed("import", "run.csv", "--out", "run.h5", "--config", "run.yaml")
     check_odd(odd / "run.h5", odd / "run.csv")
-    assert main(["import", "run.csv", "--out", "run.h5", "--config", "run.yaml", "--points", "tip=other"]) == 0
+    printed("import", "run.csv", "--out", "run.h5", "--config", "run.yaml", "--points", "tip=other")
     assert read_recording(odd / "run.h5").point_names == ("other",)
 
 
-def test_what_the_preview_proposes_imports_the_file(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_preview_proposes_imports_the_file(odd, printed):
     (odd / "plain.csv").write_text("t;q_a;tip_x;tip_y;tip_z\n" + "".join(f"{k};90;900;0;0\n" for k in range(9)))
-    assert main(["import", "plain.csv", "--preview", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(printed("import", "plain.csv", "--preview", "--json"))
     assert (told["format"], told["recording"]) == ("yid-import/1", None)
     assert {source["name"] for source in told["sources"]} >= {"t"}
-    assert main(["import", "plain.csv", "--preview"]) == 0
-    *_, said = capsys.readouterr().out.strip().splitlines()
+    *_, said = printed("import", "plain.csv", "--preview").strip().splitlines()
     assert not (odd / "plain.h5").exists()
     program, *words = shlex.split(said)
     assert program == "yid-ocp"
-    assert main(words) == 0
+    printed(*words)
     recording = read_recording(odd / "plain.h5")
-    assert recording.joints is not None
     assert recording.joints.position[0, 0] == pytest.approx(math.pi / 2)
     assert recording.points[0].position[0, 0, 0] == pytest.approx(0.9)
     # a recording of our own is shown, too
-    assert main(["import", "plain.h5", "--preview"]) == 0
-    told = capsys.readouterr().out
+    told = printed("import", "plain.h5", "--preview")
     assert "note: the file is already a recording" in told
     assert "to import it" not in told
 
 
-def test_left_out_lines_are_told(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_left_out_lines_are_told(odd, printed):
     (odd / "bad.csv").write_text("t,q_a\n0,0\n1,x\n2,0\n")
-    assert main(["import", "bad.csv", "--out", "bad.h5", "--skip-bad-lines"]) == 0
-    assert "note: 1 of 3 lines were left out: not rows of numbers (line 3)" in capsys.readouterr().out
+    told = printed("import", "bad.csv", "--out", "bad.h5", "--skip-bad-lines")
+    assert "note: 1 of 3 lines were left out: not rows of numbers (line 3)" in told
 
 
+BOTH = ("joints.csv", "mocap.csv")
 GOOD = "t,q_a,tip_x,tip_y,tip_z\n0,0.1,1,1,1\n1,0.2,1,1,1\n"
 BAD: dict[str, tuple[str, str | None, str, str]] = {
     # file, its text (None: there is no such file), flags, what is said
@@ -108,17 +103,14 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_import_says_what_is_wrong_and_writes_nothing(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_import_says_what_is_wrong_and_writes_nothing(case, tmp_path, monkeypatch, printed):
     name, text, flags, said = BAD[case]
     monkeypatch.chdir(tmp_path)
     (tmp_path / "wrong.yaml").write_text("import: {colums: {q_a: skip}}\n")
     if text is not None:
         (tmp_path / name).write_text(text)
     before = sorted(entry.name for entry in tmp_path.iterdir())
-    assert main(["import", name] if flags == "--out" else ["import", name, "--out", "made.h5", *flags.split()]) == 2
-    told = capsys.readouterr().err
+    told = printed("import", name, *([] if flags == "--out" else ["--out", "made.h5", *flags.split()]), code=2)
     first, *more = (line for line in told.strip().splitlines() if not line.startswith("reading "))
     assert first.startswith("error: ")
     assert said in first
@@ -126,9 +118,7 @@ def test_a_bad_import_says_what_is_wrong_and_writes_nothing(
     assert sorted(entry.name for entry in tmp_path.iterdir()) == before
 
 
-def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_preview(
-    odd: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_preview(odd, printed):
     t = np.arange(0, 2, 0.01)
     rows = "".join(f"{x:.3f},{math.sin(3 * x):.6f},{3 * math.cos(3 * x):.6f},{k % 3}\n" for k, x in enumerate(t))
     (odd / "joints.csv").write_text("timestamp,pos_a,vel_a,tau_a [Nm]\n" + rows)
@@ -136,29 +126,24 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
         f"{x:.3f},{500 * math.cos(math.sin(3 * x)):.3f},{500 * math.sin(math.sin(3 * x)):.3f},0\n" for x in t
     )
     (odd / "mocap.csv").write_text("time,tip X,tip Y,tip Z\n" + rows)
-    assert main(["import", "joints.csv", "mocap.csv", "--preview"]) == 0
-    *_, said = capsys.readouterr().out.strip().splitlines()
-    assert main(shlex.split(said)[1:]) == 0
-    told = capsys.readouterr().out
+    *_, said = printed("import", *BOTH, "--preview").strip().splitlines()
+    told = printed(*shlex.split(said)[1:])
     assert "position [rad], velocity [rad/s], effort [N m]" in told
     assert "have one clock" in told
     recording = read_recording(odd / "joints_merged.h5")
-    assert recording.joints is not None
     assert recording.joints.names == ("a",)
     assert recording.points[0].position[0, 0] == pytest.approx([0.5, 0, 0])
-    assert all(file_sha256(odd / name) in recording.source for name in ("joints.csv", "mocap.csv"))
+    assert all(file_sha256(odd / name) in recording.source for name in BOTH)
     words = ["--units", "mm", "--points", "tip=w_rod", "--joints", "a=elbow", "--columns", "tau_a [Nm]=skip"]
-    assert main(["import", "joints.csv", "mocap.csv", "--out", "both.h5", *words, "--clock-offset", "mocap=0.5"]) == 0
+    printed("import", *BOTH, "--out", "both.h5", *words, "--clock-offset", "mocap=0.5")
     recording = read_recording(odd / "both.h5")
-    assert recording.joints is not None
     assert (recording.joints.names, recording.joints.effort) == (("elbow",), None)
     assert (recording.point_names, recording.points[0].t[0]) == (("w_rod",), 0.5)
     for flags, what in (
         (["--columns", "x=skip"], "no file has a column 'x'"),
         (["--episode", "1"], "no format of these files has the option"),
     ):
-        assert main(["import", "joints.csv", "mocap.csv", "--out", "no.h5", "--units", "mm", *flags]) == 2
-        assert what in capsys.readouterr().err
+        assert what in printed("import", *BOTH, "--out", "no.h5", "--units", "mm", *flags, code=2)
 
 
 @pytest.mark.parametrize(
@@ -171,47 +156,41 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     ],
     ids=["two samples", "milliseconds", "no motion", "degrees"],
 )
-def test_doubts_are_said_at_import(text: str, said: str, odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doubts_are_said_at_import(text, said, odd, printed):
     (odd / "run.csv").write_text(text)
-    assert main(["import", "run.csv", "--out", "run.h5"]) == 0
-    assert said in capsys.readouterr().out
+    assert said in printed("import", "run.csv", "--out", "run.h5")
 
 
-def test_sources_that_differ_in_a_number_are_one_row(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sources_that_differ_in_a_number_are_one_row(odd, printed):
     """In the tables of `import`, and points in what `init` prints and writes; JSON lists all."""
     names = [f"q_joint{i}" for i in range(1, 8)] + [f"tau_joint{i}" for i in range(1, 8)]
     names += [f"m{i}_{axis}" for i in (1, 2, 3, 5) for axis in "xyz"] + [f"tip_{axis}" for axis in "xyz"]
     rows = [",".join(["0.01" if k else "0", *(f"{math.sin(0.1 * k + i):.4f}" for i in range(29))]) for k in range(2)]
     (odd / "run.csv").write_text("\n".join([",".join(["t", *names]), *rows]))
-    assert main(["import", "run.csv", "--preview"]) == 0
-    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    told = [line.split() for line in printed("import", "run.csv", "--preview").splitlines()]
     shown = ["q_joint1..7", "tau_joint1..7", *(f"m{i}_{axis}" for i in (1, 2, 3, 5) for axis in "xyz")]
     assert [words[0] for words in told[3:17]] == shown
     assert told[3][-1] == "position:joint1..7"
-    assert main(["import", "run.csv", "--preview", "--json"]) == 0
-    assert [source["name"] for source in json.loads(capsys.readouterr().out)["sources"]] == ["t", *names]
-    assert main(["import", "run.csv", "--out", "run.h5"]) == 0
-    assert "m1..3, m5, tip" in capsys.readouterr().out
-    assert main(["init", "package:xarm7", "run.h5", "--out", "run.yaml"]) == 0
-    told = capsys.readouterr().out
+    sources = json.loads(printed("import", "run.csv", "--preview", "--json"))["sources"]
+    assert [source["name"] for source in sources] == ["t", *names]
+    assert "m1..3, m5, tip" in printed("import", "run.csv", "--out", "run.h5")
+    told = printed("init", "package:xarm7", "run.h5", "--out", "run.yaml")
     assert "joints: joint1..7\n" in told
     for text in (told, (odd / "run.yaml").read_text()):
         assert "m1..3, m5, tip at ?" in text
 
 
-def test_no_command_is_suggested_that_would_fail(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_command_is_suggested_that_would_fail(odd, printed):
     (odd / "run.csv").write_text("t,bend\n0,1\n1,2\n")
-    assert main(["import", "run.csv", "--preview"]) == 0
-    told = capsys.readouterr().out
+    told = printed("import", "run.csv", "--preview")
     assert "the import needs more information" in told
     assert "yid-ocp import" not in told
 
 
-def test_every_flag_is_a_key_of_the_section() -> None:
+def test_every_flag_is_a_key_of_the_section():
     from yid_ocp.config.settings import ImportSettings
     from yid_ocp.options import options_by_key
 
-    known: Callable[..., object] = build_argument_parser().parse_args
-    given = vars(known(["import", "x"]))
+    given = vars(build_argument_parser().parse_args(["import", "x"]))
     others = {"command", "run", "files", "out", "preview", "config", "quiet", "verbose", "json"}
     assert set(given) - others == set(options_by_key(ImportSettings))

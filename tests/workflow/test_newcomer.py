@@ -126,7 +126,6 @@ SERVOS = {f"{joint}.servo_{key}": x for joint in ("lift", "elbow", "wrist_flex")
 def write_mcap(recording: Recording, folder: Path) -> Path:
     """A bag with the joints on one topic, their commands on another, every point on its own, and one nobody needs."""
     joints = recording.joints
-    assert joints is not None
     nothing = {"velocity": np.zeros(0), "effort": np.zeros(0)}
     messages: list[tuple[float, str, str, dict[str, Any]]] = [(0.0, "/note", "std_msgs/msg/String", {"data": "hello"})]
     for topic, rows in (("/joint_states", joints.position), ("/joint_commands", joints.position_command)):
@@ -182,7 +181,6 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
     bag = write_mcap(recording, desk)
     assert main(["init", "package:ur5", str(bag), *UR5_NUMBERS, "--out", "cable.yaml", "--quiet"]) == 0
     run = load_config("cable.yaml")
-    assert run.model.object is not None
     places = {name: said.parent_frame for name, said in run.model.frames.items()}
     assert places == {"middle": "cable:50%", "tip": "w_cable"}
     problem = load_problem("cable.yaml", ["problem.use_compiler=false"])

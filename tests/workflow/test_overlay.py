@@ -25,10 +25,9 @@ def two_runs(pendulum_data, tmp_path_factory):
     return folder / "free", folder / "fixed", fixed
 
 
-def test_two_runs_of_the_same_recordings_are_overlaid(two_runs, cli, tmp_path):
+def test_two_runs_of_the_same_recordings_are_overlaid(two_runs, printed, tmp_path):
     first, second, fixed = two_runs
-    done = cli("report", first, second, "--out", tmp_path / "both")
-    assert done.code == 0, done.err
+    told = printed("report", first, second, "--out", tmp_path / "both")
     made = json.loads((tmp_path / "both" / "overlay.json").read_text(), parse_constant=pytest.fail)
     assert list(made["runs"]) == ["free", "fixed"]
     own, other = (json.loads((run / "result.json").read_text()) for run in (first, second))
@@ -48,25 +47,24 @@ def test_two_runs_of_the_same_recordings_are_overlaid(two_runs, cli, tmp_path):
             at = list(paths[0].attrs["channels"]).index(e["channel"])
             apart = np.array(paths[1]["predicted"])[:, at] - np.array(paths[0]["predicted"])[:, at]
         assert e["difference"] == pytest.approx(np.sqrt(np.nanmean(apart**2))), joint
-    assert f"{other['parameters'][fixed]['value']:.4g} (fixed)" in done.out
-    assert f"different by more than 2 std: {fixed}" in done.out
+    assert f"{other['parameters'][fixed]['value']:.4g} (fixed)" in told
+    assert f"different by more than 2 std: {fixed}" in told
     page = (tmp_path / "both" / "report.html").read_text(encoding="utf-8")
     names = ["verdict", "scene", "days", "overlay", "numbers"]
     assert [name for name in re.findall(r'<section id="(\w+)">', page) if name != "inputs"] == names
     assert "fixed minus free" in page
 
 
-def test_runs_that_share_only_some_recordings_are_refused_by_name(two_runs, cli, tmp_path):
+def test_runs_that_share_only_some_recordings_are_refused_by_name(two_runs, printed, tmp_path):
     first, *_ = two_runs
     alone = tmp_path / "alone"
     copied = json.loads((first / "result.json").read_text())
     copied["inputs"] = {name: digest for name, digest in copied["inputs"].items() if not name.endswith("held_out.h5")}
     alone.mkdir()
     (alone / "result.json").write_text(json.dumps(copied))
-    refused = cli("report", first, alone, "--out", tmp_path / "both")
-    assert refused.code == 2
-    assert f"held_out.h5 only in {first}" in refused.err
-    assert "the other's `recordings`" in refused.err
+    told = printed("report", first, alone, "--out", tmp_path / "both", code=2)
+    assert f"held_out.h5 only in {first}" in told
+    assert "the other's `recordings`" in told
     assert not (tmp_path / "both").exists()
 
 

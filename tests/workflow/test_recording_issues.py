@@ -79,12 +79,11 @@ def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
 
 
 @pytest.mark.parametrize("command", ["solve", "compare", "diagnose", "check"])
-def test_strict_stops_a_run_in_doubt(cli, damaged, tmp_path, left_nothing, command):
+def test_strict_stops_a_run_in_doubt(printed, damaged, tmp_path, left_nothing, command):
     file = damaged(noisy)
-    done = cli(command, file, "--strict", "--out", tmp_path / "run")
-    assert done.code == 2
-    assert "error: more noise than stated: the noise of effort.shoulder" in done.err
-    assert "damaged/joints/effort.shoulder" in done.err
+    told = printed(command, file, "--strict", "--out", tmp_path / "run", code=2)
+    assert "error: more noise than stated: the noise of effort.shoulder" in told
+    assert "damaged/joints/effort.shoulder" in told
     left_nothing(file)
 
 
@@ -94,12 +93,11 @@ def test_check_lists_what_is_in_doubt(carried_out, damaged):
     assert done.out.splitlines()[-2] == "a run is possible; see the issues"
 
 
-def test_times_that_are_not_seconds_stop_a_run_at_once(cli, damaged, tmp_path, left_nothing):
+def test_times_that_are_not_seconds_stop_a_run_at_once(printed, damaged, tmp_path, left_nothing):
     file = damaged(joints(t=lambda group: 1e3 * group.t))
-    done = cli("solve", file, "--out", tmp_path / "run")
-    assert done.code == 2
-    assert "times are not in seconds: joints/t has a sample every 10 s; if the times are milliseconds, the" in done.err
-    assert "divide by 1e+03" in done.err
+    told = printed("solve", file, "--out", tmp_path / "run", code=2)
+    assert "times are not in seconds: joints/t has a sample every 10 s; if the times are milliseconds, the" in told
+    assert "divide by 1e+03" in told
     left_nothing(file)
 
 
