@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 
+from yid_ocp.data.readers import read_any
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording
+from yid_ocp.errors import DataError
 
 
 def turned(angle: float) -> np.ndarray:
@@ -72,6 +76,13 @@ def table(folder: Path, text: str, name: str = "run.csv") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def refused(path: Path, message: str, read: Callable[..., object] = read_any, **options: Any) -> DataError:
+    """The error that reading ends with."""
+    with pytest.raises(DataError, match=message) as caught:
+        read(path, **options)
+    return caught.value
 
 
 def joints_of(recording: Recording) -> JointGroup:
