@@ -34,15 +34,11 @@ def golden_problem(request, golden, paper_systems):
         )
         held = [1] if name == "single" else [1, 2]
         free = [i for i in range(3) if i not in held]
-        groups = [
-            PointGroup("points_arm", [f"w_T{i + 1}" for i in held], t[1:], trep.w[:, held], 1e-3, sensor_name="arm")
-        ]
+        groups = [PointGroup("points_arm", [f"w_T{i + 1}" for i in held], t[1:], trep.w[:, held], 1e-3, "arm")]
         if vision:
             at = np.arange(33, len(t), 33)
             names, seen = [f"w_T{i + 1}" for i in free], trep.w[at - 1][:, free]
-            groups.append(
-                PointGroup("points_camera", names, t[at], seen, 5e-3, sensor_name="camera", camera_pose=np.eye(4))
-            )
+            groups.append(PointGroup("points_camera", names, t[at], seen, 5e-3, "camera", camera_pose=np.eye(4)))
         start = np.concatenate([trep.q[0], trep.p[0]])
         options = ProblemOptions(
             arm_tracking_feedback="proportional", known_initial_states={"golden": start}, path_cutoff=math.inf
@@ -81,9 +77,7 @@ def pendulum(urdf_folder):
     step = compile_step(system, 0.01)
     t = 0.01 * np.arange(201)
     path = 0.6 * np.sin(2 * np.pi * 0.7 * t) * np.sin(np.pi * t / 2) ** 2
-    camera = PointGroup(
-        "points_camera", ["tip"], t[::4], np.zeros((51, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
-    )
+    camera = PointGroup("points_camera", ["tip"], t[::4], np.zeros((51, 1, 3)), 2e-3, "camera", camera_pose=np.eye(4))
     empty = Recording(JointGroup(["shoulder"], t, path[:, None], position_std=0.0), (camera,), name="twin")
 
     def build(recording: Recording | None = None, values: dict[str, float] | None = None) -> EstimationProblem:

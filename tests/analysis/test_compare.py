@@ -175,9 +175,7 @@ def compared(monkeypatch):
         monkeypatch.setattr(module, "fit_problem", fit)
         monkeypatch.setattr(estimation, "solve", whole)
         monkeypatch.setattr(estimation, "add_intervals_and_checks", lambda _, made: replace(made, message="checked"))
-        monkeypatch.setattr(
-            module, "solution_with_profile_intervals", lambda _, made: replace(made, message="profiled")
-        )
+        monkeypatch.setattr(module, "solution_with_profile_intervals", lambda _, own: replace(own, message="profiled"))
         monkeypatch.setattr(module, "problem_without_input_errors", lambda problem: Problem(problem.options.weighting))
         solvers = [SimpleNamespace(name=name) for name in solutions if name != "all_noise"]
         told = []

@@ -202,9 +202,7 @@ def swung(urdf_folder):
     step = compile_step(system, 0.02, use_compiler=False)
     t = 0.02 * np.arange(41)
     path = 0.4 * np.sin(7.0 * t)
-    camera = PointGroup(
-        CAMERA_GROUP, ["tip"], t[::4], np.zeros((11, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
-    )
+    camera = PointGroup(CAMERA_GROUP, ["tip"], t[::4], np.zeros((11, 1, 3)), 2e-3, "camera", camera_pose=np.eye(4))
 
     def build(effort_std=None, **options):
         joints = JointGroup(["shoulder"], t, path[:, None], position_std=0.0, effort_std=effort_std)
@@ -250,10 +248,8 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert made.problem.episodes[0].grid.steps == 20
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     problem = swung()
-    x = np.array([np.nan, 0.1])
-    found = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, x)).position_sensitivities_of_variant(
-        frozenset()
-    )
+    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, np.array([np.nan, 0.1])))
+    found = builder.position_sensitivities_of_variant(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
@@ -313,9 +309,7 @@ def driven(urdf_folder):
     group = JointGroup(
         ("shoulder", "elbow"), t, angles, effort=np.zeros((51, 2)), effort_kind="command", position_std=1e-3
     )
-    camera = PointGroup(
-        CAMERA_GROUP, ["T1_1_tip"], t[::5], np.zeros((11, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
-    )
+    camera = PointGroup(CAMERA_GROUP, ["T1_1_tip"], t[::5], np.zeros((11, 1, 3)), 2e-3, "camera", camera_pose=np.eye(4))
     step = compile_step(system, 0.02, use_compiler=False)
     return EstimationProblem(step, [Recording(group, (camera,), name="run")], ("T1.bend",), ProblemOptions())
 

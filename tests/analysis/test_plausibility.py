@@ -544,9 +544,7 @@ def hanging(seed: int = 0) -> Recording:
     swing = 0.02 * np.sin(3 * t)[:, None, None] * np.ones((1, 12, 3))
     noise = 2e-4 * np.random.default_rng(seed).standard_normal((200, 12, 3))
     names = (*(f"p{i}" for i in range(9)), "a1", "a2", "a3")
-    return Recording(
-        None, (PointGroup("points", names, t, shape + swing + noise, sensor_name="motion capture"),), name="c"
-    )
+    return Recording(None, (PointGroup("points", names, t, shape + swing + noise, None, "motion capture"),), name="c")
 
 
 @pytest.mark.parametrize(
@@ -568,11 +566,8 @@ def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words, ratio):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert words in doubt.what
-        assert (doubt.recording, doubt.group, doubt.limit_violation_ratio) == (
-            "c",
-            "points",
-            pytest.approx(ratio, rel=5e-3),
-        )
+        assert (doubt.recording, doubt.group) == ("c", "points")
+        assert doubt.limit_violation_ratio == pytest.approx(ratio, rel=5e-3)
 
 
 def test_a_cable_of_which_a_point_is_missing_is_judged_by_the_others():

@@ -122,9 +122,7 @@ def told(sets):
 @pytest.mark.parametrize(("period", "rates"), [(0.2, ["rate:10", "rate:30"]), (0.09, ["rate:30"]), (0.03, [])])
 def test_faster_cameras_than_there_was(held_tube, period, rates):
     recording, t = held_tube.episodes[0].recording, period * np.arange(1, 10)
-    camera = PointGroup(
-        "points_camera", ["T1_0_tip"], t, np.zeros((9, 1, 3)), 2e-3, sensor_name="camera", camera_pose=np.eye(4)
-    )
+    camera = PointGroup("points_camera", ["T1_0_tip"], t, np.zeros((9, 1, 3)), 2e-3, "camera", camera_pose=np.eye(4))
     recordings = [replace(recording, points=(camera,))]
     problem = EstimationProblem(held_tube.step, recordings, held_tube.free, held_tube.options)
     found = what_if(problem, considered_changes={"rate:10", "rate:30"}, evaluate_changes=lambda sets, _: told(sets))

@@ -198,9 +198,7 @@ def test_the_other_arm_of_a_robot(repository):
     assert both.driven[7:] == tuple(name.replace("left_", "right_") for name in system.driven)
     found = {grasp.name: (grasp.holder_frame, grasp.held_frame) for grasp in both.grasps}
     assert found == {"left": ("left_gripper", "w_T2"), "right": ("right_gripper", "w_T3")}
-    assert (
-        system_with_second_arm_holding_object(load_config(repository / "configs" / "dual_arm_vision.yaml"), both)
-        is None
-    )
+    dual = load_config(repository / "configs" / "dual_arm_vision.yaml")
+    assert system_with_second_arm_holding_object(dual, both) is None
     moved = replace(run, model=replace(run.model, arms=replace(run.model.arms, mode="prescribed")))
     assert system_with_second_arm_holding_object(moved, system) is None

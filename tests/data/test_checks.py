@@ -52,9 +52,7 @@ def column(values, j, change):
 def causes(recording, **sensors) -> set[str]:
     chosen = {name.replace("_", "."): options for name, options in sensors.items()}
     found = recording_quality_issues(recording, lambda group: chosen.get(group, SensorOptions()))
-    assert all(
-        doubt.recording == recording.name and doubt.advice and doubt.limit_violation_ratio >= 1 for doubt in found
-    )
+    assert all(own.recording == recording.name and own.advice and own.limit_violation_ratio >= 1 for own in found)
     return {doubt.cause for doubt in found}
 
 

@@ -115,9 +115,8 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
 
 
 def test_a_linear_law_of_a_segment_is_another_stiffness_of_all_its_joints():
-    beam = build_system(
-        load_config(Path(__file__).parents[2] / "configs" / "soft_beam.yaml", ["model.effects=[]", "parameters={}"])
-    )
+    file = Path(__file__).parents[2] / "configs" / "soft_beam.yaml"
+    beam = build_system(load_config(file, ["model.effects=[]", "parameters={}"]))
     values = ca.vertcat(*(spring.stiffness for spring in beam.elastic_joints))
     stiffness = ca.Function("k", [beam.parameters.symbols], [values])(beam.parameters.vector()).full()[:, 0]
     assert stiffness[0] == pytest.approx(2 * stiffness[1])  # half a link

@@ -374,9 +374,8 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
     told = {"sha256": digest, "cases": 2, "seed": 3, "purpose": "report", "configs": {"of": ""}}
     (tmp_path / "commitment.json").write_text(json.dumps(told))
     first, second = diagnosed(), diagnosed()
-    second = replace(
-        second, screening=replace(second.screening, candidate_scores=second.screening.candidate_scores[:2])
-    )
+    few = replace(second.screening, candidate_scores=second.screening.candidate_scores[:2])
+    second = replace(second, screening=few)
     for i, made in enumerate((first, second)):
         value = {"seconds": 9.0, "result": made.to_dict(), "evidence": diagnosis_evidence_to_dict(made)}
         (tmp_path / f"answers/{i}.json").write_text(json.dumps({"name": f"case_{i}", "value": value}))
@@ -386,11 +385,8 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
     assert (said["cases"], said["not_judged"], said["detection"]["3"]["cases"]) == (2, 1, 1)
     assert said["confusion"]["said"] == ["joint_coulomb", "not_judged"]
     [changed] = said["rescored"]["changed"]
-    assert (changed["case"], changed["then"], changed["now"]) == (
-        "case_0",
-        "effect joint_coulomb@elbow",
-        "not_judged -",
-    )
+    known = {"case": "case_0", "then": "effect joint_coulomb@elbow", "now": "not_judged -"}
+    assert {key: changed[key] for key in known} == known
     assert "| of.it | 2 | 1 |" in (tmp_path / "other/table.md").read_text()
 
 

@@ -122,9 +122,8 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
     told = f.finding("unknown", unknown_reason="stand_in", transfer_checks=(f.carried(),)).to_dict()
     [rejected] = told["rejected_candidates"]
     assert (rejected["kind"], rejected["location"], rejected["closure"]) == ("friction", "elbow", 0.9)
-    assert rejected["reason"].startswith(
-        "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ±"
-    )
+    said = "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ±"
+    assert rejected["reason"].startswith(said)
     assert (told["reason"], told["effects"]) == ("stand_in", [])
     assert f.finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []
     # several fail together, by the checks of all

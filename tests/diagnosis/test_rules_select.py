@@ -65,10 +65,8 @@ def bootstrapped(before: HeldOutLoss, after: HeldOutLoss):
     """95 % interval of the closure over resampled blocks, the same for both losses, those without a gap left out."""
     count = len(before.block_sample_counts)
     ratios = []
-    for here in np.random.default_rng(0).integers(0, count, (1000, count)):
-        g0, g1 = (
-            max(of.block_chi2[here].sum() / of.block_sample_counts[here].sum() - 1, 0.0) for of in (before, after)
-        )
+    for at in np.random.default_rng(0).integers(0, count, (1000, count)):
+        g0, g1 = (max(of.block_chi2[at].sum() / of.block_sample_counts[at].sum() - 1, 0.0) for of in (before, after))
         ratios += [1 - g1 / g0] if g0 > 0 else []
     return np.quantile(ratios, (0.025, 0.975))
 
@@ -233,9 +231,7 @@ class Rounds:
         self.losses, self.refits, self.screens, self.heard = losses, [], [], Heard()
         usual = {"fails": (), "absent": (), "before": None, "pairs": (), "left": None, "cost": 1.0, "noisy": False}
         vars(self).update(usual | how)
-        self.scores = tuple(
-            map(lambda of, p, best: score(of, p=p, decrease=best), EFFECTS, p_values, (19.0, 18.0, 17.0))
-        )
+        self.scores = tuple(map(lambda of, p, by: score(of, p=p, decrease=by), EFFECTS, p_values, (19.0, 18.0, 17.0)))
         self.progress, self.skipped, self.is_late = self.heard, [], False
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
 
@@ -274,9 +270,8 @@ class Rounds:
         self.refits.append(([of.kind for of in base], [of.kind for (of,), _ in tried], values.get("k")))
         known = [(*base, of) for (of,), _ in tried]
         if where.startswith("from"):
-            lost = [
-                (of, self.before.get(of.kind, (9.0, 9.2)), 0.5 if of.kind in self.before else 2.0) for (of,) in known
-            ]
+            before = self.before
+            lost = [(of, before.get(of.kind, (9.0, 9.2)), 0.5 if of.kind in before else 2.0) for (of,) in known]
             return [fit([of], loss(*own), cost, {"k": 7.0, f"{of.label}.a": 1.0}) for of, own, cost in lost]
         return [self.fit(effects) for effects in known if "".join(sorted(e.kind for e in effects)) in self.losses]
 
@@ -451,10 +446,6 @@ def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(b
     assert one_round(nominal, [found], min_log_bayes_factor=20.0)[0] == []
 
 
-def near(*fits):
-    return nearest(fits)
-
-
 def test_where_noise_is_left_all_recordings_are_one_likelihood():
     """A spring that bends far away is an offset; chance alone may predict one motion better with it, by 2 here."""
     spring = fit([effect("spring@elbow", amplitude("a"), amplitude("b"))], loss(1.0, 1.0), cost=100.0)
@@ -463,25 +454,25 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     assert held_out_improvement_and_error(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
     assert bic_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
-    assert near(spring, offset) == ["offset@elbow", "spring@elbow"]
+    assert nearest([spring, offset]) == ["offset@elbow", "spring@elbow"]
     # uncertain parameters predict badly; a fit to all recordings would change them
     updated = replace(spring, held_out_loss=replace(spring.held_out_loss, updated_chi2=150.0))
     assert bic_difference(updated, spring) == pytest.approx(150.0 - spring.held_out_loss.total_chi2)
-    assert near(spring, replace(offset, cost=101.5)) == ["spring@elbow", "offset@elbow"]
+    assert nearest([spring, replace(offset, cost=101.5)]) == ["spring@elbow", "offset@elbow"]
     # up to odds of 150 to 1, half as sure as the difference
-    assert near(spring, replace(offset, cost=111.2)) == ["spring@elbow", "offset@elbow"]
-    assert near(spring, replace(offset, cost=111.4)) == ["spring@elbow"]
+    assert nearest([spring, replace(offset, cost=111.2)]) == ["spring@elbow", "offset@elbow"]
+    assert nearest([spring, replace(offset, cost=111.4)]) == ["spring@elbow"]
     # a model's response to an effect is known to a twentieth, so a 400th of what is explained proves nothing
     for cost, found in ((4775.0, ["spring@elbow"]), (4790.0, ["spring@elbow", "offset@elbow"])):
         whole = replace(fit((), loss(1.0, 1.0), cost=cost), residual_count=100)
         assert nearest([spring, replace(offset, cost=113.0)], nominal=whole) == found
     # the likeliest of all recordings counts, whatever is ahead on those held out
     ahead, true = fit([effect("ahead@elbow")], loss(0.9, 1.0), cost=130.0), fit([effect("true@elbow")], loss(1.0, 0.95))
-    assert near(ahead, replace(true, cost=100.0)) == ["true@elbow"]
+    assert nearest([ahead, replace(true, cost=100.0)]) == ["true@elbow"]
     # where more than noise is left, squares are errors of the model
     rough = replace(spring, held_out_loss=loss(1.2, 1.2))
-    assert near(rough, replace(offset, held_out_loss=loss(1.21, 1.21))) == ["spring@elbow"]
-    found = near(replace(rough, cost=1e3), replace(offset, held_out_loss=loss(1.2, 1.2)))
+    assert nearest([rough, replace(offset, held_out_loss=loss(1.21, 1.21))]) == ["spring@elbow"]
+    found = nearest([replace(rough, cost=1e3), replace(offset, held_out_loss=loss(1.2, 1.2))])
     assert found == ["offset@elbow", "spring@elbow"]
 
 

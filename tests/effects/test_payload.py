@@ -126,12 +126,11 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     nominal = arm()
     effect = make_effect("payload", "hand", nominal)
     names = effect.parameters.names
-    near = effect.parameters_as_reported(
-        dict(zip(names, (1.0, 0.0, 0.2, 0.0), strict=True)), dict.fromkeys(names, 0.01)
-    )
+    std = dict.fromkeys(names, 0.01)
+    near = effect.parameters_as_reported(dict(zip(names, (1.0, 0.0, 0.2, 0.0), strict=True)), std)
     assert near["my"].value == pytest.approx(0.2, rel=1e-3)
     assert near["my"].std == 0.01
-    far = effect.parameters_as_reported(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), dict.fromkeys(names, 0.01))
+    far = effect.parameters_as_reported(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), std)
     most = np.hypot(_MAX_PAYLOAD_DISTANCE * 1.0, _MAX_COM_SHIFT * 1.2)
     assert np.hypot(far["my"].value, far["mz"].value) == pytest.approx(most, rel=1e-6)
     assert np.isnan(far["my"].std)

@@ -3,8 +3,6 @@
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.cli import main
-
 PENDULUM = """\
 model:
   robot: {urdf}
@@ -47,13 +45,11 @@ def pendulum(limited_urdf, tmp_path):
 
 
 @pytest.fixture
-def refused(tmp_path, capsys):
+def refused(tmp_path, printed):
     """Check that `plan` refuses some settings with some words and leaves nothing."""
 
     def check(config, settings, words):
-        arguments = [part for setting in settings for part in ("--set", setting)]
-        assert main(["plan", str(config), "--out", str(tmp_path / "out"), *arguments]) == 2
-        told = capsys.readouterr().err
+        told = printed("plan", config, "--out", tmp_path / "out", settings=settings, code=2)
         assert all(word in told for word in words), told
         assert not (tmp_path / "out").exists()
 

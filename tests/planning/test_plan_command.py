@@ -189,24 +189,21 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
     assert {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]} == {PAIR, PAIR[::-1]}
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
-    assert PAIR[0] in "\n".join(
-        summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[outcome.result["format"]](outcome.result))
-    )
+    told = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[outcome.result["format"]](outcome.result))
+    assert PAIR[0] in "\n".join(told)
+
+
+WRONG = ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")
+UNKNOWN = ("no finished run of `solve` or `diagnose`", "plan.parameter_run_folder")
 
 
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (
-            ["plan.parameters_to_identify=[elbow.stifness]"],
-            ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml"),
-        ),
+        (["plan.parameters_to_identify=[elbow.stifness]"], WRONG),
         (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
         (["recordings.estimate=[]"], ("no recording is listed for estimation",)),
-        (
-            ["plan.parameter_run_folder=nowhere"],
-            ("no finished run of `solve` or `diagnose`", "plan.parameter_run_folder"),
-        ),
+        (["plan.parameter_run_folder=nowhere"], UNKNOWN),
         (["plan.duration=0.1", "plan.hold_duration=0.1"], ("too short", "plan.duration")),
     ],
 )

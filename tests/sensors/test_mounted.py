@@ -188,11 +188,8 @@ def test_slopes_with_effects_are_those_of_differences(urdf: Path, recorded: Reco
     """Errors of the sensors, and effects that change what a wrist bears."""
     errors = {"sensor_bias@wrist:lower": {"force_x": 0.3, "torque_z": -0.1}, "sensor_scale@imu:w_T1": {"scale": 1.1}}
     bodies = {"payload@tool": {"mass": 0.2, "mz": 0.01}, "gravity_tilt@world": {"rx": 0.02}}
-    forces = {
-        "aerodynamic_drag@T1": {"cd": 2.0},
-        "grasp_offset@hand": {"dx": 0.01},
-        "clock_scale@clock": {"scale": 1.05},
-    }
+    forces = {"aerodynamic_drag@T1": {"cd": 2.0}, "grasp_offset@hand": {"dx": 0.01}}
+    forces |= {"clock_scale@clock": {"scale": 1.05}}
     system = holding(urdf, effects=errors | bodies | forces, prescribed=ARM)
     tried = [effect.parameters.names[0] for effect in system.effects]
     step = compile_step(system, 0.01, use_compiler=False)
@@ -308,10 +305,7 @@ problem: {{path_cutoff: 10.0, use_compiler: false}}
 """)
     made = load_problem(tmp_path / "run.yaml")
     assert made.system.prescribed == ARM
-    assert {s.sensor.group_name.partition("_")[0] for s in made.episodes[0].measurements} == {
-        "wrist.force",
-        "wrist.torque",
-        "imu",
-    }
+    sensors = {samples.sensor.group_name.partition("_")[0] for samples in made.episodes[0].measurements}
+    assert sensors == {"wrist.force", "wrist.torque", "imu"}
     unused = [f"sensors.{key}.use=false" for key in recorded.sensor_setting_keys if key[:3] in ("imu", "wri")]
     assert load_problem(tmp_path / "run.yaml", unused).system.driven == ARM

@@ -165,10 +165,8 @@ def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
     assert set(injected.INJECTABLE_EFFECT_KINDS) <= set(EFFECTS)
     assert not set(OUT_OF_LIBRARY_FORCE_BUILDERS) & set(EFFECTS)
     tested_elsewhere = {"rotor_inertia", "standard_linear_solid", "hysteresis", *TWINS}
-    assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {
-        *injected._MUJOCO_MODEL_KINDS,
-        *injected._FORCES,
-    }
+    tested = {label.partition("@")[0] for label in SIZES} | tested_elsewhere
+    assert tested == {*injected._MUJOCO_MODEL_KINDS, *injected._FORCES}
     assert set(injected._SENSOR_ERROR_KINDS) <= set(injected.INJECTABLE_EFFECT_KINDS)
     with pytest.raises(ConfigError, match="grasp_slip"):
         run_experiment_with_effects(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])

@@ -95,10 +95,8 @@ def test_friction_that_the_engines_solver_holds_is_found(kind, values) -> None:
 
 def test_what_is_injected_adds_to_ordinary_friction() -> None:
     parts = [InjectedEffect("joint_coulomb", "shoulder", {"tau_c": size}) for size in (0.2, 0.4)]
-    both, whole = (
-        recorded(parts[1:], friction=parts[:1]),
-        recorded([], friction=[replace(parts[0], values={"tau_c": 0.6})]),
-    )
+    both = recorded(parts[1:], friction=parts[:1])
+    whole = recorded([], friction=[replace(parts[0], values={"tau_c": 0.6})])
     assert np.array_equal(both.joints.position, whole.joints.position)
 
 

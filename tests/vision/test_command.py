@@ -142,11 +142,7 @@ def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
 def test_the_examples_run(carried_out, repository, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = (
-        "virtual_frames.duration=1.0",
-        "virtual_frames.frame_rate=4.0",
-        "virtual_frames.dropped_frame_fraction=0.0",
-    )
+    short = ("virtual_frames={duration: 1.0, frame_rate: 4.0, dropped_frame_fraction: 0.0}",)
     coarse = ("options.filters.voxel_size=0.014", "options.calibration.n_frames=3", "write_virtual_frames=true")
     settings = [f"track.{setting}" for setting in (*short, *coarse)]
     done = carried_out("track", file, "--quiet", settings=(*settings, PLAIN, UNDRAWN))

@@ -357,20 +357,16 @@ def test_a_place_without_points_is_hidden_or_empty(points, hidden):
     assert OcclusionMap(points, HOME).hidden_mask(PLACE, RADIUS, 0.01).tolist() == [hidden]
     # what is expected to be asked about saves work and changes nothing
     for expected in (PLACE, PLACE + 0.3, np.empty((0, 3))):
-        assert OcclusionMap(points, HOME, expected_points=expected).hidden_mask(PLACE, RADIUS, 0.01).tolist() == [
-            hidden
-        ]
+        view = OcclusionMap(points, HOME, expected_points=expected)
+        assert view.hidden_mask(PLACE, RADIUS, 0.01).tolist() == [hidden]
 
 
 def test_nothing_is_seen_beside_the_picture_which_ends_where_points_stand_along_its_side():
     camera = CameraIntrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
     behind = patch([0.0, 0.0, 4.0], 1.0)
     places = np.array([[0.0, 0.0, 2.0], [1.2, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    assert OcclusionMap(behind, HOME, camera).hidden_mask(places, np.full(3, 0.02), 0.01).tolist() == [
-        False,
-        True,
-        True,
-    ]
+    found = OcclusionMap(behind, HOME, camera).hidden_mask(places, np.full(3, 0.02), 0.01)
+    assert found.tolist() == [False, True, True]
     wall = patch([0.0, 0.0, 4.0], 2.0, 0.02)  # fills the picture, which is 0.5 wide in x/z
     places, radius = np.array([[0.2, 0.0, 2.0], [0.6, 0.0, 2.0]]), np.full(2, 0.02)
     assert OcclusionMap(wall, HOME).hidden_mask(places, radius, 0.01).tolist() == [False, True]

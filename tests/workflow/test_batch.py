@@ -77,9 +77,8 @@ def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data
 def test_robots_are_configurations_and_what_differs_has_no_history(pendulum, written, pendulum_data, tmp_path):
     other = written(pendulum_data.text.replace("rest_position: 0.2", "rest_position: 0.25"), "other.yaml")
     broken = written(pendulum_data.text.replace("free: true", "fre: true"), "broken.yaml")
-    outcome = run_batch(
-        batch_runs_from_configs([pendulum, other, broken], None, QUICK), tmp_path / "batch", workers=HERE
-    )
+    members = batch_runs_from_configs([pendulum, other, broken], None, QUICK)
+    outcome = run_batch(members, tmp_path / "batch", workers=HERE)
     assert names(outcome) == {"pendulum": "converged", "other": "converged", "broken": "error"}
     assert "fre" in outcome.result["runs"][2]["message"]
     assert outcome.result["history"] is None

@@ -122,9 +122,8 @@ def test_the_baselines_effects_stay_in_the_model(run):
     known = RunEstimates("old", *values, effects={"kelvin_voigt@beam": {"tau": 0.01}})
     with pytest.raises(ConfigError, match="the effect kelvin_voigt@beam"):
         problem_with_earlier_runs(build_problem(run), known)
-    problem, _ = problem_with_earlier_runs(
-        build_problem(run_history.settings_with_baseline_effects(run, (known,))), known
-    )
+    run = run_history.settings_with_baseline_effects(run, (known,))
+    problem, _ = problem_with_earlier_runs(build_problem(run), known)
     assert "kelvin_voigt@beam.tau" in problem.free
     assert problem.unknowns.named_values(problem.initial_unknowns)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
 

@@ -190,12 +190,7 @@ STATED = {
     "joints.position": SensorOptions(std=1e-3),
 }
 
-PRESCRIBED = {
-    "path_cutoff": np.inf,
-    "initial_state": "estimated",
-    "weak_prior_geometric_std": 7.0,
-    "huber_threshold": 1.5,
-}
+MOVED = {"path_cutoff": np.inf, "initial_state": "estimated", "weak_prior_geometric_std": 7.0, "huber_threshold": 1.5}
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +209,7 @@ def problem_of(urdf_folder):
         joints = JointGroup(("shoulder",), t, angle, effort=torque, **noise)
         tip = np.tile([0.0, 0.1, 0.4], (41, 1, 1)) + 0.02 * np.random.default_rng(1).standard_normal((41, 1, 3))
         recording = Recording(joints, (PointGroup("points", ("tip",), t, tip, 0.01),), name="made")
-        own = {"sensors": sensors, "prior_stds": {"elbow.rest": 0.05}} | (PRESCRIBED if role == "prescribed" else {})
+        own = {"sensors": sensors, "prior_stds": {"elbow.rest": 0.05}} | (MOVED if role == "prescribed" else {})
         options = ProblemOptions(**own | changed)
         return EstimationProblem(steps[role], [recording], ("elbow.stiffness", "elbow.rest"), options)
 

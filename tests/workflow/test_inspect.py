@@ -33,9 +33,7 @@ def test_a_recording_whose_start_is_fitted(carried_out, written, tmp_path):
     """A rod of two links under the ceiling, an eighth of a radian aside; the ends of both are seen."""
     aside = 0.3 * np.array([math.sin(0.125), 0.0, -math.cos(0.125)])
     place = np.stack([aside, 2 * aside]) + 1e-4 * np.random.default_rng(1).standard_normal((len(TIMES), 2, 3))
-    camera = PointGroup(
-        "points_camera", ["T1_0_tip", "w_T1"], TIMES, place, 1e-3, sensor_name="camera", camera_pose=np.eye(4)
-    )
+    camera = PointGroup("points_camera", ["T1_0_tip", "w_T1"], TIMES, place, 1e-3, "camera", camera_pose=np.eye(4))
     write_recording(Recording(None, (camera,)), tmp_path / "aside.h5")
     entries = ("--entry", "del[T1_0_y]", "--entry", "del[T1_0_y], T1.bend")
     done = carried_out("inspect", written(HANGING), *entries)

@@ -23,7 +23,6 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import torque_offset_table_rows
 from yid_ocp.workflow import prediction_outputs
@@ -152,12 +151,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
 
 
 def simulated(problem, seeds):
-    episode = problem.episodes[0]
-    outcome = problem.predictor.predict_episode(
-        episode, *problem.unpack_episode_unknowns(problem.initial_unknowns, 0), False
-    )
-    known = (problem.predictor, episode, outcome, problem.theta)
-    return [recording_from_prediction(*known, seed).joints for seed in seeds]
+    return [problem.simulate_synthetic_recording(seed=seed).joints for seed in seeds]
 
 
 def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
