@@ -246,6 +246,19 @@ def benchmark_module(repository):
     return load
 
 
+@pytest.fixture(scope="session")
+def refused_with():
+    """refused_with(error, words): what stands below must end in an error that says all of them."""
+
+    @contextlib.contextmanager
+    def block(error, words):
+        with pytest.raises(error) as caught:
+            yield
+        assert all(word in str(caught.value) for word in words), str(caught.value)
+
+    return block
+
+
 @pytest.fixture
 def written(tmp_path):
     """Write a configuration file and return its path."""

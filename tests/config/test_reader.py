@@ -130,11 +130,9 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("compare: {methods: {newton: {}}}\n", ["no solver 'newton'", "'gauss_newton'?", "1: compare.methods.newton"]),
     ],
 )
-def test_refusals(written, text, words):
-    with pytest.raises(ConfigError) as caught:
+def test_refusals(refused_with, written, text, words):
+    with refused_with(ConfigError, (*words, "run.yaml", "line")):
         load_config(written(text))
-    for word in (*words, "run.yaml", "line"):
-        assert word in str(caught.value)
 
 
 def test_the_solver_and_compared_methods(written):
@@ -199,11 +197,9 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
         ("solver={name:single_shooting}", ["put a space after the colon, as in {name: single_shooting}"]),
     ],
 )
-def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words):
-    with pytest.raises(ConfigError) as caught:
+def test_what_is_set_wrong_is_told_with_the_nearest_key(refused_with, written, setting, words):
+    with refused_with(ConfigError, (*words, f"--set {setting.split('=')[0]}")):
         load_config(written(SET), [setting])
-    for word in (*words, f"--set {setting.split('=')[0]}"):
-        assert word in str(caught.value)
 
 
 # Numbers that may have any value: places, angles, offsets.

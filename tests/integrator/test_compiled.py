@@ -77,14 +77,15 @@ def test_structs_are_laid_out_as_in_the_kernel(step):
 
 
 @pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])
-def test_a_rollout_beyond_all_memory(urdf_folder, use_compiler):
+def test_a_rollout_beyond_all_memory(refused_with, urdf_folder, use_compiler):
     system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"))
     step = compile_step(system, 0.01, use_compiler=use_compiler)
     theta, start, nothing = system.parameters.vector(), np.zeros(4), np.zeros((3, 0))
-    with pytest.raises(InsufficientMemoryError) as caught:
+    with refused_with(
+        InsufficientMemoryError,
+        ("a rollout of 100000000000000 steps with 0 derivatives", "3.2e+06 GB", "fewer parameters"),
+    ):
         simulate(step, theta, start, 10**14)
-    for word in ("a rollout of 100000000000000 steps with 0 derivatives", "3.2e+06 GB", "fewer parameters"):
-        assert word in str(caught.value)
     wide = SensitivityDirections((), np.broadcast_to(0.0, (4, 10**15)))
     said = r"3 steps with 1000000000000000 derivatives, which needs 1\.28e\+08 GB"
     with pytest.raises(InsufficientMemoryError, match=said):

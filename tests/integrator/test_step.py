@@ -251,11 +251,9 @@ def test_a_status_says_what_to_try(single_step, golden, theta_golden):
         ({"constraint_force_at": "end"}, ["constraint_force_at = 'end'", "node, midpoint"]),
     ],
 )
-def test_a_step_that_cannot_be_is_refused(hinge, arguments, words):
-    with pytest.raises(ModelError) as caught:
+def test_a_step_that_cannot_be_is_refused(refused_with, hinge, arguments, words):
+    with refused_with(ModelError, words):
         compile_step(hinge(), **{"time_step": 0.01, **arguments})
-    for word in words:
-        assert word in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -271,17 +269,15 @@ def test_a_step_that_cannot_be_is_refused(hinge, arguments, words):
         ({"internal": [1.0]}, ["internal has shape (1,)", "(0,)"]),
     ],
 )
-def test_wrong_shapes_name_the_array(parts, urdf_folder, change, words):
+def test_wrong_shapes_name_the_array(refused_with, parts, urdf_folder, change, words):
     system, q = parts.closed_loop(urdf_folder)
     step = compile_step(system, 0.01, use_compiler=False)
     s = system.mechanism.joint_index("swing")
     arguments = {"q0": q, "p0": np.zeros(6), "u": np.zeros(2), "theta": system.parameters.vector()}
     arguments |= {"prescribed": (q[[s]], q[[s]])}
     assert step(**arguments)[3].is_converged
-    with pytest.raises(ModelError) as caught:
+    with refused_with(ModelError, words):
         step(**{**arguments, **change})
-    for word in words:
-        assert word in str(caught.value)
 
 
 @pytest.mark.parametrize("use_compiler", [True, False])

@@ -138,12 +138,10 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", list(WRONG))
-def test_errors_of_build(robot, name):
+def test_errors_of_build(refused_with, robot, name):
     action, words = WRONG[name]
-    with pytest.raises(ModelError) as caught:
+    with refused_with(ModelError, words):
         action(robot)
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_a_clamp_has_six_massless_coordinates():
@@ -205,11 +203,9 @@ def test_changed_sets_keep_order_and_symbols(three):
         (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "2 to inf"]),
     ],
 )
-def test_errors_name_what_is_wrong_and_what_is_allowed(three, action, words):
-    with pytest.raises(ConfigError) as caught:
+def test_errors_name_what_is_wrong_and_what_is_allowed(refused_with, three, action, words):
+    with refused_with(ConfigError, words):
         action(three)
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_an_error_has_its_parts_on_lines_of_their_own():

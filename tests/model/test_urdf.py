@@ -183,13 +183,11 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", list(BROKEN))
-def test_a_broken_urdf_is_refused(name, tmp_path):
+def test_a_broken_urdf_is_refused(refused_with, name, tmp_path):
     parts, words = BROKEN[name]
     path = urdf(tmp_path, *parts)
-    with pytest.raises(ModelError) as caught:
+    with refused_with(ModelError, [*words, str(path)]):
         read_urdf(path)
-    for word in [*words, str(path)]:
-        assert word in str(caught.value)
     (tmp_path / "page.urdf").write_text("<html></html>")
     with pytest.raises(ModelError, match="the URDF cannot be read: an element has no 'name'"):
         read_urdf(tmp_path / "page.urdf")
@@ -215,11 +213,9 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
         ),
     ],
 )
-def test_errors_name_what_is_wrong_and_what_is_near(urdf_folder, action, words):
-    with pytest.raises(ModelError) as caught:
+def test_errors_name_what_is_wrong_and_what_is_near(refused_with, urdf_folder, action, words):
+    with refused_with(ModelError, words):
         action(urdf_folder / "mixed_joints.urdf")
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):

@@ -247,7 +247,7 @@ def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
         assert told[1][key][0] == pytest.approx(2 * told[0][key][0], rel=1e-3)
 
 
-def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_urdf):
+def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_with, limited_urdf):
     problem = problem_of(limited_urdf, free=("elbow.stiffness", "shoulder.damping"), prescribed=("shoulder",))
     sensors = {"joints.effort": SensorOptions(use=False)}
     blind = problem.with_options(replace(problem.options, sensors=sensors))
@@ -256,10 +256,10 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
     damping = found.parameter_precisions["shoulder.damping"]
     assert damping.std_planned == damping.std_combined == np.inf
     assert found.parameter_precisions["elbow.stiffness"].std_planned < 1.0
-    with pytest.raises(ConfigError) as caught:
+    with refused_with(
+        ConfigError, ("information about shoulder.damping", "a parameter that changes readings", "standard deviations")
+    ):
         plan_informative_motion(blind, replace(OPTIONS, parameters_to_identify=("shoulder.damping",)))
-    for word in ("information about shoulder.damping", "a parameter that changes readings", "standard deviations"):
-        assert word in str(caught.value)
     options = SimpleNamespace(clamp_pose_point_names="a")
     clamped = SimpleNamespace(system=problem.system, episodes=[None], options=options)
     with pytest.raises(ConfigError, match=r"a plan cannot move clamps(.|\n)*try: let a robot"):
@@ -287,8 +287,6 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
         ({"n_random_starts": 0}, ("n_random_starts = 0", "from 1")),
     ],
 )
-def test_what_is_refused(moved_problem, more, words):
-    with pytest.raises(YidError) as caught:
+def test_what_is_refused(refused_with, moved_problem, more, words):
+    with refused_with(YidError, words):
         plan_informative_motion(moved_problem, replace(OPTIONS, **more))
-    for word in words:
-        assert word in str(caught.value), str(caught.value)
