@@ -190,16 +190,14 @@ def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics, verdict: s
     """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
     if verdict != "unknown":
         return None
-    search = seen.with_events
-    problem = search.problem.with_effort_noise_of_effects(fit.effects, fit.values)
+    problem = seen.with_events.problem.with_effort_noise_of_effects(fit.effects, fit.values)
     if problem is None:
         return None
-    text = f"efforts are noisier beside {hypotheses.join_effect_labels(fit.effects)}: going on with this noise"
-    search.progress.begin_stage(text)
+    seen.search.progress.begin_stage(f"going on with the noise beside {hypotheses.join_effect_labels(fit.effects)}")
     # stored and recorded results are of the noise before
-    search = replace(search, problem=problem, store=NO_REFIT_STORE, record=EffectSearchRecord(), rounds=[])
-    nominal = _fitted_nominal_model(search, seen.nominal.values)
-    return _examined(search, nominal, seen.truncated, seen.is_corrected_for_links, seen.removed)
+    search = replace(seen.with_events, problem=problem, store=NO_REFIT_STORE, record=EffectSearchRecord(), rounds=[])
+    told = seen.truncated, seen.is_corrected_for_links, seen.removed
+    return _examined(search, _fitted_nominal_model(search, seen.nominal.values), *told)
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:

@@ -225,9 +225,9 @@ class AllCandidatesProblem:
         """Return the problem with the smoothed errors of torques and angles of a fit to the same recordings."""
         if fitted is None:
             return self
-        pairs = zip(self.problem.episodes, fitted.episodes, strict=True)
-        episodes = [replace(episode, input_errors=own.input_errors) for episode, own in pairs]
-        return replace(self, problem=self.problem.with_episodes(episodes, self.problem.held_out))
+        pairs, held_out = zip(self.problem.episodes, fitted.episodes, strict=True), self.problem.held_out
+        told = [replace(episode, input_errors=own.input_errors) for episode, own in pairs]
+        return replace(self, problem=self.problem.with_episodes(told, held_out))
 
     def with_effort_noise_of_effects(
         self, effects: Sequence[EffectBase], values: Mapping[str, float]
@@ -238,15 +238,13 @@ class AllCandidatesProblem:
         """
         own, now = self.with_nominal_and_effects_free(effects), self.problem
         theta, _ = own.unpack_episode_unknowns(own.unknown_vector(values), 0)
-
-        def told(episodes: Sequence[Episode]) -> list[Episode]:
-            return [episode_with_effort_noise_at(now.step, episode, now.options, theta) for episode in episodes]
-
-        made = replace(self, problem=now.with_episodes(told(now.episodes), told(now.held_out)), held_out_spread=None)
-        pairs = zip(now.episodes, made.problem.episodes, strict=True)
+        told = partial(episode_with_effort_noise_at, now.step, options=now.options, theta=theta)
+        made = now.with_episodes([*map(told, now.episodes)], [*map(told, now.held_out)])
+        pairs = zip(now.episodes, made.episodes, strict=True)
         samples = (own for before, after in pairs for own in zip(before.measurements, after.measurements, strict=True))
         growth = [np.nanmedian(new.std / old.std, axis=0).max() for old, new in samples if old.sensor.effort_joints]
-        return made if max(growth, default=1.0) > _MIN_NOISE_GROWTH else None
+        is_noisier = max(growth, default=1.0) > _MIN_NOISE_GROWTH
+        return replace(self, problem=made, held_out_spread=None) if is_noisier else None
 
     def truncate_failing_held_out_recordings(
         self, values: Mapping[str, float], kept_fraction: float

@@ -111,20 +111,18 @@ def _gap(result: DiagnosisResult) -> str:
     fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
     sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    detectable = f"{sum(seen)} of {len(seen)} candidates are detectable"
+    p_text, detectable = _p_value_relation(p_value), f"{sum(seen)} of {len(seen)} candidates are detectable"
     said = f"{tests[0].degrees_of_freedom:.0f} effective samples for {unknowns} unknowns; {detectable}"
     texts = {
         "insufficient_data": f"The data are insufficient: {said}.",
-        "no_gap": " ".join(
-            [f"There is no relevant gap ({sizes}; p {_p_value_relation(p_value)}).", *_why_no_gap(result)]
-        ),
+        "no_gap": " ".join([f"There is no relevant gap ({sizes}; p {p_text}).", *_why_no_gap(result)]),
     }
     if result.verdict in texts:
         return texts[result.verdict]
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
-        return f"The gap is real{only} ({sizes}; p {_p_value_relation(p_value)})."
+        return f"The gap is real{only} ({sizes}; p {p_text})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
     small = f"not along what {best.effect.label} would do (p {_p_value_relation(p_value)})"
     return f"As a whole the recordings are explained to within their noise ({sizes}), but {small}."
@@ -233,16 +231,14 @@ def _remains(result: DiagnosisResult) -> list[str]:
     mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
     what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
     exceeds = result.remaining_test.p_value < result.thresholds.significance_level
-    more = f"{what} exceeds noise: {', '.join([*worst.values(), *mostly])}."
-    [said] = _applying(
-        [(exceeds, more), (not exceeds, f"{what} is within noise and the uncertainty of the parameters.")]
-    )
+    more = f"exceeds noise: {', '.join([*worst.values(), *mostly])}"
+    [said] = _applying([(exceeds, more), (not exceeds, "is within noise and the uncertainty of the parameters")])
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_parameters_before_and_after.items()
         if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
     ]
-    return [said, _listed("Changed parameters of the nominal model: ", moved)]
+    return [f"{what} {said}.", _listed("Changed parameters of the nominal model: ", moved)]
 
 
 def _earlier_runs(result: DiagnosisResult) -> list[str]:

@@ -237,8 +237,8 @@ def prepare_episode(
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))
     if functions.input_corrections.angles_depend_on_effort:
-        slower = ZeroPhaseLowPassFilter(_GEAR_LOAD_CUTOFF_FRACTION * options.path_cutoff)
-        parts = (system.driven, low_pass), (system.prescribed, slower)
+        slow = ZeroPhaseLowPassFilter(_GEAR_LOAD_CUTOFF_FRACTION * options.path_cutoff)
+        parts = ((system.driven, low_pass), (system.prescribed, slow))
         load = np.hstack([smoothed_joint_efforts(recording, names, grid, own) for names, own in parts if names])
     known_parameters = options.parameters_by_recording.get(recording.name, {})
     start = errors = None
