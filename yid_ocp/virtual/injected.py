@@ -537,9 +537,9 @@ class _InjectedTerms:
     def __init__(
         self,
         system: System,
-        values: _Values,
+        values: Mapping[str, float],
         effects: Sequence[InjectedEffect],
-        held_frictions: Sequence[InjectedEffect],
+        held_frictions: Sequence[InjectedEffect] = (),
     ) -> None:
         self._effects, self._forces = tuple(effects), list[_ForceCallback]()
         self._scene, self._held_frictions = _EffectContext(system, values), tuple(held_frictions)
