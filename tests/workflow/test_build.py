@@ -236,7 +236,7 @@ def test_a_problem_has_the_options_of_its_section(written):
         ("dual_arm_vision", ["model.arms.mode=prescribed"], True),
         ("dual_arm_vision", [], False),
         ("single_arm_vision", ["model.arms.mode=prescribed"], True),
-        ("baxter_arm", ["recordings.estimate=[]"], False),
+        ("baxter_arm", ["recordings={}"], False),
         ("dual_arm_vision", ["model.arms.mode=prescribed", "recordings.estimate=[]"], False),
     ],
     ids=["two grasps", "driven", "one grasp", "no grasp", "without recordings"],
