@@ -136,7 +136,8 @@ def linearize_candidates(
                     known[point].append(((other - data)[rows.data] * ~is_in_scatter, by_name))
         errors, shifts = [], []
         for (_, first), (error, own) in zip(known[0], known[point], strict=False):
-            change = np.stack([(first | own).get(name, np.zeros_like(error)) for name in trial.unknown_names], axis=1)
+            changes, unmoved = first | own, np.zeros_like(error)
+            change = np.stack([changes.get(name, unmoved) for name in trial.unknown_names], axis=1)
             # the part of a signature that free parameters explain changes with their own signatures
             shift = np.zeros_like(moved)
             shift[rows.data] = change[:, places] - np.delete(change, places, axis=1) @ follow

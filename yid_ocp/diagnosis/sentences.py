@@ -160,14 +160,12 @@ def _causes(result: DiagnosisResult) -> list[str]:
     if added:
         names = " and ".join(_named(entry.effect, added[-1].refitted_model, limits) for entry in added)
         verb, part = "closes" if len(added) == 1 else "together close", "an unknown part of it on held-out motions"
-        interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
-        is_noise = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
-        parts = [
-            (math.isfinite(total.ci_low), f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"),
-            (is_noise, f"{part}, because the nominal model's error there is within noise"),
-            (True, part),
-        ]
-        text.append(f"{names} {verb} {_applying(parts)[0]}.")
+        if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
+            part += ", because the nominal model's error there is within noise"
+        if math.isfinite(total.ci_low):
+            interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
+            part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
+        text.append(f"{names} {verb} {part}.")
     for own, *others in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
     explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
@@ -179,7 +177,9 @@ def _causes(result: DiagnosisResult) -> list[str]:
         "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
     }
     text.append(reasons[result.unknown_reason])
-    return text + _applying([(bool(result.unknown_reason), _several_places(result))])
+    if result.unknown_reason:
+        text.append(_several_places(result))
+    return text
 
 
 def _several_places(result: DiagnosisResult) -> str:
@@ -230,9 +230,9 @@ def _remains(result: DiagnosisResult) -> list[str]:
     worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
     mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
     what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
-    exceeds = result.remaining_test.p_value < result.thresholds.significance_level
-    more = f"exceeds noise: {', '.join([*worst.values(), *mostly])}"
-    [said] = _applying([(exceeds, more), (not exceeds, "is within noise and the uncertainty of the parameters")])
+    said = "is within noise and the uncertainty of the parameters"
+    if result.remaining_test.p_value < result.thresholds.significance_level:
+        said = f"exceeds noise: {', '.join([*worst.values(), *mostly])}"
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_parameters_before_and_after.items()
@@ -264,6 +264,6 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             text.append(f"{made} could not be predicted ({part.failure_message}).")
             continue
         text.append(f"{made} are predicted to {errors} (rms) {how} them, and to {plain} without a diagnosis.")
-        no_better = "That is no better, so the effect may be a substitute for another cause."
-        text += _applying([(not part.is_improved_by_counterfactual, no_better)])
+        if not part.is_improved_by_counterfactual:
+            text.append("That is no better, so the effect may be a substitute for another cause.")
     return text

@@ -234,8 +234,7 @@ def prepare_episode(
     estimated = [own for own in effects if not {*free}.isdisjoint(own.amplitude_parameter_names)]
     sticking = {own.location: own.sticking_speed for own in estimated if own.sticking_speed}
     samples = _samples(step, recording, options, theta, grid, uncertain, sticking)
-    known = (*system.driven, *system.prescribed)
-    load = np.zeros((grid.steps + 1, len(known)))
+    load = np.zeros((grid.steps + 1, len(system.driven) + len(system.prescribed)))
     if functions.input_corrections.angles_depend_on_effort:
         slow = ZeroPhaseLowPassFilter(_GEAR_LOAD_CUTOFF_FRACTION * options.path_cutoff)
         parts = ((system.driven, low_pass), (system.prescribed, slow))
@@ -353,9 +352,9 @@ def episode_with_effort_noise_at(step: Step, episode: Episode, options: ProblemO
     found = {samples.sensor.group_name: samples for samples in again if samples.sensor.effort_joints}
 
     def changed(own: SensorMeasurements) -> SensorMeasurements:
-        if own.sensor.group_name not in found or own.value.shape != found[own.sensor.group_name].value.shape:
+        new = found.get(own.sensor.group_name)
+        if new is None or own.value.shape != new.value.shape:
             return own
-        new = found[own.sensor.group_name]
         weight = np.where(own.weight > 0, new.weight, 0.0)
         std = np.where(np.isnan(own.std), np.nan, new.std)
         return replace(own, weight=weight, std=std, noise_correlation=new.noise_correlation)
