@@ -365,7 +365,7 @@ def test_a_value_near_its_bound_lies_at_it(value, at_bound):
 
 
 def test_the_size_that_a_parameter_might_have():
-    for how, size in (({}, 3.0), ({"upper": 8.0}, 4.0), ({"upper": 8.0, "priors": {"k0": 0.5}}, 0.5)):
+    for how, size in (({}, 3.0), ({"upper": 8.0}, 3.0), ({"upper": 8.0, "priors": {"k0": 0.5}}, 0.5)):
         assert typical_parameter_magnitudes(MadeUp(linear(np.eye(1)), (3.0,), **how), np.ones(1))["k0"] == size
     three = MadeUp(linear(np.eye(2)), (3.0, 5.0), fixed=(9.0,))
     assert typical_parameter_magnitudes(three, np.array([1.0, 5.0]))["k0"] == 7.0

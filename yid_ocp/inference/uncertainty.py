@@ -359,8 +359,8 @@ def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
     """Return the typical magnitude of each free parameter, from priors, bounds, similar parameters or scales.
 
-    It is the first of these that is available: the prior's standard deviation, half the distance of finite bounds, the
-    median of other parameters of the same kind (such as `bend`), or else unit, and the scale of the unknown.
+    It is the first of these that is available: the prior's standard deviation, the median of other parameters of the
+    same kind (such as `bend`), or else unit, and the scale of the unknown, which is the only one for an effect.
     """
     (theta, _), entries = problem.unpack_episode_unknowns(x, 0), list(problem.system.parameters)
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
@@ -373,14 +373,11 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     for entry in entries:
         if entry.name not in (*problem.shared_parameters, *problem.local_parameters):
             continue
-        width = entry.upper - entry.lower
         alike = [o for o in entries if o.name != entry.name and o.unit == entry.unit and "@" not in o.name]
         own = [o for o in alike if o.name.rpartition(".")[2] == entry.name.rpartition(".")[2]]
         others = [float(sizes[o.name]) for o in own or alike if sizes[o.name] > 0]
         if entry.name in known:
             found[entry.name] = float(known[entry.name])
-        elif math.isfinite(width):
-            found[entry.name] = width / 2
         else:
             found[entry.name] = float(np.median(others)) if others and "@" not in entry.name else scales[entry.name]
     return found

@@ -27,8 +27,8 @@ from yid_ocp.solvers import base
 
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
-# After a rejected step: least damping, and length of the next step if the trial had no prediction.
-_MIN_REJECTED_DAMPING, _LENGTH_AFTER_FAILURE = 1e-6, 0.25
+# Length of the next step as a fraction of a rejected one whose trial had no prediction.
+_LENGTH_AFTER_FAILURE = 0.25
 # The search ends after this many accepted steps that together lower the cost by no more than this (a tenth of the cost
 # of one standard deviation) and move no unknown by more than this fraction of its standard deviation, if the predicted
 # decrease is at most the cost of a 95 % interval.
@@ -49,7 +49,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
     lower the cost negligibly compared with the noise, as on a cost with kinks (friction, fast waves over many seconds).
     """
 
-    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 100
     step_tolerance: Annotated[
         float,
         Gt(0),
@@ -133,7 +133,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
             slope = float(residual @ (jacobian @ step))
             fraction = -0.5 * slope / max(trial.cost - now.cost - slope, 1e-300) if trial.ok else _LENGTH_AFTER_FAILURE
             longest = float(np.clip(fraction, 0.1, 0.5) * np.linalg.norm(scaled))
-            rejected, mu = True, max(mu, _MIN_REJECTED_DAMPING)
+            rejected = True
             if np.max(np.abs(scaled)) < self.step_tolerance:
                 if is_stationary_point(problem, x, now):
                     return ended(base.Status.CONVERGED, _LOWEST)
