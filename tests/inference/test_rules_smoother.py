@@ -148,9 +148,9 @@ NOTHING = dict.fromkeys(SOURCES, 0.0)
 
 
 def test_variances_stay_within_their_range_and_rounding_is_never_the_best():
-    variance, _ = smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6})
+    variance, _ = smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6}, 0.0)
     assert variance[FORCE] >= 1e-6
-    exploding, _ = smoother._refined([made(3, size=np.full(3, 1e9))], NOTHING | {FORCE: 1e6})
+    exploding, _ = smoother._refined([made(3, size=np.full(3, 1e9))], NOTHING | {FORCE: 1e6}, 0.0)
     assert exploding[FORCE] <= 1e7
     assert smoother._run([made(1, loose=1e12)], NOTHING).log_evidence == -math.inf
 

@@ -38,6 +38,7 @@ from yid_ocp.inference.smoother import (
     smoothed_unknown_significance_mask,
 )
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns, sensor_bias_location_name
+from yid_ocp.parallel.threads_and_processes import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -157,8 +158,9 @@ def find_force_and_fault_events(
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques)
     cut = [entry for entry in (_before_overspeed(history, ends) for history in histories) if entry is not None]
-    sought = [(history, *detect_force_pulses(history, limits)) for history in cut]
-    found, tries = [(history, pulse) for history, own, _ in sought for pulse in own], sum(n for *_, n in sought)
+    sought = map_in_threads(lambda history: detect_force_pulses(history, limits), cut)
+    found = [(history, pulse) for history, (own, _) in zip(cut, sought, strict=True) for pulse in own]
+    tries = sum(n for _, n in sought)
     real = benjamini_hochberg_mask([pulse.p_value for _, pulse in found], tries, limits.significance_level)
     forces = _one_each([entry for entry, sure in zip(found, real, strict=True) if sure], problem)
     times = {(e.recording, 0.5 * (e.start_time + e.end_time)) for e in wrong}

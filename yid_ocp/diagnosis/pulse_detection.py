@@ -229,7 +229,7 @@ class _Filter:
 
     def __call__(self, windows: _Windows, t: Array) -> Array:
         """Return filtered pulse shapes (M, k) at times (M,)."""
-        return self._seen(windows, t[:, None])
+        return np.asarray(self.of_many(windows, t).toarray())
 
     def of_many(self, windows: _Windows, t: Array) -> _SparseMatrix:
         """Return filtered pulse shapes (M, k) as a sparse matrix, for windows that are short beside the history."""

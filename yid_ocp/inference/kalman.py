@@ -83,13 +83,24 @@ class KalmanStepMatrices:
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
         return noise, pulled + self.observation.T @ noise
 
-    def costate_covariance_before_step(self, information: Array) -> Array:
-        """Compute the costate covariance (nx, nx) before the step from its value `information` after the step."""
+    def costate_covariances_before_step(
+        self, information: Array, other: Array, seen: Array
+    ) -> tuple[Array, Array, Array]:
+        """Compute covariances of the costate before the step, also of m other parameters without variance.
+
+        `information` (nx, nx) is its covariance after the step, `other` (m, nx) that of the others' costates before the
+        step with it, and `seen` (r, m) S^(-1/2) times the measurement's derivatives by them. Returns the covariances
+        (nx, nx) and (m, nx) before the step, and what the measurement adds to the others' variances (m,).
+        """
         shaped, projected = self.whitening @ self.observation, self.projected_covariance
-        pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
-        pulled -= (pulled @ projected.T) @ shaped
-        found = shaped.T @ shaped + pulled - shaped.T @ (projected @ pulled)
-        return (found + found.T) / 2
+        pull = self.transition._propagate_costate_back
+        own, beside = pull(pull(information).T), pull(other.T).T
+        half, half_beside = own @ projected.T, beside @ projected.T
+        core = np.eye(len(shaped)) + projected @ half
+        found = shaped.T @ core @ shaped + own - half @ shaped - (half @ shaped).T
+        cross = seen.T @ (core @ shaped - half.T) + beside - half_beside @ shaped
+        added = np.sum(seen * (core @ seen) - 2 * seen * half_beside.T, axis=0)
+        return (found + found.T) / 2, cross, added
 
 
 def kalman_matrices_and_next_covariance(

@@ -115,24 +115,13 @@ class _Update(NamedTuple):
 
 @dataclass(frozen=True)
 class _Filtered:
-    """Filter of one recording at given variances, with its updates if they were kept."""
+    """Filter of one recording at given variances, for states and unknowns of nonzero variance, which are `used`."""
 
     model: LinearResidualModel
-    begin: Array  # first state and unknowns by the first disturbances, shape (ns + nd, nd)
+    used: IntArray
     products: Array  # V' S^-1 V, shape (1 + ntheta, 1 + ntheta)
     log_determinant: float  # infinite if large variances make the filter ill-conditioned
-    updates: Sequence[_Update]
-
-    @cached_property
-    def error_steps(self) -> Sequence[tuple[Array, Array, Array, StateTransition]]:
-        """For each interval: whitened observation; its columns of nonzero variance, with their gain and transition."""
-        found, ns = [], len(self.model.initial_state_std)
-        kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(self.updates[0].p)[ns:] > 0)])
-        for step in (update.step for update in self.updates):
-            move, shaped = step.transition, step.whitening @ step.observation
-            follow = StateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
-            found.append((shaped, shaped[:, kept], step.projected_covariance[:, kept].T.copy(), follow))
-        return found
+    updates: Sequence[_Update]  # empty if they were not kept
 
 
 class _Smoothed(NamedTuple):
@@ -147,8 +136,7 @@ class _Smoothed(NamedTuple):
 
 def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filtered:
     """Filter one recording with given variances of the unknowns, shape (nd,)."""
-    # scores of unknowns with zero variance are not needed
-    used = np.arange(len(variance)) if keep else np.flatnonzero(variance > 0)
+    used = np.flatnonzero(variance > 0)
     variance = variance[used]
     ns, nd = len(model.initial_state_std), len(variance)
     size, columns = ns + nd, model.intervals[0].negative_residual_jacobian.shape[1]
@@ -166,7 +154,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         transition = StateTransition(move, np.full(nd, model.interval_correlation))
         step, later, own = kalman_matrices_and_next_covariance(p, design, transition)
         if math.isinf(own):
-            return _Filtered(model, begin, products, math.inf, ())
+            return _Filtered(model, used, products, math.inf, ())
         white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
@@ -174,29 +162,37 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
             updates.append(_Update(step, mean, p, white))
         mean, p = after, later + fresh
         p = (p + p.T) / 2
-    return _Filtered(model, begin, products, log_determinant, updates)
+    return _Filtered(model, used, products, log_determinant, updates)
 
 
 def _backwards(done: _Filtered) -> _Smoothed:
     """Smoother from a filter whose updates were kept."""
-    model, begin, updates = done.model, done.begin, done.updates
-    ns, gain = len(model.initial_state_std), math.sqrt(1 - model.interval_correlation**2)
-    count, (size, columns) = len(updates), updates[0].mean.shape
-    score, information = np.zeros((count, size - ns, columns)), np.zeros((count, size - ns))
-    smoothed, covariance = np.zeros((count, size - ns, columns)), np.zeros((count, size - ns))
-    left: list[Array] = []
+    model, used, updates = done.model, done.used, done.updates
+    rho, start = model.interval_correlation, model.initial_state_jacobian
+    (ns, nd), (size, columns) = start.shape, updates[0].mean.shape
+    count, gain, left = len(updates), math.sqrt(1 - rho**2), list[Array]()
+    score, smoothed = np.zeros((2, count, nd, columns))
+    information, covariance = np.zeros((2, count, nd))
     r, n = np.zeros((size, columns)), np.zeros((size, size))
+    # costates of all unknowns: their values, covariance with those of states and used unknowns, and variance
+    own, cross, variance = np.zeros((nd, columns)), np.zeros((nd, size)), np.zeros(nd)
     for j in reversed(range(count)):
-        update = updates[j]
+        step, mean, p, white = updates[j]
+        seen, drive = step.whitening @ model.intervals[j].unknown_jacobian, model.intervals[j].unknown_input_matrix
         if j + 1 < count:
-            score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        noise, r = update.step.smoothed_measurement_noise_and_costate(update.white, r)
+            score[j + 1], information[j + 1] = gain * own, gain**2 * variance
+        own = drive.T @ r[:ns] + rho * own
+        noise, r = step.smoothed_measurement_noise_and_costate(white, r)
+        own += model.intervals[j].unknown_jacobian.T @ noise
         left.append(noise)
-        n = update.step.costate_covariance_before_step(n)
-        smoothed[j] = (update.mean + update.p @ r)[ns:]
-        own = update.p[ns:]
-        covariance[j] = np.diag(update.p)[ns:] - np.sum((own @ n) * own, axis=1)
-    score[0], information[0] = begin.T @ r, np.sum(begin * (n @ begin), axis=0)
+        pulled = drive.T @ n[:ns] + rho * cross
+        variance = np.sum((pulled[:, :ns] + rho * cross[:, :ns]) * drive.T, axis=1) + rho**2 * variance
+        n, cross, added = step.costate_covariances_before_step(n, pulled, seen)
+        variance = variance + added
+        smoothed[j, used] = (mean + p @ r)[ns:]
+        covariance[j, used] = np.diag(p)[ns:] - np.sum((p[ns:] @ n) * p[ns:], axis=1)
+    score[0] = start.T @ r[:ns] + own
+    information[0] = np.sum((start.T @ n[:ns, :ns] + 2 * cross[:, :ns]) * start.T, axis=1) + variance
     return _Smoothed(score, information, smoothed, covariance, tuple(reversed(left)))
 
 
@@ -259,14 +255,17 @@ def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[
     return found
 
 
-def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]:
-    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
+def _refined(models: _Models, variance: _Variances, without: float) -> tuple[_Variances, _State]:
+    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation.
+
+    It ends when an iteration adds little to the rise of the log evidence above that `without` any group.
+    """
     state = _run(models, variance)
     for _ in range(_MAX_ITERATIONS):
         ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in _scores(models, state).items()}
         trial = {s: float(np.clip(v * ratio[s], *_VARIANCE_BOUNDS)) if v else 0.0 for s, v in variance.items()}
         after = _run(models, trial)
-        if not after.log_evidence > state.log_evidence + 0.05:
+        if not after.log_evidence > state.log_evidence + max(0.05, 1e-4 * (after.log_evidence - without)):
             break
         variance, state = trial, after
     return variance, state
@@ -276,6 +275,7 @@ def _selected(
     models: _Models, sources: _Groups, variance: _Variances, state: _State, least: float
 ) -> tuple[_Variances, _State]:
     """Repeatedly add the group that raises the log evidence most, while the rise is more than `least`."""
+    without = state.log_evidence
     while sum(v > 0 for v in variance.values()) < _MAX_GROUPS:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
@@ -288,7 +288,7 @@ def _selected(
         (evidence, size), source = max(reached, key=lambda pair: pair[0][0])
         if not evidence > state.log_evidence + least:
             break
-        variance, state = _refined(models, variance | {source: size})
+        variance, state = _refined(models, variance | {source: size}, without)
     return variance, state
 
 
@@ -297,19 +297,19 @@ def _responses(base: _Filtered, chosen: IntArray) -> Array:
     model, updates = base.model, base.updates
     ns, count, u, first = len(model.initial_state_std), len(updates), len(chosen), 0
     # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown;
-    # unknowns without variance stay at zero, and so does all before the disturbance
-    behind, unknown = np.zeros((len(base.error_steps[0][2]), count * u)), np.zeros((count, 1))
+    # all before the disturbance stays at zero
+    behind, unknown = np.zeros((len(updates[0].mean), count * u)), np.zeros((count, 1))
     behind[:ns, :u] = model.initial_state_jacobian[:, chosen]
     found = np.zeros((sum(len(update.white) for update in updates), count * u))
-    for k, (shaped, observation, gain, follow) in enumerate(base.error_steps):
+    for k, (interval, (step, *_)) in enumerate(zip(model.intervals, updates, strict=True)):
         unknown[:k] *= model.interval_correlation
         unknown[k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         begun, left = unknown[: k + 1], behind[:, : (k + 1) * u]
-        rows, first = found[first : first + len(shaped), : left.shape[1]], first + len(shaped)
-        rows[:] = observation @ left + (shaped[:, None, ns + chosen] * begun).reshape(rows.shape)
-        left[:] = follow.propagate_state(left - gain @ rows)
-        drive = updates[k].step.transition.state_rows[:, None, ns + chosen]
-        left[:ns] += (drive * begun).reshape(ns, -1)
+        rows, first = found[first : first + len(step.whitening), : left.shape[1]], first + len(step.whitening)
+        seen = step.whitening @ interval.unknown_jacobian[:, chosen]
+        rows[:] = (step.whitening @ step.observation) @ left + (seen[:, None] * begun).reshape(rows.shape)
+        left[:] = step.transition.propagate_state(left - step.projected_covariance.T @ rows)
+        left[:ns] += (interval.unknown_input_matrix[:, None, chosen] * begun).reshape(ns, -1)
     return found
 
 
