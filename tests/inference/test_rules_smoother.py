@@ -274,7 +274,7 @@ def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
         rows.append(interval.state_jacobian @ state + np.outer(interval.unknown_jacobian[:, unknown], now))
         state = interval.state_transition @ state + np.outer(interval.unknown_input_matrix[:, unknown], now)
     response = np.vstack([*rows, np.zeros((len(reference.y) - COUNT * ROWS, COUNT))])
-    score, information = smoother.force_log_likelihood_coefficients(model, variance, unknown)
+    [(score, information)] = smoother.force_log_likelihood_coefficients(model, variance, [unknown])
     assert score == pytest.approx(response.T @ reference.inverse @ reference.y, rel=1e-7, abs=1e-9)
     assert information == pytest.approx(response.T @ reference.inverse @ response, rel=1e-7, abs=1e-9)
 

@@ -32,6 +32,7 @@ from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
 from yid_ocp.inference.smoother import (
     SIGNIFICANT_Z,
+    SmoothedUnknownGroup,
     SmoothedUnknownsResult,
     force_log_likelihood_coefficients,
     generalised_force_unit,
@@ -262,14 +263,17 @@ def _driving_forces(
             error, held = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64))
             # the last interval is shorter
             full = slice(0, max(len(middle) - 1, 1))
-            for name in sought[model.recording]:
-                index, at = model.unknown_names.index(name), problem.system.mechanism.joint_index(name)
-                source, size = model.unknown_groups[index], model.reference_std[index]
-                variance, unit = smoothed.group_variance | {source: 0.0}, generalised_force_unit(problem.system, name)
-                score, information = force_log_likelihood_coefficients(model, variance, index)
-                what = (model.recording, source.location, name, unit, middle[full])
-                known = (score[full] / size, information[full, full] / size**2)
-                found.append(ForceHistory(*what, *known, error[full, at], held[full, at]))
+            by_source: dict[SmoothedUnknownGroup, list[int]] = {}
+            for index in map(model.unknown_names.index, sought[model.recording]):
+                by_source.setdefault(model.unknown_groups[index], []).append(index)
+            for source, chosen in by_source.items():
+                known = force_log_likelihood_coefficients(model, smoothed.group_variance | {source: 0.0}, chosen)
+                for index, (score, information) in zip(chosen, known, strict=False):
+                    name, size = model.unknown_names[index], model.reference_std[index]
+                    at, unit = problem.system.mechanism.joint_index(name), generalised_force_unit(problem.system, name)
+                    what = (model.recording, source.location, name, unit, middle[full])
+                    told = (score[full] / size, information[full, full] / size**2)
+                    found.append(ForceHistory(*what, *told, error[full, at], held[full, at]))
     return found
 
 

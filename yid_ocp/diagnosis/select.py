@@ -154,11 +154,6 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
 
 
-def _is_significant(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the amplitudes together are at least as significant as one amplitude at `min_z` standard deviations."""
-    return fit.p_values[effect.label] <= math.erfc(limits.min_z / math.sqrt(2.0))
-
-
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better."""
     before, after = without.held_out_loss, fit.held_out_loss
@@ -166,7 +161,9 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Threshold
     is_clear = gained > error
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
-    return is_clear and all(_is_significant(e, fit, limits) for e in _beside(without.effects, fit))
+    # the amplitudes of an effect together are at least as significant as one amplitude at `min_z` standard deviations
+    least = math.erfc(limits.min_z / math.sqrt(2.0))
+    return is_clear and all(fit.p_values[effect.label] <= least for effect in _beside(without.effects, fit))
 
 
 def _beside(effects: Sequence[EffectBase], fit: RefitStatistics) -> list[EffectBase]:

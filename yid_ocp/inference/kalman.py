@@ -83,9 +83,7 @@ class KalmanStepMatrices:
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
         return noise, pulled + self.observation.T @ noise
 
-    def costate_covariances_before_step(
-        self, information: Array, other: Array, seen: Array
-    ) -> tuple[Array, Array, Array]:
+    def costate_covariances_before(self, information: Array, other: Array, seen: Array) -> tuple[Array, Array, Array]:
         """Compute covariances of the costate before the step, also of m other parameters without variance.
 
         `information` (nx, nx) is its covariance after the step, `other` (m, nx) that of the others' costates before the

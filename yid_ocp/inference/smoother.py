@@ -105,11 +105,11 @@ class SmoothedUnknownsResult:
 
 
 class _Update(NamedTuple):
-    """One interval of the filter, kept for the backward pass: prediction `mean`, covariance `p` and innovations."""
+    """One interval of the filter, kept for the backward pass: rows of the used unknowns, and innovations."""
 
     step: KalmanStepMatrices
-    mean: Array
-    p: Array
+    mean: Array  # prediction
+    covariance: Array
     white: Array
 
 
@@ -134,7 +134,7 @@ class _Smoothed(NamedTuple):
     left: tuple[Array, ...]  # smoothed residuals
 
 
-def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filtered:
+def _forwards(model: LinearResidualModel, variance: Array) -> _Filtered:
     """Filter one recording with given variances of the unknowns, shape (nd,)."""
     used = np.flatnonzero(variance > 0)
     variance = variance[used]
@@ -158,8 +158,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
-        if keep:
-            updates.append(_Update(step, mean, p, white))
+        updates.append(_Update(step, mean[ns:], p[ns:].copy(), white))
         mean, p = after, later + fresh
         p = (p + p.T) / 2
     return _Filtered(model, used, products, log_determinant, updates)
@@ -169,7 +168,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
     """Smoother from a filter whose updates were kept."""
     model, used, updates = done.model, done.used, done.updates
     rho, start = model.interval_correlation, model.initial_state_jacobian
-    (ns, nd), (size, columns) = start.shape, updates[0].mean.shape
+    (ns, nd), columns, size = start.shape, updates[0].white.shape[1], updates[0].covariance.shape[1]
     count, gain, left = len(updates), math.sqrt(1 - rho**2), list[Array]()
     score, smoothed = np.zeros((2, count, nd, columns))
     information, covariance = np.zeros((2, count, nd))
@@ -177,7 +176,7 @@ def _backwards(done: _Filtered) -> _Smoothed:
     # costates of all unknowns: their values, covariance with those of states and used unknowns, and variance
     own, cross, variance = np.zeros((nd, columns)), np.zeros((nd, size)), np.zeros(nd)
     for j in reversed(range(count)):
-        step, mean, p, white = updates[j]
+        step, mean, own_covariance, white = updates[j]
         seen, drive = step.whitening @ model.intervals[j].unknown_jacobian, model.intervals[j].unknown_input_matrix
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * own, gain**2 * variance
@@ -187,10 +186,10 @@ def _backwards(done: _Filtered) -> _Smoothed:
         left.append(noise)
         pulled = drive.T @ n[:ns] + rho * cross
         variance = np.sum((pulled[:, :ns] + rho * cross[:, :ns]) * drive.T, axis=1) + rho**2 * variance
-        n, cross, added = step.costate_covariances_before_step(n, pulled, seen)
+        n, cross, added = step.costate_covariances_before(n, pulled, seen)
         variance = variance + added
-        smoothed[j, used] = (mean + p @ r)[ns:]
-        covariance[j, used] = np.diag(p)[ns:] - np.sum((p[ns:] @ n) * p[ns:], axis=1)
+        smoothed[j, used] = mean + own_covariance @ r
+        covariance[j, used] = np.diag(own_covariance[:, ns:]) - np.sum((own_covariance @ n) * own_covariance, axis=1)
     score[0] = start.T @ r[:ns] + own
     information[0] = np.sum((start.T @ n[:ns, :ns] + 2 * cross[:, :ns]) * start.T, axis=1) + variance
     return _Smoothed(score, information, smoothed, covariance, tuple(reversed(left)))
@@ -223,7 +222,7 @@ def _run(models: _Models, variance: _Variances) -> _State:
     """Filter all recordings at given variances."""
 
     def run(model: LinearResidualModel) -> _Filtered:
-        return _forwards(model, model.prior_variances_of_unknowns(variance), True)
+        return _forwards(model, model.prior_variances_of_unknowns(variance))
 
     filtered = tuple(map_in_threads(run, models))
     products = np.sum([done.products for done in filtered], axis=0)
@@ -256,10 +255,7 @@ def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[
 
 
 def _refined(models: _Models, variance: _Variances, without: float) -> tuple[_Variances, _State]:
-    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation.
-
-    It ends when an iteration adds little to the rise of the log evidence above that `without` any group.
-    """
+    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
     for _ in range(_MAX_ITERATIONS):
         ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in _scores(models, state).items()}
@@ -273,8 +269,8 @@ def _refined(models: _Models, variance: _Variances, without: float) -> tuple[_Va
 
 def _selected(
     models: _Models, sources: _Groups, variance: _Variances, state: _State, least: float
-) -> tuple[_Variances, _State]:
-    """Repeatedly add the group that raises the log evidence most, while the rise is more than `least`."""
+) -> tuple[_Variances, float]:
+    """Repeatedly add the group that raises the log evidence most, by more than `least`. Variances and evidence."""
     without = state.log_evidence
     while sum(v > 0 for v in variance.values()) < _MAX_GROUPS:
         found = _scores(models, state)
@@ -289,21 +285,22 @@ def _selected(
         if not evidence > state.log_evidence + least:
             break
         variance, state = _refined(models, variance | {source: size}, without)
-    return variance, state
+    return variance, state.log_evidence
 
 
-def _responses(base: _Filtered, chosen: IntArray) -> Array:
+def _responses(base: _Filtered, chosen: IntArray, correlation: float) -> Array:
     """Innovations caused by disturbances of unit variance of the u chosen unknowns, (rows of all intervals, J u)."""
     model, updates = base.model, base.updates
     ns, count, u, first = len(model.initial_state_std), len(updates), len(chosen), 0
     # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown;
     # all before the disturbance stays at zero
-    behind, unknown = np.zeros((len(updates[0].mean), count * u)), np.zeros((count, 1))
-    behind[:ns, :u] = model.initial_state_jacobian[:, chosen]
+    behind, unknown = np.zeros((updates[0].covariance.shape[1], count * u)), np.zeros((count, 1))
+    if correlation:  # the first disturbance acted before the start
+        behind[:ns, :u] = model.initial_state_jacobian[:, chosen]
     found = np.zeros((sum(len(update.white) for update in updates), count * u))
     for k, (interval, (step, *_)) in enumerate(zip(model.intervals, updates, strict=True)):
-        unknown[:k] *= model.interval_correlation
-        unknown[k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
+        unknown[:k] *= correlation
+        unknown[k] = math.sqrt(1 - correlation**2) if k else 1.0
         begun, left = unknown[: k + 1], behind[:, : (k + 1) * u]
         rows, first = found[first : first + len(step.whitening), : left.shape[1]], first + len(step.whitening)
         seen = step.whitening @ interval.unknown_jacobian[:, chosen]
@@ -323,7 +320,8 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
         return -math.inf, _VARIANCE_BOUNDS[0]
     values, pulls = [], []
     for base in bases:
-        rows = _responses(base, np.flatnonzero([own == source for own in base.model.unknown_groups]))
+        chosen = np.flatnonzero([own == source for own in base.model.unknown_groups])
+        rows = _responses(base, chosen, base.model.interval_correlation)
         value, vectors = np.linalg.eigh(rows.T @ rows)
         values.append(np.maximum(value, 0.0))
         pulls.append(vectors.T @ (rows.T @ np.vstack([update.white for update in base.updates])))
@@ -364,13 +362,14 @@ def smooth_unknowns_about_fit(
         nothing = _run(models, none)
         sides = {"both": sources, "plant": tuple(s for s in sources if s.kind != "bias")}
         sides["sensor"] = tuple(s for s in sources if s.kind == "bias")
-        found: dict[str, tuple[_Variances, _State]] = {}
+        found: dict[str, tuple[_Variances, float]] = {}
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
             found[side] = done[0] if done else _selected(models, own, none, nothing, least)
-        gain = {side: state.log_evidence - nothing.log_evidence for side, (_, state) in found.items()}
-        # a greedy choice among all groups may be worse than a choice among fewer
-        variance, state = max(found.values(), key=lambda entry: entry[1].log_evidence)
+        gain = {side: evidence - nothing.log_evidence for side, (_, evidence) in found.items()}
+        # a greedy choice among all groups may be worse than a choice among fewer; filters are too large to keep all
+        variance = max(found.values(), key=lambda entry: entry[1])[0]
+        state = _run(models, variance) if any(variance.values()) else nothing
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
         drop, alternatives = _alternatives(models, variance, nothing, state, least)
@@ -383,30 +382,22 @@ def smooth_unknowns_about_fit(
 
 
 def force_log_likelihood_coefficients(
-    model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
-) -> tuple[Array, Array]:
-    """Return g (J,) and L (J, J) in the log likelihood g'f - f'L f / 2 of an unknown with values f (J,) in J intervals.
+    model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknowns: Sequence[int]
+) -> list[tuple[Array, Array]]:
+    """Return g (J,) and L (J, J) in the log likelihood g'f - f'L f / 2 of unknowns with values f (J,) in J intervals.
 
-    `unknown` is the index of the unknown; f is in units of the unknown's reference standard deviation. Free parameters,
-    states and other unknowns are integrated out; `variance` has the variances of their groups [squared reference].
+    `unknowns` are indices; f is in units of an unknown's reference standard deviation. Free parameters, states and
+    other unknowns are integrated out; `variance` has the variances of their groups [squared reference]. The list is
+    empty if large variances make the filter ill-conditioned.
     """
-    count, parameters = len(model.intervals), model.intervals[0].negative_residual_jacobian.shape[1] - 1
-    moved = np.zeros((len(model.initial_state_std), count))
-    intervals = []
-    for j, interval in enumerate(model.intervals):
-        seen = interval.state_jacobian @ moved
-        seen[:, j] += interval.unknown_jacobian[:, unknown]
-        moved = interval.state_transition @ moved
-        moved[:, j] += interval.unknown_input_matrix[:, unknown]
-        jacobian = np.hstack([interval.negative_residual_jacobian, seen])
-        rest = np.pad(interval.unreachable_products, (0, count))
-        intervals.append(replace(interval, negative_residual_jacobian=jacobian, unreachable_products=rest))
-    known, split = model.prior_variances_of_unknowns(variance), 1 + parameters
-    products = _forwards(replace(model, intervals=tuple(intervals)), known, False).products
-    free = products[1:split, 1:split] + np.eye(parameters) / 9.0
-    cross = products[split:, 1:split]
-    weighed = np.linalg.solve(free, np.column_stack([products[1:split, 0], cross.T]))
-    return products[split:, 0] - cross @ weighed[:, 0], products[split:, split:] - cross @ weighed[:, 1:]
+    done, found = _forwards(model, model.prior_variances_of_unknowns(variance)), list[tuple[Array, Array]]()
+    free = done.products[1:, 1:] + np.eye(len(done.products) - 1) / 9.0
+    for unknown in unknowns if done.updates else ():
+        rows = _responses(done, np.array([unknown]), 0.0)
+        told = rows.T @ np.vstack([update.white for update in done.updates])
+        weighed = np.linalg.solve(free, np.column_stack([done.products[1:, 0], told[:, 1:].T]))
+        found.append((told[:, 0] - told[:, 1:] @ weighed[:, 0], rows.T @ rows - told[:, 1:] @ weighed[:, 1:]))
+    return found
 
 
 def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedDisturbances:

@@ -153,7 +153,10 @@ def _courses(
             raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
         rows = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)].T
         held = [servos[name].command_interpolation == "held" for name in driven]
-        return [_held(row, edges) if jumps else _straight(row, t) for row, jumps in zip(rows, held, strict=True)]
+        return [
+            _held(row, edges) if jumps else scipy.interpolate.PPoly(np.stack([np.diff(row) / np.diff(t), row[:-1]]), t)
+            for row, jumps in zip(rows, held, strict=True)
+        ]
     if joints.effort is None:
         what, allowed = "joint efforts drive the model, but the recording has none", "the effort of every driven joint"
         hint = "import the efforts, or set model.arms.mode: prescribed"
@@ -178,10 +181,6 @@ def _with_lost_samples(t: Array, values: Array) -> tuple[Array, Array]:
 
 def _held(values: Array, edges: Array) -> scipy.interpolate.PPoly:
     return scipy.interpolate.PPoly(values[None, :], edges)
-
-
-def _straight(values: Array, t: Array) -> scipy.interpolate.PPoly:
-    return scipy.interpolate.PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
 
 
 def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
