@@ -38,7 +38,7 @@ from yid_ocp.diagnosis.refit import (
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, screen_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.verdict import NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
@@ -148,19 +148,19 @@ def _examined(
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     composed.changes_by_encoder_noise.clear()
     nominal = replace(nominal, held_out_loss=held_out_loss(own, nominal.unknowns, nominal.evaluation, spread))
+    least = _LEFT_BY_DISCRETISATION * removed
+    evidence = NominalModelGapEvidence(nominal, *tests, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
+    found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
+    seen = _Examined(replace(search, problem=composed), *found)
     try:
         screened = screen_candidates(composed, (), nominal.values)
     except SolverError:
         if not own.step.time_step > _MAX_STEP_OF_LAST_HALVING:
             raise
-        screened = EMPTY_SCREENING_RESULT
-    evidence = NominalModelGapEvidence(nominal, *tests, screened, discretisation_chi2=_LEFT_BY_DISCRETISATION * removed)
-    search.end_stage("screening")
-    found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
-    seen = _Examined(replace(search, problem=composed), *found)
-    if screened is EMPTY_SCREENING_RESULT:
         return _at_half_time_step(seen, "the model with all candidates fails", 0.0)
-    gap = screened.largest_predicted_chi2_decrease
+    search.end_stage("screening")
+    evidence = replace(evidence, screening=screened)
+    seen, gap = replace(seen, evidence=evidence), screened.largest_predicted_chi2_decrease
     return (evidence.warrants_search(limits) and _at_finer_discretisation(seen, nominal, gap)) or seen
 
 
@@ -186,10 +186,22 @@ def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
 
 
-def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics, verdict: str) -> _Examined | None:
+def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined | None:
+    """The nominal model, examined again if noise or discretisation need it beside the effects; else None."""
+    for entry in judged.selected_effects[-1:]:
+        if judged.verdict == "unknown" and (noisier := _with_noise_beside_effects(seen, entry.refitted_model)):
+            return noisier
+    # of several effects, the last one may correct the error of the discretisation
+    for fit in (entry.refitted_model for entry in judged.selected_effects[-2:][:1]):
+        scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
+        again = scores and refit_with_effects(seen.search.problem, fit.effects, fit.values)
+        if scores and again:
+            return _at_finer_discretisation(seen, again, scores.largest_predicted_chi2_decrease)
+    return None
+
+
+def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examined | None:
     """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
-    if verdict != "unknown":
-        return None
     problem = seen.with_events.problem.with_effort_noise_of_effects(fit.effects, fit.values)
     if problem is None:
         return None
@@ -315,17 +327,10 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
     evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_from_baseline(nominal, limits))
     judged = judge(search, evidence)
-    # what is left beside an effect may be the error of the discretisation
-    is_in_time = time.perf_counter() < search.deadline  # a search that begins anew would find nothing
-    for entry in judged.selected_effects[-1:][:is_in_time]:
-        if noisier := _with_noise_beside_effects(seen, entry.refitted_model, judged.verdict):
-            return _diagnosed(problem, noisier, earlier)
-    for entry in judged.selected_effects[-2:][:is_in_time]:
-        own = entry.refitted_model
-        scores = search.record.screenings.get(f"beside {hypotheses.join_effect_labels(own.effects)}")
-        fit = scores and refit_with_effects(search.problem, own.effects, own.values)
-        if scores and fit and (finer := _at_finer_discretisation(seen, fit, scores.largest_predicted_chi2_decrease)):
-            return _diagnosed(problem, finer, earlier)
+    # after the deadline a search that begins anew would find nothing
+    anew = _examined_anew(seen, judged) if time.perf_counter() < search.deadline else None
+    if anew is not None:
+        return _diagnosed(problem, anew, earlier)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):

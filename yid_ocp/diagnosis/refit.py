@@ -397,8 +397,7 @@ def refit_with_each_effect(
     """Refit the model once for each effect, or pair of effects, added to `base`. Failed refits are omitted.
 
     A refit that cannot predict the held-out recordings has failed. Each entry of `tried` holds the added effects and
-    their initial parameters; `values` are the initial values of all other unknowns. `where` labels these initial values
-    in the store of refits, so that refits of the same effects from other values remain distinct.
+    their initial parameters; `values` are the initial values of all other unknowns, and `where` is their name.
     """
     if not tried:
         return []

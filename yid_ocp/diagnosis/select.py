@@ -334,8 +334,8 @@ def _with_closures(
         again = f"{join_effect_labels(effects[:i])} again"
         fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
         closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        longer = [other for other in later if len(other.effects) == len(fit.effects) + 1]
-        more = [other for other in longer if len(_beside(fit.effects, other)) == 1]
+        # one effect more, and no other one less
+        more = [o for o in later if len(_beside(fit.effects, o)) == 1 == len(o.effects) - len(fit.effects)]
         more = _plausible_beside(fit.effects, more, search.thresholds)
         same = _equivalents_and_shares(effect, chosen.rivals[effect.label])
         found.append(SelectedEffect(effect, fit, closed, *same, tuple(more)))

@@ -49,7 +49,8 @@ def write_report(path: Path, findings: ReportData) -> bool:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": _format_number, "listed": _column_classes, "drawn": figure_html}
+    environment.filters |= {"listed": _column_classes, "drawn": figure_html}
+    environment.filters["number"] = lambda value, digits=4: "–" if value is None else f"{value:.{digits}g}"
     environment.filters["verdict"] = {words: verdict for verdict, words in VERDICT_TABLE_TEXTS.items()}.get
     environment.tests["table"] = lambda block: isinstance(block, SummaryTable)
     environment.tests["command"] = lambda block: isinstance(block, CodeBlock)
@@ -105,10 +106,6 @@ def _packed_script() -> str:
         if file:
             write_text(file, packed)
     return packed
-
-
-def _format_number(value: object, digits: int = 4) -> str:
-    return "–" if value is None else f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def _column_classes(table: SummaryTable) -> list[str]:

@@ -208,9 +208,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     unsure = ("±", "± if start and grasps were unknown", "± if all else were known")
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval", "unit", "verdict")]
     for name, entry in parameters.items():
-        spread = (_relative(entry[key]) for key in ("std_relative", "std_relative_unknown", "std_alone"))
-        relative = entry["std_relative"]
-        interval = _interval_cell(entry, None if relative is None else relative * abs(entry["value"]))
+        stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
+        spread = (
+            "unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else f"{s:.2g} times" for s in stds
+        )
+        interval = _interval_cell(entry, None if stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
@@ -239,10 +241,6 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     yield SummaryStatement(f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else "", "verdict")
-
-
-def _relative(value: float | None) -> str:
-    return "unknown" if value is None else f"{percent_number_text(value)} %" if value < 10 else f"{value:.2g} times"
 
 
 @register_summary("yid-friction/1")
