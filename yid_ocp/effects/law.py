@@ -107,7 +107,8 @@ class TorqueLaw(base.EffectBase):
         values = ca.vertcat(*(self.parameters[name].symbol for name in self.knot_parameter_names(quantity)))
         first, slope, *cubes = ca.vertsplit(ca.SX(ca.DM(_truncated_power_weights(len(knots)))) @ values)
         place = ca.fmin(ca.fmax((x - knots[0]) / (knots[1] - knots[0]), 0), len(knots) - 1)
-        return first + slope * place + sum(cube * ca.fmax(place - k, 0) ** 3 for k, cube in enumerate(cubes))
+        # a comparison has no derivative, that of a maximum needs a division
+        return first + slope * place + sum(cube * (place > k) * (place - k) ** 3 for k, cube in enumerate(cubes))
 
 
 def _truncated_power_weights(count: int) -> Array:
