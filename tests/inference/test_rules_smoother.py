@@ -148,11 +148,11 @@ NOTHING = dict.fromkeys(SOURCES, 0.0)
 
 
 def test_variances_stay_within_their_range_and_rounding_is_never_the_best():
-    variance, _ = smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6}, 0.0)
+    variance, _ = smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6})
     assert variance[FORCE] >= 1e-6
-    exploding, _ = smoother._refined([made(3, size=np.full(3, 1e9))], NOTHING | {FORCE: 1e6}, 0.0)
+    exploding, _ = smoother._refined([made(3, size=np.full(3, 1e9))], NOTHING | {FORCE: 1e6})
     assert exploding[FORCE] <= 1e7
-    assert smoother._run([made(1, loose=1e12)], NOTHING).log_evidence == -math.inf
+    assert smoother._refined([made(1, loose=1e12)], NOTHING)[1].log_evidence == -math.inf
 
 
 def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
@@ -268,13 +268,14 @@ def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
     model = made(5)
     variance = dict(zip(SOURCES, (0.8, 0.0, 2.5), strict=True))
     reference = Dense([model], variance)
+    assert smoother.force_log_likelihood_coefficients(made(1, loose=1e12), variance, [unknown]) == []
     state, rows = np.zeros((STATES, COUNT)), []
     for j, interval in enumerate(model.intervals):
         now = np.eye(COUNT)[j]
         rows.append(interval.state_jacobian @ state + np.outer(interval.unknown_jacobian[:, unknown], now))
         state = interval.state_transition @ state + np.outer(interval.unknown_input_matrix[:, unknown], now)
     response = np.vstack([*rows, np.zeros((len(reference.y) - COUNT * ROWS, COUNT))])
-    [(score, information)] = smoother.force_log_likelihood_coefficients(model, variance, [unknown])
+    score, information = smoother.force_log_likelihood_coefficients(model, variance, [1, unknown])[1]
     assert score == pytest.approx(response.T @ reference.inverse @ reference.y, rel=1e-7, abs=1e-9)
     assert information == pytest.approx(response.T @ reference.inverse @ response, rel=1e-7, abs=1e-9)
 

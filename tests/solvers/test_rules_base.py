@@ -19,7 +19,7 @@ from yid_ocp.inference.linearized_residual import (
 from yid_ocp.problem.evaluation import PriorResiduals
 from yid_ocp.solvers import GaussNewton, base
 from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, fit_problem
-from yid_ocp.solvers.gradient_methods import _PATIENCE_STEPS
+from yid_ocp.solvers.gradient_methods import _LENGTH_AFTER_FAILURE, _PATIENCE_STEPS
 
 INSIDE = [((1, 1), (3, -4), 8.0), ((1, 1), (5, -1), 5.0)]
 LOW = [((0, 1), (5, -1), 2.0), ((0, 1), (-5, -1), 5.0), ((0, 2), (5, -9), 0.0), ((-0.1, 2.1), (5, -9), 0.0)]
@@ -478,11 +478,11 @@ def test_an_unknown_clipped_to_its_bound_at_zero_comes_back():
     assert found.x[0] == pytest.approx(2.0, abs=1e-2)
 
 
-def edge(limit):
+def edge(limit, weak=10.0):
     """A weakly informed unknown drawn to 2 beside a well informed one; beyond a limit nothing can be predicted."""
 
     def rows(x, duration):
-        return None if x[0] > limit else (np.array([10.0 * (x[0] - 2.0), 1e3 * x[1]]), np.diag([10.0, 1e3]))
+        return None if x[0] > limit else (np.array([weak * (x[0] - 2.0), 1e3 * x[1]]), np.diag([weak, 1e3]))
 
     return MadeUp(rows, (1.0, 1.0), lower=-np.inf)
 
@@ -495,6 +495,13 @@ def test_a_rejected_step_is_followed_by_one_that_is_shorter_along_what_is_weakly
     assert tried[0] == pytest.approx(1.0, rel=0.02)
     assert accepted == 1
     assert tried[accepted] >= 0.02
+
+
+def test_the_step_after_a_rejected_one_is_as_long_as_that_suggests_whatever_the_damping():
+    problem = edge(1.2, weak=0.1)
+    GaussNewton(initial_damping=1e-12).minimize_cost(problem, np.array([1.0, 0.0]), None)
+    moved = problem.asked[2][0][0] - 1.0
+    assert 0.05 < moved <= _LENGTH_AFTER_FAILURE
 
 
 def test_at_the_edge_of_what_can_be_predicted_the_search_stalls_soon():

@@ -29,11 +29,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.sensors import measuring_camera_pose
 from yid_ocp.sensors.base import missing_noise_level_error
-from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_SENSOR_KEY,
-    JOINT_POSITION_GROUP_NAME,
-    is_point_group_measured_by_arm,
-)
+from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 

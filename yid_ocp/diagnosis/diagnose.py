@@ -188,16 +188,17 @@ def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
 
 def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined | None:
     """The nominal model, examined again if noise or discretisation need it beside the effects; else None."""
-    for entry in judged.selected_effects[-1:]:
-        if judged.verdict == "unknown" and (noisier := _with_noise_beside_effects(seen, entry.refitted_model)):
-            return noisier
-    # of several effects, the last one may correct the error of the discretisation
-    for fit in (entry.refitted_model for entry in judged.selected_effects[-2:][:1]):
-        scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
-        again = scores and refit_with_effects(seen.search.problem, fit.effects, fit.values)
-        if scores and again:
-            return _at_finer_discretisation(seen, again, scores.largest_predicted_chi2_decrease)
-    return None
+    fits = [entry.refitted_model for entry in judged.selected_effects]
+    if not fits:
+        return None
+    if judged.verdict == "unknown" and (noisier := _with_noise_beside_effects(seen, fits[-1])):
+        return noisier
+    fit = fits[max(len(fits) - 2, 0)]  # the last of several effects may correct the error of the discretisation
+    scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
+    again = scores and refit_with_effects(seen.search.problem, fit.effects, fit.values)
+    if not scores or not again:
+        return None
+    return _at_finer_discretisation(seen, again, scores.largest_predicted_chi2_decrease)
 
 
 def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examined | None:

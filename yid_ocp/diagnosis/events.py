@@ -32,7 +32,6 @@ from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
 from yid_ocp.inference.smoother import (
     SIGNIFICANT_Z,
-    SmoothedUnknownGroup,
     SmoothedUnknownsResult,
     force_log_likelihood_coefficients,
     generalised_force_unit,
@@ -263,12 +262,11 @@ def _driving_forces(
             error, held = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64))
             # the last interval is shorter
             full = slice(0, max(len(middle) - 1, 1))
-            by_source: dict[SmoothedUnknownGroup, list[int]] = {}
-            for index in map(model.unknown_names.index, sought[model.recording]):
-                by_source.setdefault(model.unknown_groups[index], []).append(index)
-            for source, chosen in by_source.items():
+            indices = [model.unknown_names.index(name) for name in sought[model.recording]]
+            for source in dict.fromkeys(model.unknown_groups[index] for index in indices):
+                chosen = [index for index in indices if model.unknown_groups[index] == source]
                 known = force_log_likelihood_coefficients(model, smoothed.group_variance | {source: 0.0}, chosen)
-                for index, (score, information) in zip(chosen, known, strict=False):
+                for index, (score, information) in zip(chosen if known else (), known, strict=True):
                     name, size = model.unknown_names[index], model.reference_std[index]
                     at, unit = problem.system.mechanism.joint_index(name), generalised_force_unit(problem.system, name)
                     what = (model.recording, source.location, name, unit, middle[full])

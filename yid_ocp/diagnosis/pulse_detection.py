@@ -186,7 +186,7 @@ class DetectedForcePulse:
         return self.peak_value * self.impulse_per_unit_peak
 
     def filtered_force_at(self, t: Array, cutoff: float = math.inf) -> Array:
-        """Return the force of the pulse at the times `t` (M,), after a low-pass filter with the cutoff [Hz]."""
+        """Return the force of the pulse at increasing times `t` (M,), after a low-pass filter with the cutoff [Hz]."""
         window = _Windows(*map(np.atleast_1d, (self.start_time, self.end_time, self.is_flat_topped)))
         return self.peak_value * _Filter.of(cutoff)(window, t)[:, 0]
 
@@ -228,7 +228,7 @@ class _Filter:
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:
-        """Return filtered pulse shapes (M, k) at times (M,)."""
+        """Return filtered pulse shapes (M, k) at increasing times (M,)."""
         return np.asarray(self.of_many(windows, t).toarray())
 
     def of_many(self, windows: _Windows, t: Array) -> _SparseMatrix:

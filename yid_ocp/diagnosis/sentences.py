@@ -160,7 +160,8 @@ def _causes(result: DiagnosisResult) -> list[str]:
     if added:
         names = " and ".join(_named(entry.effect, added[-1].refitted_model, limits) for entry in added)
         verb, part = "closes" if len(added) == 1 else "together close", "an unknown part of it on held-out motions"
-        part += ", because the nominal model's error there is within noise"
+        if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
+            part += ", because the nominal model's error there is within noise"
         if math.isfinite(total.ci_low):
             interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
             part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"

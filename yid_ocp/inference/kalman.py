@@ -84,11 +84,11 @@ class KalmanStepMatrices:
         return noise, pulled + self.observation.T @ noise
 
     def costate_covariances_before(self, information: Array, other: Array, seen: Array) -> tuple[Array, Array, Array]:
-        """Compute covariances of the costate before the step, also of m other parameters without variance.
+        """Compute covariances of the costate before the step, also of the costates of m parameters of any variance.
 
-        `information` (nx, nx) is its covariance after the step, `other` (m, nx) that of the others' costates before the
-        step with it, and `seen` (r, m) S^(-1/2) times the measurement's derivatives by them. Returns the covariances
-        (nx, nx) and (m, nx) before the step, and what the measurement adds to the others' variances (m,).
+        `information` (nx, nx) is that of the state's costate after the step. `other` (m, nx) is that of the parameters'
+        costates, already before the transition, with it. `seen` (r, m) is S^(-1/2) times the measurement's derivatives
+        by them. Returns both before the step, and what the measurement adds to the parameters' variances (m,).
         """
         shaped, projected = self.whitening @ self.observation, self.projected_covariance
         pull = self.transition._propagate_costate_back

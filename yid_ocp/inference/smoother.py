@@ -50,6 +50,7 @@ _DETECTABLE_CHI2_RISE = 10.0  # rise of r'r that shows an unknown
 _MIN_TIED_EVIDENCE_RATIO = 0.9  # share of a location's evidence at which an alternative is named
 _MAX_GROUPS = 4  # selected at most
 _MAX_ITERATIONS = 12  # fixed-point iterations on the standard deviations
+_MIN_EVIDENCE_GAIN = 0.2  # of an iteration, else it is the last one; groups differ significantly by 5 or more
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
 _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
 
@@ -105,12 +106,12 @@ class SmoothedUnknownsResult:
 
 
 class _Update(NamedTuple):
-    """One interval of the filter, kept for the backward pass: rows of the used unknowns, and innovations."""
+    """One interval of the filter, kept for the backward pass."""
 
     step: KalmanStepMatrices
-    mean: Array  # prediction
-    covariance: Array
-    white: Array
+    mean: Array  # prediction of the `used` unknowns, shape (used, 1 + ntheta)
+    covariance: Array  # with states and used unknowns, shape (used, ns + used)
+    white: Array  # innovations
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ class _Filtered:
     used: IntArray
     products: Array  # V' S^-1 V, shape (1 + ntheta, 1 + ntheta)
     log_determinant: float  # infinite if large variances make the filter ill-conditioned
-    updates: Sequence[_Update]  # empty if they were not kept
+    updates: Sequence[_Update]  # empty if the filter is ill-conditioned
 
 
 class _Smoothed(NamedTuple):
@@ -165,7 +166,7 @@ def _forwards(model: LinearResidualModel, variance: Array) -> _Filtered:
 
 
 def _backwards(done: _Filtered) -> _Smoothed:
-    """Smoother from a filter whose updates were kept."""
+    """Smoother from a filter that is not ill-conditioned."""
     model, used, updates = done.model, done.used, done.updates
     rho, start = model.interval_correlation, model.initial_state_jacobian
     (ns, nd), columns, size = start.shape, updates[0].white.shape[1], updates[0].covariance.shape[1]
@@ -254,16 +255,20 @@ def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[
     return found
 
 
-def _refined(models: _Models, variance: _Variances, without: float) -> tuple[_Variances, _State]:
+def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]:
     """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
+    if math.isinf(state.log_evidence):
+        return variance, state
     for _ in range(_MAX_ITERATIONS):
         ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in _scores(models, state).items()}
         trial = {s: float(np.clip(v * ratio[s], *_VARIANCE_BOUNDS)) if v else 0.0 for s, v in variance.items()}
         after = _run(models, trial)
-        if not after.log_evidence > state.log_evidence + max(0.05, 1e-4 * (after.log_evidence - without)):
+        gained = after.log_evidence - state.log_evidence
+        if gained > 0:
+            variance, state = trial, after
+        if not gained > _MIN_EVIDENCE_GAIN:
             break
-        variance, state = trial, after
     return variance, state
 
 
@@ -271,7 +276,6 @@ def _selected(
     models: _Models, sources: _Groups, variance: _Variances, state: _State, least: float
 ) -> tuple[_Variances, float]:
     """Repeatedly add the group that raises the log evidence most, by more than `least`. Variances and evidence."""
-    without = state.log_evidence
     while sum(v > 0 for v in variance.values()) < _MAX_GROUPS:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
@@ -284,7 +288,10 @@ def _selected(
         (evidence, size), source = max(reached, key=lambda pair: pair[0][0])
         if not evidence > state.log_evidence + least:
             break
-        variance, state = _refined(models, variance | {source: size}, without)
+        more, reached_state = _refined(models, variance | {source: size})
+        if math.isinf(reached_state.log_evidence):
+            break
+        variance, state = more, reached_state
     return variance, state.log_evidence
 
 
@@ -390,7 +397,8 @@ def force_log_likelihood_coefficients(
     other unknowns are integrated out; `variance` has the variances of their groups [squared reference]. The list is
     empty if large variances make the filter ill-conditioned.
     """
-    done, found = _forwards(model, model.prior_variances_of_unknowns(variance)), list[tuple[Array, Array]]()
+    found: list[tuple[Array, Array]] = []
+    done = _forwards(model, model.prior_variances_of_unknowns(variance))
     free = done.products[1:, 1:] + np.eye(len(done.products) - 1) / 9.0
     for unknown in unknowns if done.updates else ():
         rows = _responses(done, np.array([unknown]), 0.0)

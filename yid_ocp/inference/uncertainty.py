@@ -357,10 +357,10 @@ def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
 
 
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
-    """Return the typical magnitude of each free parameter, from priors, bounds, similar parameters or scales.
+    """Return the typical magnitude of each free parameter, from priors, similar parameters or scales.
 
-    It is the first of these that is available: the prior's standard deviation, the median of other parameters of the
-    same kind (such as `bend`), or else unit, and the scale of the unknown, which is the only one for an effect.
+    It is the first of these that is available: the prior's standard deviation; the median of other parameters of the
+    same kind (such as `bend`), or of the same unit, except for effects; and the scale of the unknown.
     """
     (theta, _), entries = problem.unpack_episode_unknowns(x, 0), list(problem.system.parameters)
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
@@ -376,10 +376,8 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
         alike = [o for o in entries if o.name != entry.name and o.unit == entry.unit and "@" not in o.name]
         own = [o for o in alike if o.name.rpartition(".")[2] == entry.name.rpartition(".")[2]]
         others = [float(sizes[o.name]) for o in own or alike if sizes[o.name] > 0]
-        if entry.name in known:
-            found[entry.name] = float(known[entry.name])
-        else:
-            found[entry.name] = float(np.median(others)) if others and "@" not in entry.name else scales[entry.name]
+        usual = float(np.median(others)) if others and "@" not in entry.name else scales[entry.name]
+        found[entry.name] = float(known.get(entry.name, usual))
     return found
 
 
