@@ -137,9 +137,8 @@ class _Smoothed(NamedTuple):
 
 def _forwards(model: LinearResidualModel, variance: Array) -> _Filtered:
     """Filter one recording with given variances of the unknowns, shape (nd,)."""
-    used = np.flatnonzero(variance > 0)
-    variance = variance[used]
-    ns, nd = len(model.initial_state_std), len(variance)
+    variance = variance[used := np.flatnonzero(variance > 0)]
+    ns, nd = len(model.initial_state_std), len(used)
     size, columns = ns + nd, model.intervals[0].negative_residual_jacobian.shape[1]
     fresh = np.zeros((size, size))
     fresh[ns:, ns:] = (1 - model.interval_correlation**2) * np.diag(variance)
@@ -159,7 +158,7 @@ def _forwards(model: LinearResidualModel, variance: Array) -> _Filtered:
         white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
-        updates.append(_Update(step, mean[ns:], p[ns:].copy(), white))
+        updates.append(_Update(step, mean[ns:].copy(), p[ns:].copy(), white))
         mean, p = after, later + fresh
         p = (p + p.T) / 2
     return _Filtered(model, used, products, log_determinant, updates)
@@ -393,16 +392,16 @@ def force_log_likelihood_coefficients(
 ) -> list[tuple[Array, Array]]:
     """Return g (J,) and L (J, J) in the log likelihood g'f - f'L f / 2 of unknowns with values f (J,) in J intervals.
 
-    `unknowns` are indices; f is in units of an unknown's reference standard deviation. Free parameters, states and
-    other unknowns are integrated out; `variance` has the variances of their groups [squared reference]. The list is
-    empty if large variances make the filter ill-conditioned.
+    `unknowns` are indices. f is in units of the unknown's reference, `variance` of the groups in its square. Free
+    parameters, states and other unknowns are integrated out. The list is empty if the filter is ill-conditioned.
     """
-    found: list[tuple[Array, Array]] = []
     done = _forwards(model, model.prior_variances_of_unknowns(variance))
-    free = done.products[1:, 1:] + np.eye(len(done.products) - 1) / 9.0
-    for unknown in unknowns if done.updates else ():
-        rows = _responses(done, np.array([unknown]), 0.0)
-        told = rows.T @ np.vstack([update.white for update in done.updates])
+    if not done.updates:
+        return []
+    free, found, u = done.products[1:, 1:] + np.eye(len(done.products) - 1) / 9.0, [], len(unknowns)
+    responses = _responses(done, np.array(unknowns, int), 0.0)
+    products = responses.T @ np.vstack([update.white for update in done.updates])
+    for rows, told in ((responses[:, i::u], products[i::u]) for i in range(u)):
         weighed = np.linalg.solve(free, np.column_stack([done.products[1:, 0], told[:, 1:].T]))
         found.append((told[:, 0] - told[:, 1:] @ weighed[:, 0], rows.T @ rows - told[:, 1:] @ weighed[:, 1:]))
     return found

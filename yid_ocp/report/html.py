@@ -50,7 +50,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"listed": _column_classes, "drawn": figure_html}
-    environment.filters["number"] = lambda value, digits=4: "–" if value is None else f"{value:.{digits}g}"
+    environment.filters["number"] = lambda x, n=4: "–" if x is None else f"{x:.{n}g}" if isinstance(x, float) else x
     environment.filters["verdict"] = {words: verdict for verdict, words in VERDICT_TABLE_TEXTS.items()}.get
     environment.tests["table"] = lambda block: isinstance(block, SummaryTable)
     environment.tests["command"] = lambda block: isinstance(block, CodeBlock)
