@@ -437,14 +437,12 @@ def light_recording(light):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("time_step", "status"), [(0.005, Status.STALLED), (0.0025, Status.CONVERGED)])
-def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, light_recording, time_step, status):
-    """At 5 ms it ends, with every sign of success, thousands of standard deviations from the truth."""
+def test_a_search_that_converged_at_an_unstable_time_step_has_stalled(light, light_recording, time_step, status):
+    """At 5 ms the estimate depends on rollouts in which an error grows by more than half per step."""
     options = ProblemOptions(path_cutoff=np.inf)
     problem = EstimationProblem(light(0.3, time_step), [light_recording], ("cable.bend",), options)
     found = fit_problem(problem, GaussNewton())
     assert found.status == Status.CONVERGED
-    entry = found.parameters["cable.bend"]
-    assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)
     judged = add_intervals_and_checks(problem, found)
     said = judged.checks.step_stability
     assert judged.status == status
@@ -453,6 +451,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
         assert judged.message.startswith("at the estimate light: the time step of 0.005 s is not stable")
         assert found.message in judged.message
     else:
+        entry = found.parameters["cable.bend"]
         assert abs(entry.value - 0.5) < 3 * entry.std
         assert judged.message == found.message
 
