@@ -32,7 +32,7 @@ def page() -> str:
     sections = {title: (text, rows) for title, text, rows in tables(RunSettings, "")}
     for title, (text, rows) in sections.items():
         lines += ["", f"## {title}", "", text, "", "| key | meaning | allowed | default |", "|---|---|---|---|", *rows]
-        lines += ["", "```yaml", *EXAMPLES.get(title, "").splitlines(), "```"]
+        lines += ["", "```yaml", *EXAMPLES[title].splitlines(), "```"] if title in EXAMPLES else []
     return "\n".join(lines) + "\n"
 
 

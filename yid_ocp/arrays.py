@@ -1,4 +1,4 @@
-"""Types of NumPy arrays of floats, integers and booleans."""
+"""Types of NumPy arrays of floats, integers and booleans, and of three numbers."""
 
 from __future__ import annotations
 
@@ -8,3 +8,4 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Vector3 = tuple[float, float, float]

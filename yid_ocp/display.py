@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 _MAX_NAMES_IN_LINE = 12  # names in a line; tables list all
-_MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows are only counted
+_MAX_NOTEBOOK_ROWS = 30  # largest number of table rows in a notebook; further rows are only counted
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class ReprMixin:
         if len(said.table_rows) < 2:
             return text
         head, *rows = said.table_rows
-        lines = [_row(head, "th"), *(_row(row, "td") for row in rows[:_MAX_TABLE_ROWS])]
-        if len(rows) > _MAX_TABLE_ROWS:
-            lines.append(_row([f"and {len(rows) - _MAX_TABLE_ROWS} more", *[""] * (len(head) - 1)], "td"))
+        lines = [_row(head, "th"), *(_row(row, "td") for row in rows[:_MAX_NOTEBOOK_ROWS])]
+        if len(rows) > _MAX_NOTEBOOK_ROWS:
+            lines.append(_row([f"and {len(rows) - _MAX_NOTEBOOK_ROWS} more", *[""] * (len(head) - 1)], "td"))
         return f"{text}<table>{''.join(lines)}</table>"
 
 

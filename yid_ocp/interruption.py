@@ -27,7 +27,7 @@ class InterruptedBySignal(KeyboardInterrupt):
 
 
 @dataclass
-class _State:
+class _SignalState:
     """State of this process: the received signal, nesting of deferring blocks, folders to remove on a forced exit."""
 
     asked: int | None = None
@@ -35,7 +35,7 @@ class _State:
     unfinished: set[Path] = field(default_factory=set)
 
 
-_STATE = _State()
+_STATE = _SignalState()
 
 
 def raise_if_interrupted() -> None:

@@ -16,7 +16,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
 from yid_ocp.solvers import GaussNewton, SteepestDescent
 
-RENAMED = "new names of older keys are in the table of CHANGELOG.md"
+RENAMED = "new names of older ones are in the table of CHANGELOG.md"
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
@@ -116,6 +116,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("solver: {parameters: {}}", ["'parameters' is a key of the file itself"]),
         ("solver: {name: gauss_newton, backtracking_factor: 0.3}", ["there is no key 'backtracking_factor'"]),
         ("xyzzy: 3", ["leave it out", RENAMED]),
+        ("solver: {name: lifted}", ["there is no solver 'lifted'", RENAMED]),
         ("diagnosis: {refits: 3}", ["there is no key 'refits'", RENAMED]),
         # what only code sets
         ("problem: {known_initial_states: {}}", ["there is no key"]),

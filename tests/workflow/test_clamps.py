@@ -132,7 +132,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
     ("change", "words"),
     [
         ({"format": "yid-plan/1"}, "another command"),
-        ({"format": "yid-diagnosis/1"}, "CHANGELOG.md has the table"),
+        ({"format": "yid-diagnosis/1"}, "table of CHANGELOG.md"),
         ({"status": "failed", "message": "no"}, "the run failed"),
         ({"covariance": {}}, "no parameters with covariance"),
         ({"covariance": {"names": [], "matrix": []}}, "determined no parameter"),
@@ -169,8 +169,15 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path, printed):
     assert [name for name, entry in written["parameters"].items() if entry["drifted"]] == ["beam.bend"]
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == ["day3"]
     assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
-    later = folder_of(tmp_path / "later", baseline={"runs": [str(folders[0])]})
-    for runs, message in (([folders[0], later], "would count twice"), (folders[:1], "fewer than two runs")):
+    later, older = (folder_of(tmp_path / name) for name in ("later", "older"))
+    (later / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{baseline_run_folders: [{folders[0]}]}}\n", "utf-8")
+    (older / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{worth: 3}}\n", "utf-8")
+    refused = (
+        (later, "would count twice"),
+        (older, "CHANGELOG.md"),
+        (folder_of(tmp_path / "old", doubts=[]), "earlier"),
+    )
+    for runs, message in [*(([folders[0], run], text) for run, text in refused), (folders[:1], "fewer than two runs")]:
         assert message in printed("report", *runs, "--out", tmp_path / "other", code=2)
 
 

@@ -192,7 +192,7 @@ def test_a_live_solve_is_shown_on_a_terminal_and_nowhere_else(pendulum, monkeypa
     assert main(["solve", str(pendulum), "--live", *settings, "--out", str(tmp_path / "lines")]) == 0
     assert "last step" not in capsys.readouterr().err
     show_all_on_a_terminal(monkeypatch)
-    monkeypatch.setattr(command_runner, "_MAX_TABLE_ROWS", 2)
+    monkeypatch.setattr(command_runner, "_MAX_LIVE_ROWS", 2)
     assert main(["solve", str(pendulum), "--live", *settings, "--out", str(tmp_path / "bars")]) == 0
     said = sys.stderr.getvalue()
     assert "last step" in said

@@ -331,7 +331,7 @@ class _Data:
         return tuple(frame for frame in frames if self.arm.is_frame_determined_by_angles(frame))
 
 
-class _Fit(NamedTuple):
+class _EffortFit(NamedTuple):
     """Results of a fit of each joint's effort, shape (k,)."""
 
     inverse: Array  # 1/g
@@ -385,7 +385,7 @@ def _issue(cause: str, words: str, depth: float, advice: str, joint: str = "", s
     return Issue(cause, words, "not_trusted", depth, advice, "", "joints", channel, setting=setting)
 
 
-def _by_joint(data: _Data, fit: _Fit) -> Iterator[Issue]:
+def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     arm, effort, needed, size = data.arm, data.effort, data.needed, data.size
     loaded, factor, names = _loaded(data), _WRONG_GAIN_FACTOR, arm.joint_names
     # A held object can add to efforts, but not several times the arm's weight, nor support nearly all of it. The prior
@@ -422,7 +422,7 @@ def _by_joint(data: _Data, fit: _Fit) -> Iterator[Issue]:
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
 
-def _signs(arm: RecordedJointsModel, fit: _Fit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:
+def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:
     depth = -fit.inverse / fit.std / (_MIN_Z / 2)
     wrong = ((arm.joint_names[j], float(depth[j])) for j in np.flatnonzero(turned))
     cases = [(f"the effort of {name} has", by, name) for name, by in wrong]
@@ -433,7 +433,7 @@ def _signs(arm: RecordedJointsModel, fit: _Fit, turned: BoolArray, upright: Bool
         yield _issue("effort_sign", words, by, "reverse the sign; effort is the motor's torque on the joint", joint)
 
 
-def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
+def _offsets(data: _Data, fit: _EffortFit, told: BoolArray) -> Iterator[Issue]:
     needed, size = data.needed, data.size
     low, high = 1 / _WRONG_GAIN_FACTOR, _WRONG_GAIN_FACTOR
     # a large offset looks like a large gain, but then the variation has the right size
@@ -451,7 +451,7 @@ def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
             yield _issue("effort_offset", words, depth, "estimate it, or correct the sensor's zero", name, setting)
 
 
-def _late(data: _Data, fit: _Fit) -> Iterator[Issue]:
+def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     motion, trials = data.motion, _LAG_SEARCH_STEP * np.arange(-5, 6)
     if motion.t[-1] - motion.t[0] < 4 * trials[-1] or np.max(fit.left) < _WELL_EXPLAINED_RMS:
         return
@@ -472,7 +472,7 @@ def _late(data: _Data, fit: _Fit) -> Iterator[Issue]:
         yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
 
 
-def _fitted(data: _Data) -> _Fit:
+def _fitted(data: _Data) -> _EffortFit:
     motion, effort, needed, size = data.motion, data.effort, data.needed, data.size
     count, width = needed.shape
     error = _EFFORT_LIMIT_ERROR_FRACTION * size + _EFFORT_SPREAD_ERROR_FRACTION * needed.std(axis=0)
@@ -495,7 +495,7 @@ def _fitted(data: _Data) -> _Fit:
     cost = float(np.sum((rows @ found - target) ** 2) + np.sum(((found - neutral) / prior) ** 2))
     own = slice(width, 2 * width)
     left = np.sqrt(np.mean(remains**2, axis=0))
-    return _Fit(found[:width], std[:width], found[own], std[own], left, direct, shift, cost)
+    return _EffortFit(found[:width], std[:width], found[own], std[own], left, direct, shift, cost)
 
 
 def _by_itself(data: _Data) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers import GaussNewton, Solution
 
 log = logging.getLogger(__name__)
-_Found = TypeVar("_Found")
+_Judgement = TypeVar("_Judgement")
 
 _CHI2_QUANTILE_999 = 10.827566170662733  # of one degree of freedom
 _SMALL_VALUE_FRACTION = 0.3  # a value below this part of its typical size is small
@@ -119,17 +119,17 @@ def solution_with_profile_intervals(
 
 
 def evaluate_for_each_parameter_at_optimum(
-    judged: Callable[[str, Array, Evaluation], _Found],
+    judged: Callable[[str, Array, Evaluation], _Judgement],
     problem: EstimationProblem,
     x: Array,
     names: Sequence[str],
     progress: Progress,
-) -> dict[str, _Found]:
+) -> dict[str, _Judgement]:
     """Find the optimum from `x` (nx,), and return judged(name, optimum, evaluation) by name, computed in parallel."""
     best = GaussNewton(max_iterations=_OPTIMUM_ITERATIONS).minimize_cost(problem, x, None).x
     there, parts = problem.evaluate(best), PartsDoneCounter(progress, len(names), names[0])
 
-    def one(name: str) -> _Found:
+    def one(name: str) -> _Judgement:
         found = judged(name, best, there)
         parts.count_done(name)
         return found

@@ -14,6 +14,8 @@ from yid_ocp import options
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_error_arguments
 
+RENAMED_NAMES_HINT = "new names of older ones are in the table of CHANGELOG.md"
+
 
 @dataclass(frozen=True)
 class SectionVariants:
@@ -52,8 +54,8 @@ class SectionVariants:
             what = f"the key '{self.selector_key}' is missing"
             hint = f"add {self.selector_key}: {next(iter(self.classes))}"
             return ConfigError(what, where=where, allowed=", ".join(self.classes), hint=hint)
-        what = f"there is no {self.variant_noun} '{word}'"
-        return ConfigError(what, where=where, **unknown_name_error_arguments(str(word), self.classes))
+        what, known = f"there is no {self.variant_noun} '{word}'", unknown_name_error_arguments(str(word), self.classes)
+        return ConfigError(what, where=where, allowed=known["allowed"], hint=f"{known['hint']}; {RENAMED_NAMES_HINT}")
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
@@ -78,7 +80,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     hints = [near] if near else []
     hints += [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else []
     # a key of an older version often resembles a present one that means something else
-    hints = [*(hints or ["leave it out"]), "new names of older keys are in the table of CHANGELOG.md"]
+    hints = [*(hints or ["leave it out"]), RENAMED_NAMES_HINT]
     if ":" in name:
         hints = ["put a space after the colon, as in {" + name.replace(":", ": ") + "}"]
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")

@@ -16,6 +16,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
+from yid_ocp.arrays import Vector3
 from yid_ocp.data.recording import RecordedOrNominalClock
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
@@ -37,7 +38,6 @@ from yid_ocp.vision.surface_meshes import ExtraMesh
 _Names = tuple[str, ...]
 _Texts = Mapping[str, str] | None
 _Numbers = Mapping[str, float] | None
-_Vector3 = tuple[float, float, float]
 _Vector4 = tuple[float, float, float, float]
 _FilePath = Annotated[str, OptionInfo("a file, relative to the configuration", is_path=True)]
 _Recording = Annotated[str, OptionInfo("a recording, relative to the configuration, or default:NAME.h5", is_path=True)]
@@ -70,7 +70,7 @@ class _GraspSettings:
     holder_frame: Annotated[str, OptionInfo("frame of the robot")]
     held_frame: Annotated[str, OptionInfo("frame of the object, or a point along a segment such as T1:40%")]
     kind: Annotated[_GraspKind, OptionInfo("point (position), axis (plus z axis) or weld (plus orientation)")] = "point"
-    held_frame_rpy: Annotated[_Vector3, OptionInfo("orientation in holder_frame", "rad")] = (0.0, 0.0, 0.0)
+    held_frame_rpy: Annotated[Vector3, OptionInfo("orientation in holder_frame", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +185,7 @@ class _ModelSettings:
     friction: Annotated[
         FrictionLawSettings | None, OptionInfo("friction law of the joints; amplitudes and damping become free")
     ] = None
-    gravity: Annotated[_Vector3, OptionInfo("gravity in the world frame", "m/s^2")] = (0.0, 0.0, -9.81)
+    gravity: Annotated[Vector3, OptionInfo("gravity in the world frame", "m/s^2")] = (0.0, 0.0, -9.81)
     measured_points: Annotated[_Names | None, OptionInfo("measured frames; T1:40%: at 40 % of T1; else tips")] = None
     surfaces_missing_from_urdf: Annotated[
         tuple[ExtraMesh, ...],
@@ -346,10 +346,10 @@ class _VirtualFramesSettings:
     duration: Annotated[float, Gt(0), Le(600), OptionInfo("duration of the experiment", "s")] = 5.0
     max_gripper_travel: Annotated[float, Gt(0), Le(1), OptionInfo("largest gripper distance from start", "m")] = 0.11
     gripper_start_offset_from_object_end: Annotated[
-        Mapping[str, _Vector3], OptionInfo("start relative to the end of the undeformed object, by grasp", "m")
+        Mapping[str, Vector3], OptionInfo("start relative to the end of the undeformed object, by grasp", "m")
     ] = field(default_factory=dict)
-    camera_position: Annotated[_Vector3, OptionInfo("position of the camera", "m")] = (2.6, 0.0, 0.45)
-    camera_target: Annotated[_Vector3, OptionInfo("point at which the camera looks", "m")] = (0.85, 0.0, -0.1)
+    camera_position: Annotated[Vector3, OptionInfo("position of the camera", "m")] = (2.6, 0.0, 0.45)
+    camera_target: Annotated[Vector3, OptionInfo("point at which the camera looks", "m")] = (0.85, 0.0, -0.1)
     frame_rate: Annotated[float, Gt(0), Le(60), OptionInfo("mean rate of frames", "Hz")] = 3.0
     dropped_frame_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
     latency: Annotated[float, OptionInfo("stamp minus time of the image", "s")] = 0.0
@@ -423,7 +423,7 @@ class RunSettings:
     import_: Annotated[ImportSettings, OptionInfo("conversion of other tools' files to recordings")] = ImportSettings()
     sensors: Annotated[
         Mapping[str, SensorOptions],
-        OptionInfo("options by group of the recordings: points, joints.effort, motors.current, wrist.force"),
+        OptionInfo("options by group of the recordings, such as points, joints.effort or wrist.force"),
     ] = field(default_factory=dict)
     parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("parameters by name or pattern")] = field(
         default_factory=dict

@@ -49,7 +49,7 @@ _INFORMED_FRACTION = 0.5  # of the prior variance that the data remove, above wh
 _DETECTABLE_CHI2_RISE = 10.0  # rise of r'r that shows an unknown
 _MIN_TIED_EVIDENCE_RATIO = 0.9  # share of a location's evidence at which an alternative is named
 _MAX_GROUPS = 4  # selected at most
-_MAX_ITERATIONS = 12  # fixed-point iterations on the standard deviations
+_MAX_STD_ITERATIONS = 12  # fixed-point iterations on the standard deviations
 _MIN_EVIDENCE_GAIN = 0.2  # of an iteration, else it is the last one; groups differ significantly by 5 or more
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
 _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
@@ -259,7 +259,7 @@ def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]
     state = _run(models, variance)
     if math.isinf(state.log_evidence):
         return variance, state
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(_MAX_STD_ITERATIONS):
         ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in _scores(models, state).items()}
         trial = {s: float(np.clip(v * ratio[s], *_VARIANCE_BOUNDS)) if v else 0.0 for s, v in variance.items()}
         after = _run(models, trial)

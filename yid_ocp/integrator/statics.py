@@ -50,7 +50,7 @@ _NEAR_GUESS = 0.1  # beyond this distance from a guess [rad or m], it may be ano
 _MAX_KNOWN_EQUILIBRIA = 8  # a problem asks for the same ones while it is built, checked and first evaluated
 _REST_TOLERANCE = 1e-10  # allowed imbalance [N m] and constraint violation [m]
 _ENERGY_ITERATION_LIMIT = 300  # iterations of the search for the lowest energy
-_Found = tuple[bool, float, float, Array]  # whether a search failed, energy, error and (q, z, forces)
+_StaticSolution = tuple[bool, float, float, Array]  # whether a search failed, energy, error and (q, z, forces)
 _MIN_RECIPROCAL_CONDITION = 1e-14  # smaller reciprocal condition numbers count as singular
 _MAX_HOLD_DEFLECTION = 0.02  # larger deflections of a holding spring mean a posture unfit for the grasp [rad]
 
@@ -74,7 +74,7 @@ class EquilibriumSolver:
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
         )
         potential = system.elastic_energy(e.q0) + e.rigid_body_terms.potential_energy + _servo_energy(system, e.u, e.q0)
-        self._least_energy: dict[bytes, _Found] = {}  # by the last searches without a guess
+        self._least_energy: dict[bytes, _StaticSolution] = {}  # by the last searches without a guess
         self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.u, e.theta], [potential])
 
     @property

@@ -202,12 +202,12 @@ class EffectMomentumCalculator:
         self._impulse = ca.Function("impulse", inputs, [ca.densify(ca.jacobian(momentum, e.u))])
         at_row = {name: row for row, name in enumerate(system.effect_internal_coordinate_symbols)}
         symbols = [before, now, last, then, e.theta, e.time_step]
-        self._memories: list[tuple[list[int], _Memory]] = []
+        self._memories: list[tuple[list[int], _InternalCoordinates]] = []
         for effect in system.effects:
             rows = [self._kept.index(at_row[x]) for x in effect.internal_coordinate_symbols if at_row[x] in self._kept]
             own = [i for i, name in enumerate(self.parameter_names) if name in effect.parameters.names]
             if rows:
-                self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
+                self._memories.append((own, _InternalCoordinates(step, symbols, law, rows, columns)))
 
     def momentum_derivative_by_previous_torque(self, theta: Array) -> Array:
         """Compute the derivative of the momentum with respect to the torques of the previous step, (nu, nu) [s]."""
@@ -287,7 +287,7 @@ def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> 
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
 
 
-class _Memory:
+class _InternalCoordinates:
     """Internal coordinates of one effect along a motion. `rows` are their indices among those in the momentum shift."""
 
     def __init__(self, step: Step, inputs: list[ca.SX], law: ca.SX, rows: list[int], columns: list[int]) -> None:

@@ -19,7 +19,7 @@ from yid_ocp.files import check_input_file
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_axis_sin_cos
 
 log = logging.getLogger(__name__)
-_JOINT_TYPES = {2: "prismatic", 3: "revolute"}
+_JOINT_TYPE_NAMES = {2: "prismatic", 3: "revolute"}
 _JOINT_EQUALITY, _WELD_EQUALITY, _SITE_OBJECT, _FREE_JOINT, _WORLD = 2, 1, 6, 0, "world"
 
 
@@ -113,7 +113,7 @@ def _body(
     at, last = _pose(model.body_pos[i], model.body_quat[i]), np.zeros(3)
     first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
     for j in range(first, first + count):
-        label, kind = _joint_name(model, j), _JOINT_TYPES.get(int(model.jnt_type[j]))
+        label, kind = _joint_name(model, j), _JOINT_TYPE_NAMES.get(int(model.jnt_type[j]))
         if kind is None:
             what, allowed = f"joint '{label}' has the type free or ball", "hinge and slide joints"
             raise ModelError(what, where=where, allowed=allowed, hint="delete a free joint; replace a ball by hinges")

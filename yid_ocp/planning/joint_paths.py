@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
-from yid_ocp.arrays import Array, IntArray
+from yid_ocp.arrays import Array, IntArray, Vector3
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, simulate
@@ -24,7 +24,6 @@ from yid_ocp.options import OptionInfo
 from yid_ocp.parallel import CASADI_LOCK
 
 _Value = TypeVar("_Value")
-_Vector3 = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,14 +50,14 @@ class PlanOptions:
         ),
     ] = "place"
     point: Annotated[str | None, OptionInfo("frame to move: a tip of the object, T3:50%, a gripper")] = None
-    target_position: Annotated[_Vector3 | None, OptionInfo("position in the world; or give an offset", "m")] = None
+    target_position: Annotated[Vector3 | None, OptionInfo("position in the world; or give an offset", "m")] = None
     point_target_offset_from_start: Annotated[
-        _Vector3 | None, OptionInfo("target position relative to the point's equilibrium position at the start", "m")
+        Vector3 | None, OptionInfo("target position relative to the point's equilibrium position at the start", "m")
     ] = None
     point_waypoint_offsets_from_start: Annotated[
-        tuple[_Vector3, ...], OptionInfo("waypoints of a path, relative to the start, passed at equal times", "m")
+        tuple[Vector3, ...], OptionInfo("waypoints of a path, relative to the start, passed at equal times", "m")
     ] = ()
-    box: Annotated[tuple[_Vector3, _Vector3] | None, OptionInfo("lowest and highest corner in the world", "m")] = None
+    box: Annotated[tuple[Vector3, Vector3] | None, OptionInfo("lowest and highest corner in the world", "m")] = None
     frames_in_box: Annotated[
         tuple[str, ...] | None, OptionInfo("frames kept inside the box; default: all points of the object")
     ] = None

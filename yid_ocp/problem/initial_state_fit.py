@@ -45,7 +45,7 @@ class FixedInitialState:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _InitialStateTask:
     """The data of one fit of a configuration to the points of one frame."""
 
     measured: list[tuple[SensorMeasurements, int]]  # measurements of each sensor, and its row of this frame
@@ -145,7 +145,7 @@ class InitialStateFitter:
                 found = [min(found, key=lambda entry: entry[2])]
                 if roughly:
                     break
-            task = _Task(frames[first], theta, rest, weight, len(index), softness)
+            task = _InitialStateTask(frames[first], theta, rest, weight, len(index), softness)
             found = [self._fit(q, v, task) for q, v, _ in found]
         q, values, _ = found[0]
         theta = theta.copy()
@@ -156,7 +156,7 @@ class InitialStateFitter:
             guess[list(system.prescribed_coordinate_indices)] = path[then]
             span = (then - first) * step.time_step
             slow = np.full(system.n_coordinates, 1 / (_RATE_STD * span))
-            task = _Task(frames[then], theta, guess, slow, 0, 1.0)
+            task = _InitialStateTask(frames[then], theta, guess, slow, 0, 1.0)
             velocity = (self._fit(guess, values, task)[0] - q) / span
         q0 = q - velocity * first * step.time_step
         q0[list(system.prescribed_coordinate_indices)] = path[0]
@@ -202,7 +202,7 @@ class InitialStateFitter:
         grids = [low + (high - low) * shares for low, high in zip(lower, upper, strict=True)]
         return [values, *(np.array(entry) for entry in itertools.product(*grids))]
 
-    def _fit(self, guess: Array, values: Array, task: _Task) -> tuple[Array, Array, float]:
+    def _fit(self, guess: Array, values: Array, task: _InitialStateTask) -> tuple[Array, Array, float]:
         """Fitted configuration, fitted parameter values and the sum of squares."""
         free = self._free
         index = [self.step.system.parameters.index(name) for name in self.fitted_parameters]
@@ -230,7 +230,7 @@ class InitialStateFitter:
         q, theta = spread(found.x)
         return q, theta[index], found.final_model.cost
 
-    def _rows(self, q: Array, theta: Array, task: _Task) -> tuple[Array, Array]:
+    def _rows(self, q: Array, theta: Array, task: _InitialStateTask) -> tuple[Array, Array]:
         """Residual of a fit and its derivative by the free coordinates and the fitted parameters."""
         step, free, wanted = self.step, self._free, task.wanted
         nz, m = step.sizes["nz"], step.sizes["m"]

@@ -71,8 +71,8 @@ class SensorOptions:
     constants: Annotated[
         Mapping[str, float | Mapping[str, float]],
         OptionInfo(
-            "constants of the sensor, by name: torque_constant [N m/A] of motors.current, sign (1 or -1) of "
-            "wrist.force and wrist.torque"
+            "constants that the sensor's kind declares, by name, such as torque_constant [N m/A] of motors.current or "
+            "sign (1 or -1) of wrist.force"
         ),
     ] = field(default_factory=dict)
 

@@ -32,7 +32,7 @@ _AIR_DENSITY = 1.2  # [kg/m^3]
 _FRICTION_SMOOTHING_SPEED = 0.02  # v_s of dry friction [rad/s]
 _NO_FRICTION = 1e-9  # friction before the motion starts; MuJoCo's constraint must exist from the start [N m]
 _FRICTION_TIME_STEPS = 10  # time constant of MuJoCo's constraint that holds a joint by friction [inner steps]
-_MAX_PAYLOAD_DISTANCE = 1.0  # largest distance of a payload's mass from its frame [m]
+_MAX_INJECTED_PAYLOAD_DISTANCE = 1.0  # largest distance of a payload's mass from its frame [m]
 _CREASED_LINK, _CREASE_ANGLE = 1, 0.03  # link before which a tube has a crease; angle beyond which it softens [rad]
 _CORD_LENGTH = 0.3  # length of a tether [m]
 _MAGNET_DISTANCE, _MAGNET_POLE_SIZE = 0.06, 0.04  # distance from the tip at equilibrium, size of the pole [m]
@@ -327,9 +327,9 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     body = int(model.jnt_bodyid[model.joint(scene.system.mechanism.joints[frame.joint_index].name).id])
     turn = value(frame.placement.rotation).reshape(3, 3, order="F")
     mass = size["mass"]
-    if not np.linalg.norm(reach) <= _MAX_PAYLOAD_DISTANCE * abs(mass):
+    if not np.linalg.norm(reach) <= _MAX_INJECTED_PAYLOAD_DISTANCE * abs(mass):
         what = f"the added mass is {np.linalg.norm(reach) / max(abs(mass), 1e-300):.3g} m from its frame"
-        allowed = f"a distance |(mx, my, mz)/mass| of at most {_MAX_PAYLOAD_DISTANCE:g} m"
+        allowed = f"a distance |(mx, my, mz)/mass| of at most {_MAX_INJECTED_PAYLOAD_DISTANCE:g} m"
         raise ModelError(what, where=where, allowed=allowed, hint="give smaller mx, my, mz, or a larger mass")
     point = value(frame.placement.translation) + turn @ reach / mass
     own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])

@@ -198,7 +198,7 @@ class ShapeFitter:
         return np.array([owner in tubes for owner in self.link_segments])
 
     def _rivals(
-        self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud
+        self, best: _BestFit, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud
     ) -> list[Array]:
         """Configurations of other shapes that may fit the cloud, one for each tube that a foreign object touches."""
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
@@ -223,7 +223,7 @@ class ShapeFitter:
         return {name for name, mine in own.items() if mine @ empty > 0 and covered(mine) < _MIN_TUBE_COVERAGE}
 
     def _without(
-        self, best: _Minimum, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud, links: BoolArray
+        self, best: _BestFit, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud, links: BoolArray
     ) -> _Left:
         """Masks of the nodes and points that are not on the links of the mask `links`."""
         tubes, nodes = self.tube_links_at_configuration(best.q), sight.skeleton_nodes
@@ -234,11 +234,11 @@ class ShapeFitter:
 
     def _attempt(
         self, sight: ProcessedFrameCloud, starts: Sequence[Array], left: _Left
-    ) -> tuple[_Minimum, ShapeFitQualityAndPointClasses]:
+    ) -> tuple[_BestFit, ShapeFitQualityAndPointClasses]:
         """The best shape by the nodes and points of the masks `left`, refined with the points that belong to it."""
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
-        tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
+        tried = [self._minimise(_BestFit(start, unit, math.inf), on_nodes) for start in starts]
         last = self._minimise(min(tried, key=lambda minimum: minimum.cost), on_points)
         near = self.max_informative_surface_distance
         evidence = shape_evidence.fit_quality_and_point_classes(self.tube_links_at_configuration(last.q), sight, near)
@@ -269,7 +269,7 @@ class ShapeFitter:
         nodes_first, points_then = ([_Task(*of, s, camera, sight.end_anchors) for s in scales] for of, scales in both)
         return nodes_first, points_then
 
-    def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
+    def _minimise(self, start: _BestFit, tasks: Sequence[_Task]) -> _BestFit:
         """The minimum after several passes, each of which starts at the result of the previous one."""
         end, most = start, _MAX_ITERATIONS
         for task in tasks:
@@ -281,12 +281,12 @@ class ShapeFitter:
             found = minimize_by_damped_newton(
                 about, begin, max_iterations=most, step_tolerance=_PASS_TOLERANCE, cost_tolerance=_PASS_TOLERANCE
             )
-            end = _Minimum(self._with_free(end.q, found.x), found.final_model.hessian, found.final_model.cost)
+            end = _BestFit(self._with_free(end.q, found.x), found.final_model.hessian, found.final_model.cost)
         return end
 
     def _judged(
         self,
-        best: _Minimum,
+        best: _BestFit,
         evidence: ShapeFitQualityAndPointClasses,
         rivals: Sequence[Array],
         sight: ProcessedFrameCloud,
@@ -431,7 +431,7 @@ class ShapeFitter:
         return self._seen(np.asarray(q, float))[0].reshape(-1, 3)
 
 
-class _Minimum(NamedTuple):
+class _BestFit(NamedTuple):
     """Minimum of the passes: configuration, Hessian by the free joints, and cost."""
 
     q: Array

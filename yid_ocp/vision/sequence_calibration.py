@@ -166,7 +166,7 @@ _LOG_DIMENSION_PRIOR_STD = (0.2, 0.4)  # standard deviations of the logarithms o
 _DOUBTED_STDS = 3.0  # deviation from the model's value beyond which the value is contradicted
 _CLEAR_STDS = 2.0  # deviation within which a first estimate finds no contradiction
 _MAX_KNOWN_LOG_STD = 0.1  # std of a logarithm above which a dimension is not determined
-_MAX_ITERATIONS, _STEP_TOLERANCE, _MAX_STEP = 8, 0.004, 0.15
+_MAX_DIMENSION_ITERATIONS, _STEP_TOLERANCE, _MAX_STEP = 8, 0.004, 0.15
 _MIN_FRAMES = 3
 _OUTLIER_END_STDS = 3.0  # robust standard deviations from the other frames' ends, at which a frame's end is a wrong one
 
@@ -263,7 +263,7 @@ def estimate_and_check_dimensions(
     wanted = np.array([kind in estimate for kind in _DIMENSION_KINDS for _ in range(many)])
     shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
     covariance, frames = nothing.covariance, 0
-    for turn in range(_MAX_ITERATIONS):
+    for turn in range(_MAX_DIMENSION_ITERATIONS):
         fits = fitted(_changed(system, given, change), starts)
         chosen = _believed(fits)
         if len(chosen) < _MIN_FRAMES:

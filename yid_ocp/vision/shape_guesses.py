@@ -36,7 +36,7 @@ _MIN_PART_FRACTION = 0.05  # of the points; smaller parts are not the object
 _MIN_LOOP_RATIO = 3.0  # a cycle this many times longer than around the object is a loop of it
 _MAX_TWIG_DIAMETERS = 1.5  # in diameters; a shorter branch is roughness
 _END_DIRECTION_SLICES = 4.0  # widths of slices over which the direction at an end is taken
-_MAX_POINTS = 2500  # points
+_MAX_CLOUD_POINTS = 2500  # points
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ def cloud_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng
     `diameter` [m] is the diameter of the thickest tube. Parts of the cloud more than `gap` [m] apart are not connected.
     """
     points = cloud.points
-    if len(points) > _MAX_POINTS:
-        points = points[np.sort(rng.choice(len(points), _MAX_POINTS, replace=False))]
+    if len(points) > _MAX_CLOUD_POINTS:
+        points = points[np.sort(rng.choice(len(points), _MAX_CLOUD_POINTS, replace=False))]
     if len(points) > _N_NEIGHBOURS:
         points, graph = _connected(points, gap)
     if len(points) <= _N_NEIGHBOURS:

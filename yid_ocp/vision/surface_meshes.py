@@ -42,7 +42,7 @@ _Triple = tuple[float, float, float]
 _MAX_MESH_BYTES = 1 << 28
 _EXTRA_MESH_SHAPES = ("mesh_file", "box_size", "cylinder_radius_and_length", "sphere_radius")
 _TUBE_FACETS = 48  # facets of a tube, whose surface is then within 0.2 % of the radius
-_TOUCHING_DISTANCE = 5e-4  # [m]
+_MAX_JOINED_DISTANCE = 5e-4  # [m]
 _MIN_PROJECTED_DISTANCE = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
 
 
@@ -189,7 +189,7 @@ class ArticulatedSurfaces:
             # for a nearly touched surface the difference vector is rounding noise: use the surface normal
             flat = answer["primitive_normals"].numpy()
             flat = flat * np.where((flat * away).sum(1) < 0, -1.0, 1.0)[:, None]
-            unit = np.where(length[:, None] > _TOUCHING_DISTANCE, away / np.maximum(length, 1e-12)[:, None], flat)
+            unit = np.where(length[:, None] > _MAX_JOINED_DISTANCE, away / np.maximum(length, 1e-12)[:, None], flat)
             better = (length < distance[near]) & (length <= within)
             chosen = near[better]
             distance[chosen], owner[chosen] = length[better], part

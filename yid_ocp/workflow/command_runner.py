@@ -98,7 +98,7 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 _MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage [s]
 _BAR_WIDTH = 12  # on a terminal [characters]
-_MAX_TABLE_ROWS = 10  # results shown below the bar on a terminal
+_MAX_LIVE_ROWS = 10  # results shown below the bar on a terminal
 _MIN_ESTIMATE_TIME = 2.0  # shortest time of a stage before its remaining time is estimated [s]
 _USUAL_IMPORT_TIME = 1.6  # usual import time of a command, at the pace of the stages' usual times [s]
 _USUAL_ITERATIONS = 20  # usual number of iterations of a search
@@ -223,7 +223,7 @@ class _BarProgress(Progress):
             self._bars.update(self._task, description=words, completed=done, total=total)
 
     def renew_results_table(self, rows: Sequence[Sequence[str]]) -> None:
-        self._table[:] = aligned_table_lines([*rows[: _MAX_TABLE_ROWS + 1]])
+        self._table[:] = aligned_table_lines([*rows[: _MAX_LIVE_ROWS + 1]])
 
     def finish_stage(self) -> None:
         if self._task is not None:

@@ -31,7 +31,7 @@ from yid_ocp.workflow.command_runner import CommandOutcome, make_command_functio
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
-_PARAMETER_KEYS = ("value", "unit", "lower", "upper", "description")
+_INSPECTED_KEYS = ("value", "unit", "lower", "upper", "description")
 _DEPENDENCE_KEYS = (
     "parameter unit rows seen=observable_rows best=most_sensitive_sensor read=directly_dependent_sensors "
     "moved=max_change_from_rest seconds along=change_along_recordings"
@@ -90,7 +90,7 @@ def _run_inspect(
                 for joint in step.system.mechanism.joints
             ],
             "parameters": {
-                entry.name: {key: getattr(entry, key) for key in _PARAMETER_KEYS} | {"free": entry.name in free}
+                entry.name: {key: getattr(entry, key) for key in _INSPECTED_KEYS} | {"free": entry.name in free}
                 for entry in parameters
             },
             "equations": step_diagnostics.step_complexity_summary(step),

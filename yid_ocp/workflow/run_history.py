@@ -19,6 +19,7 @@ from yid_ocp.analysis.run_estimates import (
     pool_estimates_and_chi2,
 )
 from yid_ocp.config.reader import load_config
+from yid_ocp.config.schema import RENAMED_NAMES_HINT
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recording
@@ -41,7 +42,6 @@ log = logging.getLogger(__name__)
 ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
 _OLD_FORMATS = ("yid-diagnosis/1",)  # formats of earlier versions, with other keys
-_RENAMED_KEYS_HINT = "CHANGELOG.md has the table old -> new under Unreleased"
 _COMPARED_MODEL_SECTIONS = ("robot", "arms", "object", "grasp", "joint_springs", "gravity")
 """Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
 _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
@@ -118,9 +118,9 @@ def read_result_file(file: Path) -> dict[str, Any]:
     if not isinstance(result, dict):
         what, hint = "the file does not hold the result of a run", "run the command again"
         raise DataError(what, where=str(file), allowed="an object in JSON", hint=hint)
-    if result.get("format") in _OLD_FORMATS:
-        what = f"an earlier version wrote this result ({result['format']}), with other names of keys"
-        what, hint = f"{what}; {_RENAMED_KEYS_HINT}", "diagnose again with this version"
+    if result.get("format") in _OLD_FORMATS or "doubts" in result:  # an old key
+        what = f"an earlier version wrote this result ({result.get('format')}), with other names of keys"
+        what, hint = f"{what}; {RENAMED_NAMES_HINT}", "run the command again with this version"
         raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
     return result
 
@@ -153,7 +153,8 @@ def _dependent(folders: Sequence[str | Path]) -> str:
     """Return a message about a run that is the baseline of another one of `folders`. Empty if there is none."""
     known = [Path(folder).resolve() for folder in folders]
     for folder in known:
-        for own in (read_result_file(folder / "result.json").get("baseline") or {}).get("runs", ()):
+        settings = _settings(folder)
+        for own in () if settings is None else settings.diagnosis.baseline_run_folders:
             if Path(own).resolve() in known:
                 return f"{own} would count twice, because it is a baseline of {folder}"
     return ""
@@ -190,10 +191,8 @@ def _difference(run: RunSettings, there: RunSettings | None) -> str:
 
 
 def _settings(folder: str | Path) -> RunSettings | None:
-    try:
-        return load_config(Path(folder) / "config.yaml")
-    except YidError:
-        return None
+    file = Path(folder) / "config.yaml"
+    return load_config(file) if is_file(file) else None
 
 
 def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:

@@ -35,9 +35,9 @@ _POSES = tuple(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWith
 _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PLACES = (_POINT_STAMPED, *_POSES)
 _WRENCH, _IMU = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Imu"
-_MOUNTED = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
+_GROUP_BY_MESSAGE_TYPE = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
 _JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *OTHER_JOINT_MESSAGE_TYPES)
-_KNOWN = (*_JOINT_TYPES, *_PLACES, *_MOUNTED)
+_KNOWN = (*_JOINT_TYPES, *_PLACES, *_GROUP_BY_MESSAGE_TYPE)
 # last parts of topics that name a message type, not the measured object
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu", "data", "data_raw")
 
@@ -257,7 +257,7 @@ def _contents(
     bag, states, places, mounted = OpenBag(path), list[BagMessage](), list[BagMessage](), list[BagMessage]()
     own_topic, paths = _topic_and_paths(bag, fields or {})
     refused: DataError | None = None
-    lists = {**dict.fromkeys(_JOINT_TYPES, states), **dict.fromkeys(_MOUNTED, mounted)}
+    lists = {**dict.fromkeys(_JOINT_TYPES, states), **dict.fromkeys(_GROUP_BY_MESSAGE_TYPE, mounted)}
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
     with bag.read_errors_as_data_errors(), closing(bag.reader) as reader:
         wanted = [c for c in reader.connections if c.topic == own_topic or c.msgtype in wanted_kinds]
@@ -328,7 +328,7 @@ def _plain(content: Any, kind: str) -> SimpleNamespace:
     if kind == JOINT_STATE_MESSAGE_TYPE:
         values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
         return SimpleNamespace(frame=frame, name=[str(name) for name in content.name], **values)
-    if kind in _MOUNTED:
+    if kind in _GROUP_BY_MESSAGE_TYPE:
         return SimpleNamespace(frame=frame, **_vectors(content, kind))
     if kind == _POINT_STAMPED:
         return SimpleNamespace(frame=frame, point=_numbers(content.point, "xyz"), axes=None)
@@ -360,7 +360,7 @@ def _mounted_sensors(
     bag: _Contents, groups: Sequence[_States], seconds: Callable[[BagMessage], float]
 ) -> Iterator[SensorChannelGroup]:
     """Yield a group for each topic of wrenches or inertial readings, and for a wrench that a driver estimates."""
-    for kind, group in _MOUNTED.items():
+    for kind, group in _GROUP_BY_MESSAGE_TYPE.items():
         topics = _names_of(bag, kind)
         for topic, name in topics.items():
             messages = [message for message in bag.mounted if message.source == topic]
@@ -567,9 +567,9 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     elif topic.name in names:
         frames = ", ".join(dict.fromkeys(message.content.frame for message in own))
         becomes, note = f"point {names[topic.name]}", f"in {frames}" if frames else ""
-    elif topic.kind in _MOUNTED:
+    elif topic.kind in _GROUP_BY_MESSAGE_TYPE:
         frames = ", ".join(dict.fromkeys(message.content.frame for message in own))
-        becomes, note = f"{_MOUNTED[topic.kind]} on {frames or topic.name}", ""
+        becomes, note = f"{_GROUP_BY_MESSAGE_TYPE[topic.kind]} on {frames or topic.name}", ""
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
         note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"

@@ -21,7 +21,7 @@ from yid_ocp.files import file_sha256
 
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
 """Lists in the parameter group POINT whose labels are results of a body model instead of positions."""
-_UNITS = ("m", "cm", "mm")
+_LENGTH_UNITS = ("m", "cm", "mm")
 
 
 class _Markers(NamedTuple):
@@ -100,9 +100,9 @@ def _markers(path: Path) -> _Markers:
         what = "the C3D file has no labelled markers" if not labels else "the C3D file has no frames or no frame rate"
         hint = "export it again with the trajectories of the markers"
         raise DataError(what, where=str(path), allowed="labelled 3-D points and their frame rate", hint=hint)
-    if unit and unit not in _UNITS:
+    if unit and unit not in _LENGTH_UNITS:
         what, hint = f"the unit of the markers is '{unit}'", "export it again in one of these units"
-        raise DataError(what, where=str(path), allowed=", ".join(_UNITS), hint=hint)
+        raise DataError(what, where=str(path), allowed=", ".join(_LENGTH_UNITS), hint=hint)
     position = position[:, : len(labels)]
     unseen = (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
     position[unseen] = np.nan

@@ -32,8 +32,8 @@ from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256, os_error_reason
 from yid_ocp.sensors import CHANNEL_KINDS
 
-_MOUNTED = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
-_COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
+_VECTORS = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
+_COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _VECTORS for axis in channel.components)
 """Components of vectors measured by sensors on a link, such as `force_x`."""
 _MOST_BAD = 0.5  # fraction of bad lines above which the table is refused
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
@@ -153,11 +153,11 @@ def _mounted_sensors(
 ) -> dict[str, tuple[tuple[str, ...], dict[str, Array]]]:
     """For each recording group: the names of its sensors on links, and their values (M, k, components) by quantity."""
     found: dict[str, tuple[tuple[str, ...], dict[str, Array]]] = {}
-    for channel in _MOUNTED:
+    for channel in _VECTORS:
         parts = [f"{channel.quantity}_{axis}" for axis in channel.components]
         if not any(kind in parts for kind, _ in meanings):
             continue
-        of_group = [f"{c.quantity}_{axis}" for c in _MOUNTED if c.group == channel.group for axis in c.components]
+        of_group = [f"{c.quantity}_{axis}" for c in _VECTORS if c.group == channel.group for axis in c.components]
         names = tuple(dict.fromkeys(name for kind, name in meanings if kind in of_group))
         values = _gather(meanings, table, [(part, name) for name in names for part in parts], where)
         held = found.setdefault(channel.group, (names, {}))[1]

@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import ArrayLike
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, Vector3
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
@@ -22,7 +22,6 @@ from yid_ocp.options import OptionInfo, options_by_key, split_annotated
 from yid_ocp.registry import Registry
 
 START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
-_Vector3 = tuple[float, float, float]
 _STANDARD_GRAVITY = 9.81
 _DAMPING_TIME = 0.02  # initial ratio of damping to rigidity [s]
 SIZE_AND_MASS_DESCRIPTIONS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
@@ -34,8 +33,8 @@ class MountSettings:
     """The parent frame of an object, and the pose of the object's root in this frame."""
 
     parent_frame: Annotated[str | None, OptionInfo("frame in which xyz and rpy are given; default: world")] = None
-    xyz: Annotated[_Vector3, OptionInfo("position in the parent frame", "m")] = (0.0, 0.0, 0.0)
-    rpy: Annotated[_Vector3, OptionInfo("roll, pitch, yaw in the parent frame", "rad")] = (0.0, 0.0, 0.0)
+    xyz: Annotated[Vector3, OptionInfo("position in the parent frame", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[Vector3, OptionInfo("roll, pitch, yaw in the parent frame", "rad")] = (0.0, 0.0, 0.0)
 
     @property
     def pose(self) -> Array:
@@ -238,7 +237,7 @@ class ObjectBuilder:
         """
         return None
 
-    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
+    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: Vector3) -> System:
         """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
         raise NotImplementedError
 

@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 from annotated_types import Ge, Gt, Le, Len
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, Vector3
 from yid_ocp.errors import DataError, ModelError, require_known_names
 from yid_ocp.files import read_input_text
 from yid_ocp.model import flexible
@@ -36,7 +36,6 @@ from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, System, SystemBuildArguments, six_joint_floating_mechanism
 from yid_ocp.options import OptionInfo
 
-_Vector3 = tuple[float, float, float]
 INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
@@ -299,7 +298,7 @@ model:
             require_known_names([name], found.vertex_names_by_branch, "branch", where, ModelError)
         return found
 
-    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
+    def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: Vector3) -> System:
         return clamped_cable_system(edge_lengths, self.branch_vertices(), replace(self, gravity=gravity))
 
     def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
 
+from yid_ocp.arrays import Vector3
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.model.flexible import FlexibleSegment
@@ -16,7 +17,6 @@ from yid_ocp.model.objects import base
 from yid_ocp.model.objects.base import OBJECT_KINDS, InitialObjectSettings, InitObjectFactory, MountedObjectBuilder
 from yid_ocp.options import OptionInfo
 
-_Vector3 = tuple[float, float, float]
 _NO_TURN = (0.0, 0.0, 0.0)
 _RIGIDITY_RATIO = {"cable": 0.01, "beam": 1.0, "tree": 0.1}
 _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT grows on the end of PARENT"
@@ -43,7 +43,7 @@ class _SegmentGeometry:
     parent_link_index: Annotated[
         int | None, Ge(0), OptionInfo("link of the parent to whose tip it is attached; default: the last")
     ] = None
-    rpy: Annotated[_Vector3, OptionInfo("rest rotation relative to the parent's link or mount", "rad")] = _NO_TURN
+    rpy: Annotated[Vector3, OptionInfo("rest rotation relative to the parent's link or mount", "rad")] = _NO_TURN
     has_separate_twist_damping: Annotated[bool, OptionInfo("whether twists have their own damping parameter")] = False
     values_given_as_rigidities: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False

@@ -28,7 +28,7 @@ from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_r
 _MAX_ANIMATIONS = 4  # a page with more is slow to open
 _MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
 _MAX_LISTED_RECORDINGS = 3  # largest number of recordings that are drawn
-_MAX_POINTS = 6  # largest number of points of a group that are drawn
+_MAX_DRAWN_POINTS = 6  # largest number of points of a group that are drawn
 _ESTIMATE_COLORS = {
     "start": figures.MEASURED_COLOR,
     "estimate": figures.LINE_PALETTE[0],
@@ -312,7 +312,7 @@ def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
                     curve = TimePlotData(f"{words} [{unit}]", _lines(group.t, group.names, values))
                     yield f"Joints: {words} of {recording.name}", lines_over_time_figure(curve)
         else:
-            names = [f"{name}.{axis}" for name in group.names[:_MAX_POINTS] for axis in "xyz"]
+            names = [f"{name}.{axis}" for name in group.names[:_MAX_DRAWN_POINTS] for axis in "xyz"]
             lines = _lines(group.t, names, group.position.reshape(len(group.t), -1))
             figure = lines_over_time_figure(TimePlotData("position [m]", lines))
             yield f"Points: {group.name} of {recording.name}", figure
