@@ -184,6 +184,7 @@ def test_no_command_is_suggested_that_would_fail(odd, printed):
     (odd / "run.csv").write_text("t,bend\n0,1\n1,2\n")
     told = printed("import", "run.csv", "--preview")
     assert "the import needs more information" in told
+    assert "--columns 'bend=position:JOINT'" in told
     assert "yid-ocp import" not in told
 
 

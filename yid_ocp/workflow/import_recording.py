@@ -119,7 +119,10 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
         else:
             recording = read_any(files[0], progress=progress, **options)
     except DataError as error:
-        more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
+        unknown = next((key for key, own in (options.get("column_meanings") or {}).items() if own == "skip"), "")
+        has_hint = not unknown or "--columns" in error.hint
+        hint = error.hint if has_hint else f"give columns a meaning, as in --columns '{unknown}=position:JOINT'"
+        more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
     what = "it" if len(files) == 1 else "them as one recording"
     return [*recording_issue_lines(recording), "", f"to import {what}:", f"  {_import_command_line(files, options)}"]

@@ -153,8 +153,7 @@ def _dependent(folders: Sequence[str | Path]) -> str:
     """Return a message about a run that is the baseline of another one of `folders`. Empty if there is none."""
     known = [Path(folder).resolve() for folder in folders]
     for folder in known:
-        settings = _settings(folder)
-        for own in () if settings is None else settings.diagnosis.baseline_run_folders:
+        for own in settings.diagnosis.baseline_run_folders if (settings := _settings(folder)) else ():
             if Path(own).resolve() in known:
                 return f"{own} would count twice, because it is a baseline of {folder}"
     return ""
