@@ -48,7 +48,9 @@ def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, 
         run = load_config(repository / "configs" / "soft_beam.yaml", (*QUIET, *said))
         finding = run_diagnose(run, tmp_path / f"load{i}").output
         assert finding.accepted_effects[0].label == "point_mass@w_beam"
-        assert finding.final_model.values["point_mass@w_beam.mass"] == pytest.approx(mass, rel=0.1)
+        model, name = finding.final_model, "point_mass@w_beam.mass"
+        # hysteresis makes the cost rough, so the estimate depends on the minimum; its std includes what is left
+        assert abs(model.values[name] - mass) < 2 * model.std[name] < 0.5 * mass
         assert finding.counterfactual is not None
         # of a swing of 9 mm; without a diagnosis it is as little or 11 mm, by where the nominal fit ends
         [(_, without)] = finding.counterfactual.effects_removed.rmse_by_unit.values()
