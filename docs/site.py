@@ -57,11 +57,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Files of the repository that are no pages are named, not linked."""
+    """Files of the repository that are no pages are named, not linked; the file name of a code block is its title."""
 
     def kept(link: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(posixpath.dirname(page.file.src_uri), link[2].split("#")[0]))
         known = re.fullmatch(r"(?!\.\./)[\w/-]+\.(md|png|gif|svg|webp)", target) and target != "README.md"
         return link[0] if known or link[2].startswith(("https:", "http:", "#")) else link[1]
 
-    return re.sub(r"\[([^\]]*)\]\(([^)]*)\)", kept, markdown)
+    # a fence with a second word would be no code block
+    titled = re.sub(r"^```(\w+) (\w\S*)$", r'```\1 title="\2"', markdown, flags=re.MULTILINE)
+    return re.sub(r"\[([^\]]*)\]\(([^)]*)\)", kept, titled)
