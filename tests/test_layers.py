@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).parents[1] / NAME
 LAYERS = (
     ("errors", "version", "arrays"),
     ("registry",),  # it raises errors, so the two cannot share a layer
-    ("options", "files", "least_squares", "interruption", "progress", "display"),
+    ("options", "files", "least_squares", "interruption", "display"),
     ("parallel",), ("model",), ("effects", "sensors"), ("integrator",), ("data",), ("vision",), ("virtual",),
     ("problem",), ("inference",), ("solvers",), ("analysis",), ("diagnosis",), ("planning",), ("export", "report"),
     ("config",), ("workflow",), ("cli",), ("__main__",),
