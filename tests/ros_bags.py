@@ -16,7 +16,7 @@ class Bag:
     """A bag in the making, of one of `BAG_KINDS`; the bytes of what it holds may be in the other order."""
 
     def __init__(self, folder: Path, kind: str, big: bool = False) -> None:
-        pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
+        pytest.importorskip("rosbags", reason="bags need rosbags: pip install '.[bags]'")
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_typestore
 

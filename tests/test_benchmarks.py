@@ -68,7 +68,7 @@ def test_a_rule_is_worth_the_cases_that_change_without_it(benchmark_module, monk
 
 @pytest.fixture(scope="module")
 def coverage(benchmark_module):
-    pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
+    pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install '.[blind]'")
     return benchmark_module("coverage")
 
 
@@ -159,7 +159,7 @@ def test_noise_is_no_gap_and_an_offset_beyond_what_is_stated_is_named(alarms, tm
 
 @pytest.mark.slow
 def test_disturbed_runs_lose_nothing(repository):
-    pytest.importorskip("rosbags", reason="its recordings stand beside a bag: pip install 'yid-ocp[bags]'")
+    pytest.importorskip("rosbags", reason="its recordings stand beside a bag: pip install '.[bags]'")
     counts = ("--kills", "12", "--pairs", "3", "--disks", "6", "--caches", "2", "--seed", "1")
     command = [sys.executable, repository / "benchmarks" / "kills.py", *counts]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -28,7 +28,7 @@ from yid_ocp.workflow.blind import run_blind
 @pytest.fixture(scope="module", autouse=True)
 def distributed():
     """The package, which takes half a second to import."""
-    return pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
+    return pytest.importorskip("distributed", reason="clusters need Dask: pip install '.[cluster]'")
 
 
 def tasks(marks: Path, count: int = 12) -> list[Task]:
@@ -194,7 +194,7 @@ class Killing(Progress):
 
 @pytest.mark.slow
 def test_a_blind_proof_survives_a_killed_worker(scheduler, pendulum, tmp_path):
-    pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install 'yid-ocp[blind]'")
+    pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install '.[blind]'")
     settings = ("recordings.held_out=[]", "output.write_report=false", "problem.use_compiler=true")
     candidates = "diagnosis.candidates=[joint_viscous, joint_coulomb]"
     run = load_config(pendulum, ("model.arms.mode=driven", *settings, candidates))

@@ -13,7 +13,7 @@ import pytest
 from yid_ocp.errors import DataError
 from yid_ocp.vision.frames import import_open3d
 
-pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
+pytest.importorskip("rosbags", reason="bags need rosbags: pip install '.[bags]'")
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ def far(points: list[int]) -> bool:
 
 
 def test_a_mutant_changes_what_something_depends_on_and_nothing_that_only_speaks_or_guards(tmp_path, monkeypatch):
-    pytest.importorskip("cosmic_ray", reason="mutants are drawn with Cosmic Ray: pip install 'yid-ocp[dev]'")
+    pytest.importorskip("cosmic_ray", reason="mutants are drawn with Cosmic Ray: pip install '.[dev]'")
     monkeypatch.syspath_prepend(str(FOLDER))
     import places
 

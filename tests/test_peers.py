@@ -50,7 +50,7 @@ def test_a_run_that_fails_is_counted_and_a_tool_without_intervals_has_none(table
 @pytest.mark.slow
 def test_a_scaled_torque_is_seen_by_no_tool_and_a_payload_by_all(tmp_path, repository):
     """Both fits predict the held-out motion; the first has numbers 15 % too large, the second the true ones."""
-    pytest.importorskip("mujoco", reason="recordings are made in MuJoCo: pip install 'yid-ocp[peers]'")
+    pytest.importorskip("mujoco", reason="recordings are made in MuJoCo: pip install '.[peers]'")
     out, program = tmp_path / "peers.json", repository / "benchmarks" / "peers"
     command = [sys.executable, program, "--cases", "scaled_torque", "payload", "--seeds", "2", "--out", out]
     environment = os.environ | {"PYTHONPATH": str(repository)}

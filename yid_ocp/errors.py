@@ -81,7 +81,7 @@ _Error = TypeVar("_Error", bound=YidError)
 
 def missing_package_error(kind: type[_Error], what: str, extra: str) -> _Error:
     """Create an error of `kind`: a package of the optional dependencies `extra` is missing. `what` is the message."""
-    where, hint = f"the Python environment {sys.prefix}", f"pip install 'yid-ocp[{extra}]'"
+    where, hint = f"the Python environment {sys.prefix}", f"pip install '.[{extra}]' in the project's clone"
     return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
 
 

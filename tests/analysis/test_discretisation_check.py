@@ -11,7 +11,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.solve import run_solve
 
-pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
+pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install '.[blind]'")
 WHOLE = ("north", "south", "east", "west")
 
 

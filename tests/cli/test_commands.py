@@ -132,7 +132,7 @@ def test_without_the_extra_report(pendulum, tmp_path):
     command = [sys.executable, "-c", code, "simulate", str(pendulum), "--out", "run"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("yid-ocp[report]") == 1
+    assert done.stderr.count(".[report]") == 1
     assert (tmp_path / "run" / "result.json").is_file()
     assert not (tmp_path / "run" / "report.html").exists()
 

@@ -19,7 +19,7 @@ from yid_ocp.data.readers.bags import OpenBag
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
-NO_ROSBAGS = "bags need rosbags: pip install 'yid-ocp[bags]'"
+NO_ROSBAGS = "bags need rosbags: pip install '.[bags]'"
 BOOL, STRING = "std_msgs/msg/Bool", "std_msgs/msg/String"
 QUARTER = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 """A quarter turn about z, as (x, y, z, w)."""
@@ -381,7 +381,7 @@ def test_bags_that_are_none_and_no_rosbags(tmp_path: Path, monkeypatch: pytest.M
     refused(tmp_path, "the bag cannot be read")
     refused(tmp_path / "absent.bag", "no such file")
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    assert refused(tmp_path, "needs the package rosbags").hint == "pip install 'yid-ocp[bags]'"
+    assert refused(tmp_path, "needs the package rosbags").hint == "pip install '.[bags]' in the project's clone"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the system cannot limit memory")

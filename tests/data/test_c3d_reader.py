@@ -15,7 +15,7 @@ LABELS = ("Cable:base", "Cable:tip", "*3", "LKneeAngles", "gone")
 
 def write_c3d(path: Path, labels: tuple[str, ...] = LABELS, unit: str = "mm", frames: int = 6) -> np.ndarray:
     """A file at 200 Hz whose markers go up; frame 2 hides the tip, frame 4 the base. What was written, (N, 2, 3)."""
-    ezc3d: Any = pytest.importorskip("ezc3d", reason="C3D needs ezc3d: pip install 'yid-ocp[c3d]'")
+    ezc3d: Any = pytest.importorskip("ezc3d", reason="C3D needs ezc3d: pip install '.[c3d]'")
     file = ezc3d.c3d()
     point = file["parameters"]["POINT"]
     point["LABELS"]["value"], point["UNITS"]["value"], point["RATE"]["value"] = labels, [unit], [200.0]
@@ -79,4 +79,4 @@ def test_files_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     write_c3d(tmp_path / "none.c3d", ("*1", "LKneeAngles"))
     refused(tmp_path / "none.c3d", "no usable marker: 1 without label, 1 result of a body model")
     monkeypatch.setitem(sys.modules, "ezc3d", None)
-    assert refused(tmp_path / "run.c3d", "needs the package ezc3d").hint == "pip install 'yid-ocp[c3d]'"
+    assert refused(tmp_path / "run.c3d", "needs the package ezc3d").hint.startswith("pip install '.[c3d]'")

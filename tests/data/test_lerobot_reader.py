@@ -24,7 +24,7 @@ FIRST = "data/chunk-000/episode_000000.parquet"
 
 def write_dataset(folder: Path, version: str, names: Any = NAMES, **more: Any) -> Path:
     """Two episodes of four frames at 30 Hz; degrees 100 * episode + 10 * frame + joint, actions one degree more."""
-    pyarrow: Any = pytest.importorskip("pyarrow", reason="LeRobot needs pyarrow: pip install 'yid-ocp[lerobot]'")
+    pyarrow: Any = pytest.importorskip("pyarrow", reason="LeRobot needs pyarrow: pip install '.[lerobot]'")
     from pyarrow import parquet
 
     shape = {"dtype": "float32", "shape": [3], "names": names}
@@ -200,4 +200,4 @@ def test_a_table_too_large_or_damaged_and_a_missing_package(tmp_path: Path, monk
     (path / FIRST).write_bytes(b"PAR1 and no more")
     refused(path, "table of the episode cannot be read")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert refused(path, "needs pyarrow").hint == "pip install 'yid-ocp[lerobot]'"
+    assert refused(path, "needs pyarrow").hint == "pip install '.[lerobot]' in the project's clone"

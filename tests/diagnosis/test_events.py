@@ -38,7 +38,7 @@ from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
 from yid_ocp.virtual.joint_motion import MultisineMotion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
-pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
+pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install '.[blind]'")
 
 JOINTS = ("shoulder", "elbow")
 

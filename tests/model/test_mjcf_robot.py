@@ -18,7 +18,7 @@ from yid_ocp.model.kinematics import lagrangian_first_derivatives, lagrangian_se
 from yid_ocp.model.urdf import read_urdf, urdf_joint_dynamics
 from yid_ocp.workflow.build import build_system
 
-mujoco = pytest.importorskip("mujoco", reason="MJCF needs mujoco: pip install 'yid-ocp[blind]'")
+mujoco = pytest.importorskip("mujoco", reason="MJCF needs mujoco: pip install '.[blind]'")
 
 INERTIAL = '<inertial mass="{0}" pos="0.01 -0.02 {1}" quat="0.9 0.1 0.3 -0.2" diaginertia="0.02 0.03 0.04"/>'
 

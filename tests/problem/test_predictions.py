@@ -180,7 +180,7 @@ def test_a_frame_has_every_parameter_and_its_interval(solution, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
     with pytest.raises(ConfigError, match="needs the package pandas") as caught:
         solution.parameters_to_dataframe()
-    assert "yid-ocp[pandas]" in caught.value.hint
+    assert ".[pandas]" in caught.value.hint
 
 
 PARENT = ("p0", "p1", "p2", "p3", "p4")

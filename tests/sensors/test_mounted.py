@@ -68,7 +68,7 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_sensor_reads_what_mujoco_reads(urdf: Path) -> None:
     """At any state, of what is beyond the sensor's link alone; MuJoCo's wrench is that of the sensor on it."""
-    mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install 'yid-ocp[blind]'")
+    mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install '.[blind]'")
     system = System.build(read_urdf(urdf))
     kept = urdf.read_text().replace('name="arm">', 'name="arm"><mujoco><compiler fusestatic="false"/></mujoco>', 1)
     spec = mujoco.MjSpec.from_string(kept)
@@ -111,7 +111,7 @@ def holding(urdf: Path, kind: str = "point", effects: Mapping[str, dict[str, flo
 @pytest.fixture(scope="module")
 def recorded(urdf: Path) -> Recording:
     """A motion of arm and rod in MuJoCo, with its own sensors on the lower link and at the rod's end, without noise."""
-    mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install 'yid-ocp[blind]'")
+    mujoco = pytest.importorskip("mujoco", reason="the other engine is MuJoCo: pip install '.[blind]'")
     from yid_ocp.virtual import mujoco_simulation as engine
     from yid_ocp.virtual.joint_motion import MultisineMotion
     from yid_ocp.virtual.mjcf import mujoco_model_from_mjcf_text, mujoco_xml

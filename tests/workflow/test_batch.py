@@ -139,7 +139,7 @@ SETTINGS = (
 
 @pytest.fixture
 def driven(pendulum):
-    pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install 'yid-ocp[blind]'")
+    pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install '.[blind]'")
     return load_config(pendulum, SETTINGS)
 
 

@@ -17,7 +17,7 @@ from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
-mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
+mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install '.[blind]'")
 
 
 def written_run(folder, effects, run, recorded=True):

@@ -259,7 +259,7 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
 
 def lerobot_dataset(folder: Path, joints: JointGroup) -> Path:
     """A dataset of one episode as LeRobot makes it: angles in degrees as 32-bit numbers, the gripper in per cent."""
-    pyarrow: Any = pytest.importorskip("pyarrow", reason="LeRobot needs pyarrow: pip install 'yid-ocp[lerobot]'")
+    pyarrow: Any = pytest.importorskip("pyarrow", reason="LeRobot needs pyarrow: pip install '.[lerobot]'")
     from pyarrow import parquet
 
     shape = {"dtype": "float32", "shape": [6], "names": [f"{name}.pos" for name in joints.names]}

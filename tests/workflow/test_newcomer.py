@@ -153,7 +153,7 @@ CROSS_NUMBERS += ("--holder", "panda_link8")  # it sits in the flange, which the
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    pytest.importorskip("mujoco", reason="made recordings need mujoco: pip install 'yid-ocp[blind]'")
+    pytest.importorskip("mujoco", reason="made recordings need mujoco: pip install '.[blind]'")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

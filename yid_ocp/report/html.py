@@ -39,7 +39,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     page's folder or up to two levels above. Without the extra `report`, a warning is logged and no page is written.
     """
     if not _installed():
-        log.warning("no report is written, because plotly is not installed: pip install 'yid-ocp[report]'")
+        log.warning("no report is written, because plotly is missing: pip install '.[report]' in the project's clone")
         return False
     import jinja2
 
