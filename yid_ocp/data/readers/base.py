@@ -75,7 +75,8 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
         if of is None:
             said = unknown_name_error_arguments(word, chain(*_TO_SI.values()))
             raise DataError(f"the unit '{word}' is unknown", where="--units", **said)
-        for quantity in (quantity for quantity, si in _QUANTITIES.items() if si == of):
+        own = [q for q, si in _QUANTITIES.items() if si == of and (q == "effort" or word not in MOTOR_CURRENT_UNITS)]
+        for quantity in own:
             _set_unit(units, quantity, word)
     return units | exact
 
@@ -153,8 +154,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
-    seen = []
-    chosen = options.point_names
+    seen, chosen = list[PointGroup](), options.point_names
     for entry in raw.points if chosen is None else _chosen_points(raw.points, chosen, where):
         std = None if entry.std is None else factors["points"] * entry.std
         t, position = factors["t"] * entry.t, factors["points"] * entry.position
