@@ -60,7 +60,7 @@ def with_torque_noise(case: str, folder: Path) -> tuple[str, ...]:
     from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
     from yid_ocp.data.recording_hdf5 import write_recording
     from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
-    from yid_ocp.virtual.injected import run_experiment_with_effects
+    from yid_ocp.virtual.injected import run_experiment_with_injected_effects
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.workflow.build import build_system
 
@@ -76,7 +76,7 @@ def with_torque_noise(case: str, folder: Path) -> tuple[str, ...]:
         )
         withheld = CASES[case].withheld
         run = (withheld, settings) if withheld else (settings,)
-        recording = (run_experiment_with_effects if withheld else run_virtual_experiment)(system, TRUTH, *run)
+        recording = (run_experiment_with_injected_effects if withheld else run_virtual_experiment)(system, TRUTH, *run)
         write_recording(recording, file)
         command += ["--set", f"recordings.{role}=[{file}]"]
     return tuple(command)

@@ -40,7 +40,7 @@ from yid_ocp.files import make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import VirtualExperimentSettings
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
@@ -168,7 +168,7 @@ def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
     experiment = VirtualExperimentSettings(
         motion=motion, initial_joint_angles=posture, seed=noise_seed, recording_name=f"motion_{motion_seed}"
     )
-    return run_experiment_with_effects(system, values, case.withheld, experiment)
+    return run_experiment_with_injected_effects(system, values, case.withheld, experiment)
 
 
 def found(name: str, seeds: Sequence[int], truth: bool = True) -> tuple[DiagnosisResult, float, float]:

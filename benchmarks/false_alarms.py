@@ -44,7 +44,7 @@ from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import sha256_of_source_files
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, baxter_foam_y_system
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.diagnose import run_diagnose
@@ -110,7 +110,7 @@ def make_pair(name: str, recipe: Mapping[str, Any], number: int, folder: str, co
             recording_name=f"{name}_{number:03d}_{purpose}",
             description=f"Twin {number} of {name} (motion seed {motion_seed}).",
         )
-        recording = run_experiment_with_effects(system, truth, kind.effects, experiment)
+        recording = run_experiment_with_injected_effects(system, truth, kind.effects, experiment)
         recording = replace(recording, points=tuple(group for group in recording.points if group.name in cell.sees))
         path = Path(folder) / f"{recording.name}_{json_sha256([recipe, code])[:8]}.h5"
         write_recording(recording, path)

@@ -40,7 +40,7 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
@@ -105,7 +105,7 @@ def recorded(seed: int, amplitudes: Mapping[str, float]) -> Recording:
         kind, _, quantity = name.partition("@joint.")
         sizes.setdefault(kind, {})[quantity] = value
     effects = [InjectedEffect(kind, "joint", size) for kind, size in sizes.items()]
-    made = run_experiment_with_effects(system, values, effects, experiment, ())
+    made = run_experiment_with_injected_effects(system, values, effects, experiment, ())
     assert made.joints is not None
     joints = replace(made.joints, proportional_gain=400.0)
     return replace(made, joints=replace(joints, velocity=None, velocity_std=None), true_parameters={})

@@ -123,7 +123,7 @@ def case(settings: list[str], seed: int) -> dict[str, float]:
         for name, x in zip(problem.unknown_names, problem.initial_unknowns, strict=True)
     }
     solution = fit_problem(
-        problem, GaussNewton(max_iterations=6), initial_unknowns=problem.unknown_vector(values).tolist(), restarts=False
+        problem, GaussNewton(max_iterations=6), initial_unknowns=problem.pack_unknowns(values).tolist(), restarts=False
     )
     return {"cpu": time.process_time() - begun, "cost": float(solution.cost)}
 

@@ -48,10 +48,10 @@ from yid_ocp.virtual.experiment import (
     baxter_foam_y_system,
     run_virtual_experiment,
 )
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_step
-from yid_ocp.workflow.build_problem import build_problem, problem_options
+from yid_ocp.workflow.build_problem import build_problem, make_problem_options
 from yid_ocp.workflow.command_runner import StderrLogLinesProgress
 from yid_ocp.workflow.plan import _parameter_and_effect_values
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
@@ -151,7 +151,7 @@ def pair(name: str, starts: int, share: float) -> None:
             seed=NOISE_SEED + seed,
             recording_name=f"planned_{seed}",
         )  # fmt: skip
-        planned.append(run_experiment_with_effects(baxter_foam_y_system(1), TRUTH, case.withheld, experiment))
+        planned.append(run_experiment_with_injected_effects(baxter_foam_y_system(1), TRUTH, case.withheld, experiment))
     after = _diagnosed(nominal, [made[0], planned[0]], [made[1], planned[1]])
     rivals = [rival.label for rival in after.selected_effects[0].equivalent_effects] if after.accepted_effects else []
     print(f"after: {after.verdict}, {', '.join(rivals)}")
@@ -186,7 +186,7 @@ def wrist() -> None:
             write_recording(replace(recording, channel_groups=(sensed,), points=()), f"{folder}/sensed.h5")
             run = load_config(config, [*asked, f"recordings.estimate=[{folder}/sensed.h5]"])
             step, [sensed_recording] = build_step(run), read_recordings_of_role(run)
-            options = problem_options(run, step.system)
+            options = make_problem_options(run, step.system)
         for words, efforts, wrists in (("efforts", True, False), ("wrist", False, True), ("both", True, True)):
             used = {f"wrist.{quantity}": SensorOptions(use=wrists) for quantity in ("force", "torque")}
             used["joints.effort"] = SensorOptions(use=efforts)

@@ -33,7 +33,7 @@ from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.effects.base import elastic_joints_of_segment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
@@ -145,7 +145,7 @@ def record(case: Case, motion_seed: int, noise_seed: int, noisy: bool) -> Record
         injected_terms=None if case.withheld else Injected(case, system),
     )
     if case.withheld:
-        return run_experiment_with_effects(system, TRUTH, [case.withheld], experiment)
+        return run_experiment_with_injected_effects(system, TRUTH, [case.withheld], experiment)
     return run_virtual_experiment(system, TRUTH, experiment)
 
 

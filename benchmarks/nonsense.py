@@ -30,7 +30,7 @@ from yid_ocp.errors import DataError, YidError
 from yid_ocp.integrator.step import Step
 from yid_ocp.solvers import fit_problem
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_inputs import resolve_default_recording
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 Damage = Callable[[Recording], Recording]
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -286,7 +286,7 @@ def renamed(old: str, new: str) -> Damage:
 
 def other_arm(recording: Recording) -> Recording:
     """The right arm's recording under the left arm's names."""
-    other = read_recording(resolve_default_recording("default:dual_arm_vision_held_out.h5"))
+    other = read_recording(resolve_recording_path("default:dual_arm_vision_held_out.h5"))
     group = other.joints
     assert group is not None
     columns = [i for i, name in enumerate(group.names) if name.startswith("right")]
@@ -467,7 +467,7 @@ def clean_recording(case: Case) -> Path | None:
     """The recording that a case damages, None where it is not here."""
     if case.config in REAL:
         return _real(case.config) if _real(case.config).is_file() else None
-    return Path(resolve_default_recording(f"default:{case.config}_estimate.h5"))
+    return Path(resolve_recording_path(f"default:{case.config}_estimate.h5"))
 
 
 def prepared(case: Case, folder: Path) -> RunSettings:

@@ -42,7 +42,7 @@ from yid_ocp.planning.joint_paths import (
 )
 from yid_ocp.planning.motion_plan import TargetMotionPlan, plan_motion_to_target
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, baxter_foam_y_system
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.workflow.diagnose import run_diagnose
@@ -226,7 +226,7 @@ def record(folder: Path, noise: int = NOISE, effects: Sequence[InjectedEffect] =
         )
         experiment = VirtualExperimentSettings(motion, posture, simulation, ROUGH.noise(1), CAMERA, seed=noise + i)
         files.append(folder / f"motion_{motion_seed}.h5")
-        write_recording(run_experiment_with_effects(system, TRUTH, effects, experiment), files[-1])
+        write_recording(run_experiment_with_injected_effects(system, TRUTH, effects, experiment), files[-1])
     return files
 
 

@@ -24,10 +24,10 @@ from yid_ocp.diagnosis import gap_law
 from yid_ocp.effects.law import (
     TorqueLaw,
     TorqueLawTable,
-    torque_law_argument_along_rollout,
     torque_law_from_tables,
+    torque_law_quantity_at_midpoints,
 )
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
@@ -51,7 +51,7 @@ def visited(problem: EstimationProblem, solution: Solution, quantity: str) -> di
         own = result.rollout
         nodes = {"state": own.state, "torque": own.torque, "multipliers": own.multipliers}
         nodes["time_step"] = np.array(episode.grid.time_step)
-        values = torque_law_argument_along_rollout(problem.system, JOINT, quantity, theta, nodes).ravel()
+        values = torque_law_quantity_at_midpoints(problem.system, JOINT, quantity, theta, nodes).ravel()
         found[episode.name] = values[np.isfinite(values)]
     return found
 
@@ -80,15 +80,15 @@ def left_out_errors(
     nominal = dict(zip(base.system.parameters.names, map(float, base.theta), strict=True))
     recordings = [episode.recording for episode in base.episodes]
     problem = EstimationProblem(step, recordings, (*base.free, *names), base.options, nominal)
-    evaluation = problem.evaluate(problem.unknown_vector(known))
-    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
+    evaluation = problem.evaluate(problem.pack_unknowns(known))
+    residual, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
     at = [problem.unknown_names.index(name) for name in names]
     basis, _ = np.linalg.qr(np.delete(jacobian, at, axis=1))
     rest, slopes = (x - basis @ (basis.T @ x) for x in (residual, jacobian[:, at]))
     family = gap_law._family(law, rest, slopes)
     whole = with_prior(problem, law, family.precision)
     fitted = GaussNewton(max_iterations=MAX_ITERATIONS).minimize_cost(
-        whole, whole.unknown_vector(known | family.values), None
+        whole, whole.pack_unknowns(known | family.values), None
     )
     errors = dict[str, float]()
     for kind, own in kinds.items():

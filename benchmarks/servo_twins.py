@@ -29,7 +29,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
@@ -93,7 +93,7 @@ def recorded(system: System, seed: int, effects: Sequence[InjectedEffect] = ()) 
         seed=seed,
         recording_name=f"servo_arm_{seed}",
     )
-    made = run_experiment_with_effects(system, TRUTH, effects, experiment)
+    made = run_experiment_with_injected_effects(system, TRUTH, effects, experiment)
     [seen] = made.points
     markers = PointGroup("points", seen.names, seen.t, seen.position, seen.std, "motion capture")
     assert made.joints is not None

@@ -27,7 +27,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
@@ -74,7 +74,7 @@ def recorded(system: System, seed: int) -> Recording:
     )
     laws = {"joint_coulomb": {"tau_c": COULOMB}, "joint_load_friction": {"share": LOAD_SHARE}}
     friction = [InjectedEffect(kind, joint, size) for joint in POSTURE for kind, size in laws.items()]
-    made = run_experiment_with_effects(system, values, [], experiment, friction)
+    made = run_experiment_with_injected_effects(system, values, [], experiment, friction)
     assert made.joints is not None
     joints = replace(made.joints, proportional_gain=GAIN)
     return replace(made, joints=replace(joints, velocity=None, velocity_std=None), true_parameters=TRUTH)

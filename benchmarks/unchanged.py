@@ -25,7 +25,7 @@ from yid_ocp import cli
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
-from yid_ocp.workflow.run_inputs import resolve_default_recording
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 REPOSITORY = Path(__file__).parents[1]
 RECORDED = Path(__file__).with_suffix(".json")
@@ -44,9 +44,7 @@ def solved(name: str) -> dict[str, Any]:
     """Parameters, status and cost of a configuration; empty where its recordings are not here."""
     file = configurations()[name]
     run = load_config(file)
-    if not all(
-        resolve_default_recording(path).is_file() for path in (*run.recordings.estimate, *run.recordings.held_out)
-    ):
+    if not all(resolve_recording_path(path).is_file() for path in (*run.recordings.estimate, *run.recordings.held_out)):
         return {}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"

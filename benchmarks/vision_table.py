@@ -210,7 +210,7 @@ class Stage:
         self.data = mujoco.MjData(self.model)
         names = system.mechanism.joint_names
         self.order = [self.model.joint(name).id for name in names]
-        tree = system.numeric_mechanism(play.values)
+        tree = system.mechanism_with_values(play.values)
         self.robot = load_robot_meshes_by_joint("package:baxter", tree)
         theta = dict(zip(system.parameters.names, system.parameters.vector(play.values), strict=True))
         self.rods = []

@@ -13,7 +13,7 @@ from typing import Any
 from yid_ocp.config.schema import option_info_from_annotation, section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.model.objects import OBJECT_KINDS
-from yid_ocp.options import Option, describe_type, mapping_value_type, options_by_key, variadic_tuple_entry_type
+from yid_ocp.options import Option, class_options_by_key, describe_type, mapping_value_type, variadic_tuple_entry_type
 
 HEAD = """\
 # Settings
@@ -40,7 +40,7 @@ def tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
     """Title, first sentence and rows of a section and of all below it."""
     sections = section_variants_from_annotation(hint)
     for word, kind in sections.classes.items() if sections is not None else ():
-        options = options_by_key(kind)
+        options = class_options_by_key(kind)
         title = (
             f"{path}, {sections.selector_key}: {word}"
             if sections is not None and sections.selector_key

@@ -15,7 +15,7 @@ def assert_nothing_impossible_is_said(finding: DiagnosisResult, text: str) -> No
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     if "The gap is real" in text and finding.screening.candidate_scores:
         assert residuals_exceed_noise(tests, finding.thresholds.null_test_excess_criteria), text
-    if finding.verdict == "no_gap" and not finding.exceeds_noise(finding.thresholds):
+    if finding.verdict == "no_gap" and not finding.residual_exceeds_noise(finding.thresholds):
         is_significant = min(test.p_value for test in tests) < finding.thresholds.significance_level
         assert ("The excess over noise is significant, but a gap needs" in text) == is_significant
     if finding.verdict in ("no_gap", "insufficient_data"):

@@ -7,7 +7,7 @@ import pytest
 from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.build import build_step
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_inputs import resolve_default_recording
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 QUICK = {
     "single_arm_vision": ["effort x 0.1", "gap of 2 s", "camera mirrored", "wrist angles x 20", "a link renamed"],
@@ -67,7 +67,7 @@ def test_shipped_recordings_are_not_in_doubt(repository, step_of, clean, config,
     roles = ("estimate", "held_out") if exact else ()
     files = [f"recordings.{role}=[{clean / config}_{role}.h5]" for role in roles]
     run = load_config(repository / "configs" / f"{config}.yaml", files)
-    files = [resolve_default_recording(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
+    files = [resolve_recording_path(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
     missing = [file for file in files if not file.is_file()]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")

@@ -10,7 +10,7 @@ import pytest
 from annotated_types import Ge, Gt, Le, Len, Lt
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.options import OptionInfo, check_option_bounds, describe_type, options_by_key
+from yid_ocp.options import OptionInfo, check_option_bounds, class_options_by_key, describe_type
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SteepestDescent
 
 
@@ -39,7 +39,7 @@ WORDS = {
 
 
 def test_options_are_the_fields_that_say_what_they_are():
-    options = options_by_key(Wheel)
+    options = class_options_by_key(Wheel)
     assert (options["radius"].default_value, options["spokes"].default_value) == (MISSING, None)
     assert {name: describe_type(option.type_hint) for name, option in options.items()} == WORDS
 

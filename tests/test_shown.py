@@ -94,7 +94,7 @@ def test_results_state_shapes_and_units(shown):
         if result.__name__ not in settings:
             text = inspect.getdoc(result)
             assert re.search(r"\[(1|s|m|rad|nat|N m)|unit", text), result
-            if result.__name__ != "ExperimentChangesByIdentifiableCount":  # it has no arrays
+            if result.__name__ != "ExperimentChangesRankedByIdentifiability":  # it has no arrays
                 assert re.search(r"\(\w+( \+ 1)?, ?\w*\)|shape", text), result
 
 

@@ -61,7 +61,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 
 @contextlib.contextmanager
-def process_memory_limit() -> Iterator[None]:
+def limit_process_memory() -> Iterator[None]:
     """Limit the additional memory of this process to 1.75 GiB inside a `with` block (on Linux only).
 
     A library that needs more memory to unpack an input file gets a MemoryError. An existing limit stays unchanged.
@@ -82,7 +82,7 @@ def process_memory_limit() -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def check_max_input_numbers(count: int, where: str) -> None:
+def check_input_number_count(count: int, where: str) -> None:
     """Raise `DataError` if an input file contains or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
         allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"

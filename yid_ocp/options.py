@@ -61,7 +61,7 @@ class Option:
 
 
 @functools.cache
-def options_by_key(kind: type) -> Mapping[str, Option]:
+def class_options_by_key(kind: type) -> Mapping[str, Option]:
     """Return the options of a dataclass by key. A key is the name of an `OptionInfo` field without a trailing `_`."""
     hints = get_type_hints(kind, include_extras=True)
     found = {}
@@ -133,7 +133,7 @@ def _words(hint: Any) -> str:
 def check_option_bounds(options: Any, where: str) -> None:
     """Raise `ConfigError` if a number in an options dataclass is outside its annotated bounds. `where` is its place."""
     kind: Any = type(options)
-    for name, option in options_by_key(kind).items():
+    for name, option in class_options_by_key(kind).items():
         value = getattr(options, option.field_name)
         if not _within(option.type_hint, value):
             raise ConfigError(f"{name} = {value} is out of range", where=where, allowed=describe_type(option.type_hint))

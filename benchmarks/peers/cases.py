@@ -156,7 +156,7 @@ def _payload(seed: int, folder: Path) -> Trial:
 def _with_body_at_hand(system: System, mass: float) -> str:
     """MJCF of the bare arm, and a body `payload` at the hand's frame that holds the unknown mass."""
     root = ElementTree.fromstring(mujoco_xml(system, time_step=1e-3))
-    frame = system.numeric_mechanism().frame("panda_hand_tcp")
+    frame = system.mechanism_with_values().frame("panda_hand_tcp")
     rotation, place = (np.array(ca.evalf(part)) for part in (frame.placement.rotation, frame.placement.translation))
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, rotation.reshape(9))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.clock_checks import problem_with_fitted_point_clocks
+from yid_ocp.analysis.clock_checks import problem_with_fitted_clocks_and_issues
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -56,13 +56,13 @@ def test_damping_is_right_where_markers_are_late(tmp_path):
         for made, shift in zip((*late, swung(0.0005, 1.1, 2)), (0.03, -0.02, 0.025), strict=True)
     ]
     problem = EstimationProblem(step, far[:2], tuple(truth), told, held_out=far[2:])
-    problems["fitted"], doubts = problem_with_fitted_point_clocks(problem)
+    problems["fitted"], doubts = problem_with_fitted_clocks_and_issues(problem)
     fitted = [episode.recording for episode in (*problems["fitted"].episodes, *problems["fitted"].held_out)]
     shifts = [1e3 * (own.points[0].t - made.points[0].t)[0] for own, made in zip(far, fitted, strict=True)]
     assert shifts == pytest.approx([30.5, -19.5, 25.5], abs=0.5), "of held-out recordings too"
     assert doubts == [], "within what is stated"
     sure = [replace(own, points=(replace(own.points[0], clock_offset_std=0.01),)) for own in far]
-    _, doubts = problem_with_fitted_point_clocks(
+    _, doubts = problem_with_fitted_clocks_and_issues(
         EstimationProblem(step, sure[:2], tuple(truth), told, held_out=sure[2:])
     )
     assert [doubt.recording for doubt in doubts] == [sure[0].name, sure[2].name]

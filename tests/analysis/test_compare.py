@@ -17,7 +17,7 @@ from yid_ocp.analysis import estimation
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, compare_methods
 from yid_ocp.analysis.estimation import (
     channels_worse_than_naive_prediction,
-    choose_cable_memory_fit,
+    choose_fit_with_or_without_shape_memory,
     prediction_errors_units_and_fit_errors,
 )
 from yid_ocp.errors import ConfigError
@@ -176,7 +176,7 @@ def compared(monkeypatch):
         monkeypatch.setattr(estimation, "solve", whole)
         monkeypatch.setattr(estimation, "add_intervals_and_checks", lambda _, made: replace(made, message="checked"))
         monkeypatch.setattr(module, "solution_with_profile_intervals", lambda _, own: replace(own, message="profiled"))
-        monkeypatch.setattr(module, "problem_without_input_errors", lambda problem: Problem(problem.options.weighting))
+        monkeypatch.setattr(module, "problem_with_exact_inputs", lambda problem: Problem(problem.options.weighting))
         solvers = [SimpleNamespace(name=name) for name in solutions if name != "all_noise"]
         told = []
         found = compare_methods(Problem(weighting, disturbed), solvers, truth, lambda *entry: told.append(entry))
@@ -381,7 +381,7 @@ class Means:
         assert values == {"a.memory": 0.0}
         return self
 
-    def unknown_vector(self, values):
+    def pack_unknowns(self, values):
         return np.array([values[name] for name in self.unknown_names])
 
 
@@ -410,12 +410,12 @@ def solved(monkeypatch):
 )
 def test_nothing_is_asked_where_nothing_is_in_question(solved, names, speeds):
     problem, found = Means((1.0, 2.0, 3.0), speeds, names), fitted((2.0, 0.5), names)
-    safe = choose_cable_memory_fit(problem, None, found)
+    safe = choose_fit_with_or_without_shape_memory(problem, None, found)
     assert (safe.problem, safe.solution, safe.message, solved.problems) == (problem, found, "", [])
 
 
 def test_a_single_recording_in_motion_bears_nothing_out(solved):
-    safe = choose_cable_memory_fit(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
+    safe = choose_fit_with_or_without_shape_memory(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
     assert safe.problem is solved.problems[0]
     assert (safe.problem.unknown_names, safe.solution.x.tolist()) == (("k",), [2.0])
     assert "fewer than two recordings start in motion" in safe.message
@@ -438,7 +438,7 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     """Each from the others alone: the first from a mean of 4, the last from 1.5, wherever the fit of all stands."""
     problem, found = Means((1.0, 2.0, 6.0), (0.5, 0.0, 0.5), off=off), fitted((at, 0.5))
     problem.bounds = tuple(np.array([bound, side]) for bound, side in zip(bounds, (0.0, 1.0), strict=True))
-    safe = choose_cable_memory_fit(problem, None, found)
+    safe = choose_fit_with_or_without_shape_memory(problem, None, found)
     missed = np.array(predicted) - [1.0, 6.0]
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (safe.problem is problem) is kept
@@ -449,9 +449,9 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
 def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
     problem.predictor.predict_episode = lambda *_: "it snaps"
-    assert "inf with memory and" in choose_cable_memory_fit(problem, None, found).message
+    assert "inf with memory and" in choose_fit_with_or_without_shape_memory(problem, None, found).message
     solved.ok = False
-    assert choose_cable_memory_fit(problem, None, found).solution is found
+    assert choose_fit_with_or_without_shape_memory(problem, None, found).solution is found
 
 
 ENTRY = {
@@ -554,7 +554,7 @@ def test_the_error_of_links_is_uncounted_where_an_object_has_them_and_nothing_is
     layouts = (SimpleNamespace(name="T1"),) if segments else ()
     options = SimpleNamespace(checked_discretisations=kinds, divided_links_model=divided)
     made = SimpleNamespace(options=options, system=SimpleNamespace(segment_layouts=layouts))
-    monkeypatch.setattr(estimation.discretisation, "estimate_shifts_by_discretisation", lambda *_: ({}, ["why"]))
+    monkeypatch.setattr(estimation.discretisation, "parameter_shifts_at_finer_discretisation", lambda *_: ({}, ["why"]))
     monkeypatch.setattr(estimation, "typical_parameter_magnitudes", lambda *_: {"k": 1.0})
     fit = replace(solution(k=estimate(2.0)), evaluation=SimpleNamespace())
     found, checks = estimation._with_discretisation_errors(made, fit, None)

@@ -9,7 +9,7 @@ from small_problems import pendulum_step
 
 from yid_ocp.analysis.discretisation import min_gap_by_grasp_at_robot_posture, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
-    parameter_equations_and_responses,
+    equations_and_sensors_per_parameter,
     step_complexity_summary,
     step_equation_jacobians_at_state,
 )
@@ -44,7 +44,7 @@ def judged(problem):
     path = episode.initial_known_coordinates[len(system.driven) :]
     rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, problem.theta, path)
     symbols = NamedStepEquations.from_equations(step.equations)
-    found = parameter_equations_and_responses(step, symbols, episode, rest.state, problem.theta, rows)
+    found = equations_and_sensors_per_parameter(step, symbols, episode, rest.state, problem.theta, rows)
     return {entry.parameter: entry for entry in found}, rest, rows
 
 
@@ -175,7 +175,7 @@ def test_without_sensors_only_rows_are_said(hanging):
     theta = step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
     rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, theta, np.zeros(0))
-    found = {e.parameter: e for e in parameter_equations_and_responses(step, symbols, None, rest.state, theta, rows)}
+    found = {e.parameter: e for e in equations_and_sensors_per_parameter(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].observable_rows is None
     assert (found["T1.twist"].max_change_from_rest, found["T1.twist"].seconds) == (None, 0.0)
     assert len(found["T1.bend"].rows) == 12

@@ -19,14 +19,14 @@ from yid_ocp.analysis.discretisation import (
     _gauss_newton_step_in_finer_model,
     _half_step_error,
     alternating_error_growth_of_worst_recording,
-    estimate_shifts_by_discretisation,
-    estimates_with_discretisation_error,
+    estimates_widened_by_discretisation_error,
     longest_accurate_time_step,
+    parameter_shifts_at_finer_discretisation,
     predicted_refit_residual_at_finer_step,
 )
 from yid_ocp.analysis.estimation import add_intervals_and_checks
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep
+from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
@@ -135,8 +135,8 @@ ONE, BOTH = math.hypot(0.1, 0.6), math.hypot(0.1, 0.6, 0.8)
     ids=["not tried", "within it", "links", "time step", "both"],
 )
 def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):
-    shifts = {"a": EstimateShiftByLinksAndTimeStep(links, time_step)}
-    found = estimates_with_discretisation_error({"a": estimate(10.0, 0.1)}, shifts, {})
+    shifts = {"a": EstimateShiftByDiscretisation(links, time_step)}
+    found = estimates_widened_by_discretisation_error({"a": estimate(10.0, 0.1)}, shifts, {})
     assert found["a"].std == pytest.approx(std)
 
 
@@ -149,8 +149,8 @@ LOWERED = [(0.6, "identifiable", "weak"), (30.0, "identifiable", "not_identifiab
 def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
-    shifts = {"c": EstimateShiftByLinksAndTimeStep(9.0), "a": EstimateShiftByLinksAndTimeStep(move)}
-    found = estimates_with_discretisation_error(said, shifts, {})
+    shifts = {"c": EstimateShiftByDiscretisation(9.0), "a": EstimateShiftByDiscretisation(move)}
+    found = estimates_widened_by_discretisation_error(said, shifts, {})
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
     assert found["b"] == said["b"]
@@ -171,8 +171,8 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
 )
 def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
     said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
-    shifts = {"a": EstimateShiftByLinksAndTimeStep(0.3)}
-    found = estimates_with_discretisation_error({"a": said}, shifts, {})["a"].interval
+    shifts = {"a": EstimateShiftByDiscretisation(0.3)}
+    found = estimates_widened_by_discretisation_error({"a": said}, shifts, {})["a"].interval
     if expected is None:
         assert found is None
     else:
@@ -181,7 +181,7 @@ def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected)
 
 def test_what_nothing_informs_stays_unknown():
     said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
-    assert estimates_with_discretisation_error(said, {"a": EstimateShiftByLinksAndTimeStep(5.0, 5.0)}, {}) == said
+    assert estimates_widened_by_discretisation_error(said, {"a": EstimateShiftByDiscretisation(5.0, 5.0)}, {}) == said
 
 
 def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
@@ -196,7 +196,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     finer = fit_problem(fine, GaussNewton(), initial_unknowns=found.x)
     own, _ = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
     # without segments there are no links to divide
-    told, notes = estimate_shifts_by_discretisation(coarse, found.x, found.evaluation, ("links", "time_step"))
+    told, notes = parameter_shifts_at_finer_discretisation(coarse, found.x, found.evaluation, ("links", "time_step"))
     assert notes == []
     assert {name: entry.time_step for name, entry in told.items()} == pytest.approx(own, rel=1e-6)
     assert {entry.links for entry in told.values()} == {None}

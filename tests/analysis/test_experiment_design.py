@@ -27,8 +27,8 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
-from yid_ocp.inference.whitening import problem_with_whitening_at, problem_without_input_errors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
+from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_whitening_at
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
@@ -287,7 +287,7 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
         free.problem.episodes[0], *free.problem.unpack_episode_unknowns(free.x, 0)
     )
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
-    kinematics = forward_kinematics(system.numeric_mechanism(), symbol)
+    kinematics = forward_kinematics(system.mechanism_with_values(), symbol)
     turn = kinematics.frame_pose(grasp.holder_frame).rotation.T @ kinematics.frame_pose(grasp.held_frame).rotation
     wanted = np.array(ca.Function("turn", [symbol], [turn])(start.state[: system.n_coordinates]))
     np.testing.assert_allclose(np.array(ca.DM(grasp.held_orientation)), wanted, atol=1e-9)
@@ -378,7 +378,7 @@ def drawn_motion(monkeypatch):
     )
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    functions = SimpleNamespace(step=None, reference_momentum_correction=shift)
+    functions = SimpleNamespace(step=None, effect_momentum_calculator=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
@@ -453,7 +453,7 @@ def ranking(noisy):
 
 
 def test_the_experiment_as_it_is_knows_the_noise_of_its_torques(noisy, ranking):
-    told, exact = relative(noisy), relative(problem_without_input_errors(noisy))
+    told, exact = relative(noisy), relative(problem_with_exact_inputs(noisy))
     for name, std in told.items():
         assert ranking.unchanged_experiment.std_relative[name] == pytest.approx(std, rel=0.02)
         assert std > 1.2 * exact[name]
@@ -487,7 +487,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
     values = noisy.unknowns.named_values(noisy.initial_unknowns)
     problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, values)
     weighted = problem_with_whitening_at(problem, problem.initial_unknowns)
-    jacobian = residual_and_jacobian_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
+    jacobian = residual_and_jacobian_with_stated_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
     std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) / problem.initial_unknowns
     for name, value in zip(problem.unknown_names, std, strict=True):
         assert predicted.std_relative[name] == pytest.approx(value, rel=0.02)
@@ -521,7 +521,7 @@ def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_fo
     )
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), options)
     x, [episode] = problem.initial_unknowns, problem.episodes
-    slopes, _ = propagation.sensitivities_and_information(problem, problem.evaluate(x), x, 0, {tip.name: 1e-6})
+    slopes, _ = propagation.point_sensitivities_and_information(problem, problem.evaluate(x), x, 0, {tip.name: 1e-6})
     [found] = (own[:, :, len(x) :].reshape(-1, own.shape[2] - len(x)) for own in slopes.values())
 
     def seen(change):

@@ -17,7 +17,7 @@ from yid_ocp.analysis.friction_law_comparison import (
     mean_and_std_error_over_motion_kinds,
     measured_and_predicted_friction_torques,
     recording_names_by_name_stem,
-    simplest_fit_within_std_error,
+    simplest_fit_within_one_std_error,
 )
 from yid_ocp.analysis.run_estimates import (
     RunEstimates,
@@ -154,17 +154,17 @@ def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():
     assert mean == pytest.approx(5.0)
     assert error == pytest.approx(np.std([2.0, 5.0, 8.0], ddof=1) / np.sqrt(3))
     rough, good, best = fit_of("viscous", 9, 9, 8, 9), fit_of("coulomb", 3, 3, 2, 4), fit_of("stribeck", 2.8, 2.8, 2, 4)
-    assert simplest_fit_within_std_error([rough, good, best], KINDS) is good
+    assert simplest_fit_within_one_std_error([rough, good, best], KINDS) is good
     far = fit_of("stribeck", 1, 1, 1.1, 0.9)
-    assert simplest_fit_within_std_error([rough, good, far], KINDS) is far
+    assert simplest_fit_within_one_std_error([rough, good, far], KINDS) is far
     # the best has by chance the same error everywhere; the difference from it is less sure
     even, uneven = fit_of("stribeck", 2, 2, 2, 2), fit_of("coulomb", 1.7, 1.7, 2.1, 2.4)
-    assert simplest_fit_within_std_error([rough, uneven, even], KINDS) is uneven
+    assert simplest_fit_within_one_std_error([rough, uneven, even], KINDS) is uneven
     # a small advantage in every kind counts although the kinds differ by more
     worse, better = fit_of("viscous", 9.1, 9.1, 5.1, 1.15), fit_of("coulomb", 9, 9, 5, 1)
-    assert simplest_fit_within_std_error([worse, better], KINDS) is better
+    assert simplest_fit_within_one_std_error([worse, better], KINDS) is better
     failed = fit_of("coulomb", float("nan"), 1, 1, 1)
-    assert simplest_fit_within_std_error([rough, failed, far], KINDS) is far
+    assert simplest_fit_within_one_std_error([rough, failed, far], KINDS) is far
 
 
 TRUTH = {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
-from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, clock_offset_drift_and_rms_distance
+from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, point_clock_offset_drift_and_rms_error
 from yid_ocp.analysis.estimation import _baselines
 from yid_ocp.analysis.joint_checks import (
     _GRASP_FORCE_STD,
@@ -475,9 +475,9 @@ def test_a_search_without_drifts_finds_a_lateness_alone():
         return np.sin(np.multiply.outer(at, rates))
 
     seen = path(t - 0.2 - 0.02 * (t - 5.0))
-    offset, drift, _ = clock_offset_drift_and_rms_distance(path, (0.0, 10.0), t, seen)
+    offset, drift, _ = point_clock_offset_drift_and_rms_error(path, (0.0, 10.0), t, seen)
     assert (offset, drift) == (pytest.approx(0.2, abs=5e-3), 0.0)
-    both = clock_offset_drift_and_rms_distance(path, (0.0, 10.0), t, seen, drifts=True)
+    both = point_clock_offset_drift_and_rms_error(path, (0.0, 10.0), t, seen, drifts=True)
     assert both == pytest.approx((0.2, 0.02, 0.0), abs=1e-4)
 
 
@@ -582,8 +582,8 @@ def test_a_cable_of_which_a_point_is_missing_is_judged_by_the_others():
 def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
     joints = runs[1].joints
     other = JointGroup(tuple(name.replace("left", "right") for name in joints.names), joints.t, joints.position)
-    assert not arms[1].has_all_angles_recorded(replace(runs[1], joints=other))
-    assert arms[1].has_all_angles_recorded(runs[1])
+    assert not arms[1].recording_has_all_joint_angles(replace(runs[1], joints=other))
+    assert arms[1].recording_has_all_joint_angles(runs[1])
 
 
 USUAL = SensorOptions()

@@ -20,7 +20,7 @@ from yid_ocp.analysis.profile import (
     is_small_enough_for_profiles,
     solution_with_profile_intervals,
 )
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.parallel import Task, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, fit_problem
@@ -35,7 +35,7 @@ def profiled(problem, name="a", std=None):
     x, index = problem.initial_unknowns, problem.unknown_names.index(name)
     best = problem.evaluate(x)
     if std is None:
-        _, jacobian = residual_and_jacobian_without_weak_priors(problem, best)
+        _, jacobian = residual_and_jacobian_with_stated_priors(problem, best)
         std = float(np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))[index]))
     problem.asked.clear()
     found = compute_profile_likelihood_interval(problem, x, index, std, best)

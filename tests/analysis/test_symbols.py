@@ -74,10 +74,10 @@ def test_every_equation_of_a_grasp_has_a_name(kind):
 @pytest.mark.parametrize("row", ["del[T1_0_x]", "del[elbow]", "constraint[hand.tilt_x]", "p1[T1_1_z]"])
 def test_an_entry_is_the_row_as_text(symbols, row):
     """The printed lines are all that is needed to work the row out."""
-    at, entry = point(symbols), symbols.equation_or_derivative(row)
+    at, entry = point(symbols), symbols.equation_or_derivative_by_name(row)
     expected = value(symbols, symbols._row_expressions, at)[symbols.row_names.index(row)]
     assert worked_out(symbols, entry, at) == pytest.approx(expected, rel=1e-9)
-    assert entry.numeric_value(symbols.all_variable_symbols, at) == pytest.approx(expected, rel=1e-12)
+    assert entry.evaluate_numerically(symbols.all_variable_symbols, at) == pytest.approx(expected, rel=1e-12)
     assert entry.title == row
     assert entry.text_lines[0].startswith(f"{row}: {entry.formula.n_operations} operations, depends on ")
     assert entry.text_lines[-1] == f"  {row} = {entry.formula.expression_texts[0]}"
@@ -114,19 +114,19 @@ def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
         moved = at.copy()
         moved[j] += sign * width
         ends.append(value(symbols, symbols._row_expressions, moved)[i])
-    entry = symbols.equation_or_derivative(f" {row},{column} ")
+    entry = symbols.equation_or_derivative_by_name(f" {row},{column} ")
     assert entry.title == f"d {row} / d {column}"
     assert not entry.is_identically_zero
     assert worked_out(symbols, entry, at) == pytest.approx((ends[0] - ends[1]) / (2 * width), rel=1e-6, abs=1e-9)
 
 
 def test_an_entry_names_or_counts_its_variables_and_says_where_it_vanishes(symbols):
-    entry = symbols.equation_or_derivative("constraint[hand.x], T1.bend")
+    entry = symbols.equation_or_derivative_by_name("constraint[hand.x], T1.bend")
     assert entry.is_identically_zero
     assert entry.text_lines == ["d constraint[hand.x] / d T1.bend = 0 for every state"]
-    stiffness = symbols.equation_or_derivative("del[elbow], elbow.stiffness")
+    stiffness = symbols.equation_or_derivative_by_name("del[elbow], elbow.stiffness")
     assert stiffness.variable_names == ("q0[elbow]", "elbow.rest", "h", "q1[elbow]")
-    assert "8 of q0" in symbols.equation_or_derivative("del[T1_0_z]").variable_names
+    assert "8 of q0" in symbols.equation_or_derivative_by_name("del[T1_0_z]").variable_names
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_an_entry_names_or_counts_its_variables_and_says_where_it_vanishes(symbo
 )
 def test_a_wrong_name_gets_the_nearest(symbols, text, what, hint):
     with pytest.raises(ConfigError) as caught:
-        symbols.equation_or_derivative(text)
+        symbols.equation_or_derivative_by_name(text)
     assert what in caught.value.what
     assert hint in caught.value.hint
     assert caught.value.where == "--entry"
@@ -151,7 +151,7 @@ def test_a_wrong_name_gets_the_nearest(symbols, text, what, hint):
 @pytest.mark.parametrize("text", ["", "del[elbow],", "del[elbow], h, h"])
 def test_neither_one_name_nor_two_is_refused(symbols, text):
     with pytest.raises(ConfigError, match="is not an entry"):
-        symbols.equation_or_derivative(text)
+        symbols.equation_or_derivative_by_name(text)
 
 
 def test_all_rows_are_listed_the_short_ones_whole(symbols):
@@ -159,7 +159,7 @@ def test_all_rows_are_listed_the_short_ones_whole(symbols):
     text = "\n".join(lines)
     for name in symbols.row_names:
         assert any(line.startswith(f"{name}: ") for line in lines), name
-    assert symbols.equation_or_derivative("del[T1_0_z]").text_lines[0] in lines
+    assert symbols.equation_or_derivative_by_name("del[T1_0_z]").text_lines[0] in lines
     inner = symbols.row_blocks[1].full_names[0]
     assert f"  {inner} = " in text
     assert "  del[T1_0_z] = " not in text

@@ -4,7 +4,7 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
-from yid_ocp.workflow.run_inputs import resolve_default_recording
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links and a short horizon
@@ -57,7 +57,7 @@ def recorded(repository, name):
     file = configurations(repository)[name]
     recordings = load_config(file).recordings
     for path in (*recordings.estimate, *recordings.held_out):
-        if not resolve_default_recording(path).is_file():
+        if not resolve_recording_path(path).is_file():
             pytest.skip(f"its recordings are not here: {path}")
     return file
 

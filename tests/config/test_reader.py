@@ -218,7 +218,7 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
     """Every number that a file may hold: its key, what the file around it looks like, its option's type, its bounds."""
     sections = section_variants_from_annotation(hint)
     for word, kind in (sections.classes if sections is not None else {}).items():
-        known = options.options_by_key(kind)
+        known = options.class_options_by_key(kind)
         needed = {key: needed_value(own.type_hint) for key, own in known.items() if own.default_value is MISSING}
         needed |= {sections.selector_key: word} if sections.selector_key else {}
         for name, entry in known.items():
@@ -229,7 +229,7 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
     named = section_variants_from_annotation(values)
     if named is not None and named.selector_key == "name":
         for name in named.classes:
-            yield from numbers(named.variants_for_entry(name, "").classes[""], within(wrap, name), (*path, name))
+            yield from numbers(named.variants_for_named_entry(name, "").classes[""], within(wrap, name), (*path, name))
     elif values is not None:
         yield from numbers(values, within(wrap, "NAME"), (*path, "NAME"), option)
     for member in options.non_none_union_members(hint):

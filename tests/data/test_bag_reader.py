@@ -391,7 +391,7 @@ def test_what_a_bag_unpacks_to_is_limited(tmp_path: Path) -> None:
     if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
         pytest.skip("memory is limited from outside, which stays as it is")
     bag = OpenBag(write_bag(tmp_path, "mcap", arm_and_camera()))
-    with pytest.raises(DataError, match="too much memory"), bag.read_errors_as_data_errors():
+    with pytest.raises(DataError, match="too much memory"), bag.raise_read_errors_as_data_errors():
         bytearray(2 << 30)
     assert np.empty(2 << 30, np.uint8).nbytes == 2 << 30  # and afterwards nothing is
 

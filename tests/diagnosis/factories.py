@@ -17,13 +17,13 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
     CandidateDetectability,
-    CandidateScore,
     ConfusabilityMatrix,
     ProjectedCandidatesLinearization,
+    ScoreTestResult,
     ScreeningResult,
     _EffectSignature,
 )
-from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
+from yid_ocp.diagnosis.select import HeldOutGapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
@@ -92,9 +92,9 @@ def screened(at, channels=(), detectable_at=module.DETECTABLE_AMPLITUDE_Z) -> Sc
         return module.screen_candidates(SimpleNamespace(problem=None), (), {})
 
 
-def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> CandidateScore:
+def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> ScoreTestResult:
     values = dict.fromkeys(of.amplitude_parameter_names, 0.1) if step is None else dict(step)
-    return CandidateScore(of, values, decrease, statistic, p)
+    return ScoreTestResult(of, values, decrease, statistic, p)
 
 
 def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability:
@@ -109,7 +109,7 @@ def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
     """Candidates that are seen and like no other, unless said."""
     labels = [entry.effect.label for entry in scores]
     seen = [visible(entry.effect) for entry in scores] if seen is None else seen
-    joint = SimpleNamespace(ranked_candidate_pairs=lambda among: iter(pairs))
+    joint = SimpleNamespace(rank_candidate_pairs=lambda among: iter(pairs))
     return ScreeningResult(tuple(seen), tuple(scores), table or alike(labels, np.eye(len(labels))), joint)
 
 
@@ -153,8 +153,8 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
     return RefittedModel(values, std, p_values, "made up", *rest)
 
 
-def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:
-    return GapClosure(value, low, high)
+def closed(value=0.9, low=0.8, high=0.95) -> HeldOutGapClosure:
+    return HeldOutGapClosure(value, low, high)
 
 
 def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=None) -> SelectedEffect:

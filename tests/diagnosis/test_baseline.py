@@ -10,7 +10,7 @@ from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import _estimated_without, problem_with_earlier_runs
+from yid_ocp.diagnosis.baseline import _estimated_without, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -50,8 +50,8 @@ def swing(folder, name, seed, effects="[]"):
     (folder / "beam.yaml").write_text(BEAM, encoding="utf-8")
     problem = build_problem(load_config(folder / "beam.yaml", (f"model.effects={effects}",)))
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
-    values = problem.unknowns.named_values(problem.unknown_vector({**TRUTH, **start}))
-    theta, offset = problem.unpack_episode_unknowns(problem.unknown_vector(values), 0)
+    values = problem.unknowns.named_values(problem.pack_unknowns({**TRUTH, **start}))
+    theta, offset = problem.unpack_episode_unknowns(problem.pack_unknowns(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
     made = recording_from_prediction(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)
@@ -124,7 +124,7 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     std = alone.std["beam.bend"] * times
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
-    together, baseline = problem_with_earlier_runs(problem, known)
+    together, baseline = problem_with_priors_and_baseline(problem, known)
     both = refit_with_effects(AllCandidatesProblem(together, (), False), (), {})
     [shift] = baseline.parameter_shifts_of_fit(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])

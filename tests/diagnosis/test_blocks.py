@@ -55,7 +55,7 @@ class Problem:
     tried: list = field(default_factory=list)
     has_process_noise: bool = False
 
-    def unknown_vector(self, values):
+    def pack_unknowns(self, values):
         return values
 
     def with_episodes(self, episodes, held_out):

@@ -25,10 +25,10 @@ from yid_ocp.diagnosis.events import (
     find_force_and_fault_events,
     problem_corrected_for_events,
 )
-from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceHistory
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import times_since_recording_start
-from yid_ocp.inference.smoother import smooth_unknowns_about_fit
+from yid_ocp.inference.smoother import smooth_unknown_forces_and_biases
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
@@ -206,7 +206,7 @@ def test_the_same_push_in_another_recording_is_another_event(twin):
     surer = replace(pulse, p_value=1e-12)
     problem = SimpleNamespace(system=SimpleNamespace(prescribed=()))
     t = 0.1 * np.arange(30)
-    force = ForceHistory("run_0", "elbow", "elbow", "N m", t, 0 * t, np.eye(30), 0 * t, 0 * t)
+    force = ForceEstimate("run_0", "elbow", "elbow", "N m", t, 0 * t, np.eye(30), 0 * t, 0 * t)
     other, rival = replace(force, recording="run_1"), replace(force, location="shoulder", coordinate="shoulder")
     found = _one_each([(force, pulse), (other, surer), (rival, surer)], problem)
     assert sorted((e.recording, e.channel) for e in found) == [("run_0", "shoulder"), ("run_1", "elbow")]
@@ -322,7 +322,7 @@ def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_fo
     problem = EstimationProblem(step, [made], ["shoulder.damping"], options)
     x = fit_problem(problem, GaussNewton()).x
     evaluation = problem.evaluate(x)
-    unknowns = smooth_unknowns_about_fit(problem, x, evaluation)
+    unknowns = smooth_unknown_forces_and_biases(problem, x, evaluation)
     (event,) = find_force_and_fault_events(problem, x, evaluation, unknowns).disturbances
     assert (event.kind, event.location, event.channel, event.unit) == ("force", "elbow", "elbow", "N m")
     assert (event.start_time, event.end_time) == pytest.approx((push.start, push.end), abs=0.15)

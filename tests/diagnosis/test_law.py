@@ -15,8 +15,8 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.law import (
     TorqueLawTable,
     read_torque_law_tables,
-    torque_law_argument_along_rollout,
     torque_law_from_tables,
+    torque_law_quantity_at_midpoints,
     torque_law_tables_csv,
 )
 from yid_ocp.errors import ConfigError, DataError
@@ -129,7 +129,7 @@ def test_a_linear_law_of_a_segment_is_another_stiffness_of_all_its_joints():
     np.testing.assert_allclose(moved, simulate(compile_step(beam, H), stiffer, start, steps).state, atol=1e-9)
     nodes = {"state": moved, "time_step": np.array(H)}
     for quantity, path in (("angle", (moved[1:] + moved[:-1]) / 2), ("speed", np.diff(moved, axis=0) / H)):
-        seen = torque_law_argument_along_rollout(beam, "beam", quantity, stiffer, nodes)
+        seen = torque_law_quantity_at_midpoints(beam, "beam", quantity, stiffer, nodes)
         np.testing.assert_allclose(seen, path[:, :10] * stiffness / stiffness[1], rtol=1e-12)
 
 
@@ -146,7 +146,7 @@ def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
     assert np.abs(runs[1].state[40] - runs[0].state[40]).max() > 1e-4
     nodes = {"state": runs[1].state, "torque": commands, "multipliers": np.zeros((40, 0)), "time_step": np.array(H)}
     theta = with_law.system.parameters.vector()
-    seen = torque_law_argument_along_rollout(with_law.system, "elbow", "command", theta, nodes)
+    seen = torque_law_quantity_at_midpoints(with_law.system, "elbow", "command", theta, nodes)
     assert np.isnan(seen[:20]).all()
     motor = torque_function(plain, {})
     middle, rate = (runs[1].state[21:, :2] + runs[1].state[20:-1, :2]) / 2, np.diff(runs[1].state[20:, :2], axis=0) / H

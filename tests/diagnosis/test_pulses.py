@@ -11,7 +11,7 @@ from yid_ocp.diagnosis.pulse_detection import (
     _MODEL_ERROR_TIME,
     _SLOW_FORCE_TIME,
     DetectedForcePulse,
-    ForceHistory,
+    ForceEstimate,
     _Rest,
     detect_force_pulses,
 )
@@ -23,10 +23,10 @@ T = 0.1 * np.arange(80)
 NOISE = 0.02
 
 
-def history(values: np.ndarray, seed: int = 0, noise: float = NOISE, **changed) -> ForceHistory:
+def history(values: np.ndarray, seed: int = 0, noise: float = NOISE, **changed) -> ForceEstimate:
     """What sensors of this noise say of a force, where the model may be wrong by 0.03."""
     measured = values + noise * np.random.default_rng(seed).standard_normal(len(values))
-    made = ForceHistory(
+    made = ForceEstimate(
         "run", "elbow", "elbow", "N m", T, measured / noise**2, np.eye(len(T)) / noise**2, 0.03 + 0 * T, 0 * T
     )
     return replace(made, **changed)
@@ -37,7 +37,7 @@ def bell(begin: float, end: float, size: float) -> np.ndarray:
     return size * np.sin(np.pi * part) ** 2
 
 
-def sure(of: ForceHistory, limits: Thresholds | None = None) -> list[DetectedForcePulse]:
+def sure(of: ForceEstimate, limits: Thresholds | None = None) -> list[DetectedForcePulse]:
     found, tries = detect_force_pulses(of, limits or Thresholds())
     real = benjamini_hochberg_mask([pulse.p_value for pulse in found], tries, 0.01)
     return sorted((p for p, r in zip(found, real, strict=True) if r), key=lambda p: p.start_time)

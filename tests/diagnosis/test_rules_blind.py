@@ -95,7 +95,7 @@ def drawn(monkeypatch):
         ensemble._detectable = tuple((s.effect, s.shape_values, s.projected_sensitivity) for s in signatures)
         return ensemble
 
-    monkeypatch.setattr(module, "run_experiment_with_effects", experiment)
+    monkeypatch.setattr(module, "run_experiment_with_injected_effects", experiment)
     monkeypatch.setattr(module, "random_multisine_motion", multisine)
     build.made = made
     return build

@@ -9,7 +9,7 @@ import pytest
 from factories import added, amplitude, cases, effect, finding, fit, loss, place, score, screening
 
 from yid_ocp.diagnosis import blind, blind_scores
-from yid_ocp.diagnosis.blind import CaseGroundTruth, UnlabelledCase, labels_json_and_sha256, open_sealed_labels
+from yid_ocp.diagnosis.blind import CaseGroundTruth, UnlabelledCase, labels_json_and_sha256, read_labels_checking_sha256
 from yid_ocp.diagnosis.blind_scores import (
     blind_case_score_summary,
     diagnosis_evidence_to_dict,
@@ -263,9 +263,9 @@ def test_a_sealed_text_is_sorted_holds_all_and_opens_only_as_it_was():
     assert json.loads(text) == [told | {"truth": {"T1.bend": 12.0}}]
     assert text.index('"case"') < text.index('"injected"') < text.index('"truth"')
     assert len(digest) == 64
-    assert open_sealed_labels(text, digest)[0].injected == (KV,)
+    assert read_labels_checking_sha256(text, digest)[0].injected == (KV,)
     with pytest.raises(DataError, match="commitment"):
-        open_sealed_labels(text.replace("0.05", "0.06"), digest)
+        read_labels_checking_sha256(text.replace("0.05", "0.06"), digest)
 
 
 @cases(
@@ -367,7 +367,7 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
         for i in range(2)
     ]
     text, digest = labels_json_and_sha256(sealed)
-    monkeypatch.setattr(blind_slices, "draw_blind_results", lambda *_: None)
+    monkeypatch.setattr(blind_slices, "draw_blind_validation_figures", lambda *_: None)
     for part in ("sealed", "answers", "best"):
         (tmp_path / part).mkdir()
     (tmp_path / "sealed/labels.json").write_text(text)
@@ -405,7 +405,7 @@ def written_slice(tmp_path, part, cases, **changes):
 
 
 def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path, monkeypatch):
-    for name in ("draw_blind_results", "write_report"):
+    for name in ("draw_blind_validation_figures", "write_report"):
         monkeypatch.setattr(blind_slices, name, lambda *_: None)
     parts = [written_slice(tmp_path, "1/2", (0, 2)), written_slice(tmp_path, "2/2", (1, 3)) / "slice.json"]
     joined = score_joined_slices(parts, tmp_path / "joined").result

@@ -56,15 +56,15 @@ class Problem:
         return self
 
     def with_effects_and_relinearized_filters(self, effects, at):
-        self.at.append(self.named_values(self.unknown_vector(at)))
+        self.at.append(self.named_values(self.pack_unknowns(at)))
         return self.with_nominal_and_effects_free(effects)
 
-    def relinearize_held_out_filters(self, own, effects, at):
+    def with_relinearized_held_out_filters(self, own, effects, at):
         assert own is self
         self.foreseen.append(dict(at))
         return self
 
-    def unknown_vector(self, values):
+    def pack_unknowns(self, values):
         return np.array([values.get(name, 1.0) for name in self.unknown_names])
 
     def named_values(self, x):
@@ -327,7 +327,7 @@ def predicting(monkeypatch):
         residual = np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs])
         return SimpleNamespace(residual=residual, jacobian=np.full((len(residual), 2), [1.0, 7.0]))
 
-    monkeypatch.setattr(module, "whitened_prediction_residual", rows)
+    monkeypatch.setattr(module, "whitened_residual_and_jacobian", rows)
     usual = {"has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": ("k",), "unknown_names": (), "initial_unknowns": np.zeros(0)}
     monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, evaluation: evaluation)
@@ -398,6 +398,6 @@ def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, s
     monkeypatch.setattr(diagnosing, "fit_problem", lambda *given, **how: asked.append(given) or solution(2.0))
     monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
     given = None if known is None else solution(known)
-    composed = SimpleNamespace(with_input_errors_of=lambda fitted: "composed")
+    composed = SimpleNamespace(with_smoothed_input_errors_of=lambda fitted: "composed")
     assert diagnosing.fit_nominal_model("problem", composed, given) == start
     assert len(asked) == solved

@@ -151,11 +151,11 @@ def test_an_inertia_turns_the_encoders_noise_into_more_noise_of_efforts(urdf_fol
     noisy = replace(group, position=group.position + 6e-4 * noise[1], effort=effort, position_std=6e-4, effort_std=0.01)
     made = EstimationProblem(plain, [replace(smooth, joints=noisy)], ("joint.damping",), options)
     made = AllCandidatesProblem.from_problem(made, [rotor])
-    assert made.with_effort_noise_of_effects([rotor], {**values, "rotor_inertia@joint.armature": 1e-4}) is None
+    assert made.with_encoder_noise_in_efforts([rotor], {**values, "rotor_inertia@joint.armature": 1e-4}) is None
     chi2 = []
-    for own in (made, made.with_effort_noise_of_effects([rotor], values)):
+    for own in (made, made.with_encoder_noise_in_efforts([rotor], values)):
         own = own.with_nominal_and_effects_free([rotor])
-        residual = own.evaluate(own.unknown_vector(values), False).residual[own.residual_rows.data]
+        residual = own.evaluate(own.pack_unknowns(values), False).residual[own.residual_rows.data]
         chi2.append(residual @ residual / len(residual))
     assert chi2[1] == pytest.approx(1.0, abs=0.3)
     assert chi2[0] > 3.0
@@ -349,9 +349,9 @@ def test_shapes_are_those_of_the_scores_or_the_middle_of_the_grid():
 
 def test_candidates_alike_explain_the_signature_from_the_limit_on():
     table = alike(["a", "b", "c", "d"], [[1.0, 0.9, 0.89, 0.95], [0.2, 1.0, 0.3, 0.1], [0, 0, 1, 0], [0, 0, 0, 1]])
-    assert table.confusable_with("a", 0.9) == ("b", "d")
-    assert table.confusable_with("a", 0.5) == ("b", "c", "d")
-    assert table.confusable_with("b", 0.9) == ()
+    assert table.candidates_confusable_with("a", 0.9) == ("b", "d")
+    assert table.candidates_confusable_with("a", 0.5) == ("b", "c", "d")
+    assert table.candidates_confusable_with("b", 0.9) == ()
 
 
 def test_two_that_hide_in_each_other_show_as_a_pair():
@@ -360,10 +360,10 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = list(screened(at).joint_score_model.ranked_candidate_pairs([a.label, b.label, c.label]))
+    pairs = list(screened(at).joint_score_model.rank_candidate_pairs([a.label, b.label, c.label]))
     assert ["".join(of.kind for of in pair) for pair, *_ in pairs] == ["ab", "ac", "bc"]
     assert pairs[0][1:] == (pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0}), pytest.approx(-1.0))
-    [(fewer, *_)] = screened(at).joint_score_model.ranked_candidate_pairs(["c@x", "b@x"])
+    [(fewer, *_)] = screened(at).joint_score_model.rank_candidate_pairs(["c@x", "b@x"])
     assert fewer == (b, c)
 
 
@@ -374,7 +374,7 @@ def test_pairs_promise_what_the_linear_model_of_both_does():
     residual = rng.standard_normal(9)
     made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
     everything = screened(point(residual, *made)).joint_score_model
-    for pair, values, decrease in everything.ranked_candidate_pairs([of.label for of in effects]):
+    for pair, values, decrease in everything.rank_candidate_pairs([of.label for of in effects]):
         x = np.hstack([columns[effects.index(of)] for of in pair])
         names = [name for of in pair for name in of.amplitude_parameter_names]
         own = [q for of in pair for q in of.definitions if not q.is_shape_parameter]

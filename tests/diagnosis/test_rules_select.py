@@ -19,8 +19,8 @@ from yid_ocp.diagnosis.select import (
     _near_best_models,
     _pairs_to_refit,
     bic_difference,
+    held_out_chi2_decrease_and_std_error,
     held_out_gap_closure,
-    held_out_improvement_and_error,
     select_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -86,11 +86,11 @@ def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks():
 
 def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
     before, after = loss(3.0, 4.0, 2.0, count=10.0), loss(2.0, 2.0, 2.0, count=10.0)
-    gained, error = held_out_improvement_and_error(before, after)
+    gained, error = held_out_chi2_decrease_and_std_error(before, after)
     assert gained == pytest.approx(1.0)
     # blocks differ by 10, 20 and 0: their standard deviation is 10, and there are three of them
     assert error == pytest.approx(math.sqrt(3) * 10.0 / 30.0)
-    assert held_out_improvement_and_error(after, before) == pytest.approx((-gained, error))
+    assert held_out_chi2_decrease_and_std_error(after, before) == pytest.approx((-gained, error))
 
 
 SMALL = effect("small@x", amplitude())
@@ -251,7 +251,7 @@ class Rounds:
             left = tuple(replace(s, p_value=self.left) for s in left)
         return screening(left)
 
-    def ranked_candidate_pairs(self, screened, without=""):
+    def rank_candidate_pairs(self, screened, without=""):
         kinds = {of.kind: of for of in EFFECTS if of.label != without}
         pairs = [(one, other) for one, other in self.pairs if {one, other} <= set(kinds)]
         return [((kinds[one], kinds[other]), {}, 17.0) for one, other in pairs]
@@ -398,7 +398,7 @@ def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it
     ]
     for lost, std in ((loss(3.0, 3.2), math.sqrt(0.125)), (loss(1.0, 1.0), 0.01)):
         own = replace(entry, refitted_model=replace(entry.refitted_model, held_out_loss=lost))
-        found = select.with_stds_that_include_model_error(replace(own, extended_models=tuple(moved)), LIMITS)
+        found = select.refit_with_model_error_in_stds(replace(own, extended_models=tuple(moved)), LIMITS)
         assert found.std[name] == pytest.approx(std)
 
 
@@ -451,7 +451,9 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     spring = fit([effect("spring@elbow", amplitude("a"), amplitude("b"))], loss(1.0, 1.0), cost=100.0)
     offset = fit([effect("offset@elbow")], loss(1.01, 1.01), cost=101.0)
     spring, offset = (replace(own, residual_count=100) for own in (spring, offset))
-    assert held_out_improvement_and_error(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
+    assert held_out_chi2_decrease_and_std_error(offset.held_out_loss, spring.held_out_loss) == pytest.approx(
+        (0.01, 0.0)
+    )
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
     assert bic_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
     assert nearest([spring, offset]) == ["offset@elbow", "spring@elbow"]
@@ -570,7 +572,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     found = screening([score(of) for of in kinds.values()], table=alike([of.label for of in kinds.values()], table))
 
     def to_refit(count):
-        joint = SimpleNamespace(ranked_candidate_pairs=lambda among: asked.append(among) or iter(promised))
+        joint = SimpleNamespace(rank_candidate_pairs=lambda among: asked.append(among) or iter(promised))
         search = RefitContext(None, Thresholds(n_refit_pairs=count), Heard())
         return _pairs_to_refit(search, replace(found, joint_score_model=joint), kinds["a"])
 
@@ -619,6 +621,6 @@ def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
     counts = np.full(8, 10.0)
     before, after = (HeldOutLoss(of * counts, counts, {}, of * counts.sum(), by) for of, by in ((2, 800.0), (3, 0.0)))
     assert (before.chi2_per_sample, after.chi2_per_sample) == (12.0, 3.0)
-    assert held_out_improvement_and_error(before, after) == (pytest.approx(9.0), 0.0)
+    assert held_out_chi2_decrease_and_std_error(before, after) == (pytest.approx(9.0), 0.0)
     found = held_out_gap_closure(before, after)
     assert (found.fraction, found.ci_low, found.ci_high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))

@@ -33,7 +33,7 @@ def explaining(part, effects, **more):
 def judgement(chosen, again=None, *, nominal=NOMINAL, gap=True, enough=True, search=None):
     """What is said of chosen effects; `again` is the refit on the held-out recordings."""
     search = search or Mock(thresholds=LIMITS, refit_on_held_out=Mock(return_value=again))
-    evidence = Mock(nominal_model=nominal, exceeds_noise=Mock(return_value=gap), are_data_sufficient=enough)
+    evidence = Mock(nominal_model=nominal, residual_exceeds_noise=Mock(return_value=gap), are_data_sufficient=enough)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(verdict_module, "select_effects", lambda *_: ((), tuple(chosen)))
         return judge(search, evidence)
@@ -63,7 +63,7 @@ def seen(tests, scores=()):
 )
 def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
     tests = [f.outcome(p=p, chi2=chi2, channels={"a": 1.0}) for p, chi2 in (before, held_out)]
-    assert seen(tests).may_have_gap(LIMITS) is seen(tests).exceeds_noise(LIMITS) is gap
+    assert seen(tests).may_have_gap(LIMITS) is seen(tests).residual_exceeds_noise(LIMITS) is gap
 
 
 @cases(
@@ -78,7 +78,7 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
     evidence, limits = seen((f.outcome(), f.outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
-    assert (evidence.may_have_gap(limits), evidence.exceeds_noise(limits)) == (gap, False)
+    assert (evidence.may_have_gap(limits), evidence.residual_exceeds_noise(limits)) == (gap, False)
     assert not replace(evidence, discretisation_chi2=1e9).may_have_gap(limits), "links and steps may remove it"
 
 
@@ -322,7 +322,7 @@ def test_data_suffice_if_samples_outnumber_unknowns_and_a_candidate_is_detectabl
     screened = f.screening(seen=[f.visible(ONE, seen)])
     test = f.outcome(degrees=degrees)
     evidence = NominalModelGapEvidence(fit(values=dict.fromkeys("abcde", 1.0)), test, test, screened, True)
-    assert evidence.are_data_sufficient is evidence.warrants_search(LIMITS) is enough
+    assert evidence.are_data_sufficient is evidence.warrants_effect_search(LIMITS) is enough
 
 
 class Problem:

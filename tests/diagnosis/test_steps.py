@@ -43,7 +43,7 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
     chosen = [effect for effect in composed.candidate_effects if effect.kind in ("rotor_inertia", "link_mass")]
     some = composed.with_nominal_and_effects_free(chosen)
     alone = EstimationProblem(composed.problem.step, [e.recording for e in some.episodes], some.free, some.options)
-    x = some.unknown_vector(nominal.values) + 0.01
+    x = some.pack_unknowns(nominal.values) + 0.01
     assert some.unknown_names == alone.unknown_names
     assert some.evaluate(x).jacobian == pytest.approx(alone.evaluate(x).jacobian, rel=1e-9, abs=1e-9)
     assert composed.problem.free == composed.nominal_free_parameter_names == ("shoulder.damping", "elbow.damping")

@@ -20,15 +20,15 @@ from yid_ocp.diagnosis.screening import linearize_candidates
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import make_effect
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_smoother_unknowns
 from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
+    problem_with_exact_inputs,
     problem_with_reestimated_held_out_torque_biases,
     problem_with_sensor_noise_only,
     problem_with_whitening_at,
-    problem_without_input_errors,
 )
 from yid_ocp.integrator.step import Step, compile_step, reachable_and_observable_state_mask, simulate
 from yid_ocp.model import System
@@ -36,7 +36,7 @@ from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.evaluation import whitened_prediction_residual
+from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
 from yid_ocp.solvers import GaussNewton, fit_problem
 
 TIME_STEP, STEPS = 0.01, 200
@@ -97,14 +97,14 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     held = zip(own.held_out_whitening_filters, extended.held_out_whitening_filters, strict=True)
     assert all(x is y is not None for x, y in held)
     assert made.problem.whitening_filters == made.problem.held_out_whitening_filters == (None,)
-    x = own.unknown_vector({"elbow.stiffness": 2.5})
+    x = own.pack_unknowns({"elbow.stiffness": 2.5})
     assert own.evaluate(x, False).cost == pytest.approx(
         problem_with_whitening_at(own, x).evaluate(x, False).cost, rel=0.02
     )
 
 
 def held_out_residual(problem, episode, result):
-    return whitened_prediction_residual(episode, problem.held_out_whitening_filters[0], result).residual
+    return whitened_residual_and_jacobian(episode, problem.held_out_whitening_filters[0], result).residual
 
 
 @cases("held_out", {"held_out": True, "in_blocks": False})
@@ -115,7 +115,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     )
     wide = made.with_nominal_and_effects_free(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
-    x, frozen = (wide.unknown_vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
+    x, frozen = (wide.pack_unknowns({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
     moved = problem_with_reestimated_held_out_torque_biases(
         problem_relinearized_at_torque_bias(wide, x, frozen), x, frozen
     )
@@ -151,8 +151,8 @@ def test_other_candidates_are_left_out_of_refits(step):
     found = []
     for hypotheses in (all_candidates, some):
         own = hypotheses.with_effects_and_relinearized_filters([friction], at)
-        own = hypotheses.relinearize_held_out_filters(own, [friction], at)
-        x = own.unknown_vector(at)
+        own = hypotheses.with_relinearized_held_out_filters(own, [friction], at)
+        x = own.pack_unknowns(at)
         evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
         rows = held_out_residual(own, *held)
         found.append((own.unknown_names, evaluation.residual, evaluation.jacobian, rows))
@@ -178,8 +178,8 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
     made = composed(step, True)
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
-    bare = problem_without_input_errors(made.problem)
-    plain = bare.evaluate(bare.unknown_vector(fit.values), False)
+    bare = problem_with_exact_inputs(made.problem)
+    plain = bare.evaluate(bare.pack_unknowns(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
     test, _ = _held_out_null_test_and_spread(fit)
     assert 0.8 < test.chi2_per_dof < 1.2
@@ -190,7 +190,7 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), composed(step, True))
     spread = noise_only_covariance_sqrt(fit.problem, fit.evaluation)
-    off = fit.problem.unknown_vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
+    off = fit.problem.pack_unknowns(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     moved = replace(fit, values=fit.problem.unknowns.named_values(off))
     assert _held_out_null_test_and_spread(moved)[0].p_value < 1e-12
     less = replace(fit.evaluation, jacobian=fit.evaluation.jacobian / 50)
@@ -280,7 +280,7 @@ def test_noise_of_torques_is_not_mistaken_for_what_they_multiply(step, monkeypat
     absent, z = with_absent(step, effect), []
     for seed in range(20, 26):
         problem = weighted_at_truth(absent, recorded(step, seed), "proportional")
-        residual, jacobian = residual_and_jacobian_without_weak_priors(
+        residual, jacobian = residual_and_jacobian_with_stated_priors(
             problem, problem.evaluate(problem.initial_unknowns)
         )
         covariance = np.linalg.inv(jacobian.T @ jacobian)
@@ -331,7 +331,7 @@ def test_a_refit_is_as_sure_as_a_solution(step, friction):
     fit = fit_nominal_model(problem, AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)]), found)
     std = found.parameters["elbow.stiffness"].std
     assert fit.std["elbow.stiffness"] == pytest.approx(std, rel=0.1)
-    _, jacobian = residual_and_jacobian_without_weak_priors(fit.problem, fit.evaluation)
+    _, jacobian = residual_and_jacobian_with_stated_priors(fit.problem, fit.evaluation)
     assert (std > 1.5 * np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[0, 0])) == (friction > 0)
 
 
@@ -378,7 +378,7 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     lasting = variance * _MIN_INTERVAL * (1 + decay) / (1 - decay)
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
     assert np.count_nonzero(model.torque_noise_variance) == 1
-    calm = problem_without_input_errors(problem)
+    calm = problem_with_exact_inputs(problem)
     assert not residual_models_with_smoother_unknowns(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()
 
 

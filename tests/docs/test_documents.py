@@ -144,8 +144,11 @@ def test_entries_and_names_are_those_of_the_equations(page, symbols):
     text = page("inspection")
     [commands] = blocks(text, "sh")
     for entry in re.findall(r"--entry '(.*?)'", commands):
-        assert symbols.equation_or_derivative(entry).title.split(" / ")[0].removeprefix("d ") == entry.split(",")[0]
-    lines = symbols.equation_or_derivative("del[T2_3_z], T2.twist").text_lines
+        assert (
+            symbols.equation_or_derivative_by_name(entry).title.split(" / ")[0].removeprefix("d ")
+            == entry.split(",")[0]
+        )
+    lines = symbols.equation_or_derivative_by_name("del[T2_3_z], T2.twist").text_lines
     assert "\n".join(f"    {line}" for line in lines) in text
     listed = re.findall(r"`((?:del|constraint|p1|q0|p0|u|q1|lam)\[[\w.]+\])`", text)
     assert len(listed) > 6

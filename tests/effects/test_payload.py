@@ -19,7 +19,7 @@ from yid_ocp.model.mechanism import (
     Joint,
     Placement,
     homogeneous_transform,
-    merge_bodies,
+    merge_inertias,
     rotation_from_rpy,
 )
 from yid_ocp.model.urdf import read_urdf
@@ -54,7 +54,7 @@ def in_pinocchio(system: System, mass: float, point, pin):
     for joint in system.mechanism.joints:
         at = np.array(ca.DM(joint.placement.homogeneous_matrix()))
         parent = model.addJoint(parent, pin.JointModelRevoluteUnaligned(*joint.axis), pin.SE3(at), joint.name)
-        body = merge_bodies(joint.bodies)
+        body = merge_inertias(joint.bodies)
         com, tensor = (np.array(ca.DM(x)) for x in (body.center_of_mass, body.inertia_about_com))
         model.appendBodyToJoint(parent, pin.Inertia(float(body.mass), com.ravel(), tensor), pin.SE3.Identity())
     own = model.inertias[parent]
@@ -102,7 +102,7 @@ def test_the_link_keeps_mass_and_inertia_wherever_a_search_goes() -> None:
     nominal = arm()
     effect = make_effect("payload", "hand", nominal)
     system = nominal.with_effects([effect])
-    last = merge_bodies(system.mechanism.joints[2].bodies)
+    last = merge_inertias(system.mechanism.joints[2].bodies)
     outputs = [last.mass, last.center_of_mass, last.inertia_about_com]
     function = ca.Function("link", [system.parameters.symbols], outputs)
     rng = np.random.default_rng(0)
@@ -127,19 +127,19 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     effect = make_effect("payload", "hand", nominal)
     names = effect.parameters.names
     std = dict.fromkeys(names, 0.01)
-    near = effect.parameters_as_reported(dict(zip(names, (1.0, 0.0, 0.2, 0.0), strict=True)), std)
+    near = effect.to_reported_parameters(dict(zip(names, (1.0, 0.0, 0.2, 0.0), strict=True)), std)
     assert near["my"].value == pytest.approx(0.2, rel=1e-3)
     assert near["my"].std == 0.01
-    far = effect.parameters_as_reported(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), std)
+    far = effect.to_reported_parameters(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), std)
     most = np.hypot(_MAX_PAYLOAD_DISTANCE * 1.0, _MAX_COM_SHIFT * 1.2)
     assert np.hypot(far["my"].value, far["mz"].value) == pytest.approx(most, rel=1e-6)
     assert np.isnan(far["my"].std)
     assert far["mass"].std == 0.01
     given = nominal.with_effects([make_effect("payload", "hand", nominal, {"mass": 1.0, "my": 3.0, "mz": 4.0})])
-    body = merge_bodies(given.mechanism.joints[2].bodies)
+    body = merge_inertias(given.mechanism.joints[2].bodies)
     moments = ca.Function("moments", [given.parameters.symbols], [body.mass * body.center_of_mass])
     first = moments(given.parameters.vector())
-    own = merge_bodies(nominal.mechanism.joints[2].bodies)
+    own = merge_inertias(nominal.mechanism.joints[2].bodies)
     added = np.array(first).ravel() - np.array(ca.DM(own.mass * own.center_of_mass)).ravel()
     acting = np.array([far[name].value for name in ("mx", "my", "mz")])
     assert added == pytest.approx(TURNED[:3, :3] @ acting + 1.0 * TURNED[:3, 3])

@@ -16,8 +16,8 @@ from yid_ocp.errors import DataError, ModelError, SolverError
 from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
-from yid_ocp.sensors import measuring_camera_pose, sensor_function_with_jacobians
+from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
+from yid_ocp.sensors import camera_pose_of_point_group, sensor_function_with_jacobians
 from yid_ocp.solvers import MultipleShooting
 
 H, STEPS = 0.01, 24
@@ -174,14 +174,14 @@ def test_a_gear_needs_recorded_effort(prescribed) -> None:
 
 def test_what_a_recording_holds(driven) -> None:
     full = recording(driven)
-    assert signal_kinds_for_effects([full]) == {"joints.position", "joints.effort", "camera"}
-    assert signal_kinds_for_effects([recording(driven, effort=False, camera=False)]) == {"joints.position"}
+    assert recorded_signal_kinds([full]) == {"joints.position", "joints.effort", "camera"}
+    assert recorded_signal_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
     arm, camera = full.points
-    assert measuring_camera_pose(arm) is None
-    assert measuring_camera_pose(camera) is not None
+    assert camera_pose_of_point_group(arm) is None
+    assert camera_pose_of_point_group(camera) is not None
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
-    assert measuring_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
-    assert "nominal_clock" in signal_kinds_for_effects([Recording(points=(unposed,))])
+    assert camera_pose_of_point_group(unposed) == tuple(map(tuple, np.eye(4)))
+    assert "nominal_clock" in recorded_signal_kinds([Recording(points=(unposed,))])
 
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
@@ -326,8 +326,8 @@ def test_the_clock_of_any_group_of_points_may_be_late_or_early(driven):
     [camera] = [group for group in recording(driven).points if group.name.endswith("camera")]
     mocap = replace(camera, name="points_mocap", sensor_name="mocap", camera_pose=None)
     made = replace(recording(driven, camera=False), points=(*recording(driven, camera=False).points, mocap))
-    assert "points:points_mocap" in signal_kinds_for_effects([made])
-    found = candidate_kinds_and_locations(driven.system, signal_kinds_for_effects([made]))
+    assert "points:points_mocap" in recorded_signal_kinds([made])
+    found = candidate_kinds_and_locations(driven.system, recorded_signal_kinds([made]))
     assert [place for kind, place in found if kind == "camera_latency"] == ["points_mocap"]
     late = make_effect("camera_latency", "points_mocap", driven.system)
     assert late.parameters["camera_latency@points_mocap.delay"].lower < 0

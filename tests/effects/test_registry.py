@@ -157,12 +157,12 @@ def test_a_compliance_is_given_and_reported_as_stiffness(one_arm) -> None:
     effect = make_effect("grasp_compliance", "left", one_arm, {"stiffness": 500.0})
     name = "grasp_compliance@left.compliance"
     assert effect.parameters[name].value == pytest.approx(2e-3)
-    found = effect.parameters_as_reported({name: 4e-3}, {name: 4e-4})
+    found = effect.to_reported_parameters({name: 4e-3}, {name: 4e-4})
     assert found["stiffness"].value == pytest.approx(250.0)
     assert found["stiffness"].std == pytest.approx(25.0)
     assert found["stiffness"].unit == "N/m"
     assert found["damping"].unit == "N s/m"
-    rigid = effect.parameters_as_reported({name: 0.0}, {name: 1e-4})["stiffness"]
+    rigid = effect.to_reported_parameters({name: 0.0}, {name: 1e-4})["stiffness"]
     assert math.isinf(rigid.value)
     assert math.isnan(rigid.std)
     with pytest.raises(ConfigError, match="positive"):

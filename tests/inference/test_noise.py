@@ -18,7 +18,7 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.evaluation import whitened_prediction_residual
+from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
 TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
@@ -56,7 +56,7 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
     torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
     changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
     result = problem.predictor.predict_episode(changed, *problem.unpack_episode_unknowns(x, 0), False)
-    return whitened_prediction_residual(changed, None, result).residual
+    return whitened_residual_and_jacobian(changed, None, result).residual
 
 
 def slopes(change, count, size):
@@ -115,7 +115,7 @@ def test_a_step_without_a_measurement_adds_no_likelihood_and_lets_the_state_go_o
     covariance = np.array([[2.0, 0.3], [0.3, 1.0]])
     map_ = np.array([[0.9, 0.2]])
     transition = kalman.StateTransition(map_, np.array([0.5]))
-    step, after, log_determinant = kalman.kalman_matrices_and_next_covariance(covariance, np.zeros((0, 2)), transition)
+    step, after, log_determinant = kalman.kalman_gains_covariance_and_logdet(covariance, np.zeros((0, 2)), transition)
     assert log_determinant == 0.0
     whole = np.vstack([map_, [0.0, 0.5]])
     np.testing.assert_allclose(after, whole @ covariance @ whole.T)
@@ -295,7 +295,7 @@ def test_a_torque_offset_whose_linear_estimate_overshoots_is_approached_by_halve
     predictor = SimpleNamespace(
         theta_with_episode_values=lambda episode, theta: theta,
         corrected_inputs=lambda episode, theta, names: SimpleNamespace(torque=np.zeros((3, 1))),
-        predict_episode=lambda *given: SimpleNamespace(feedback_torque_and_sensitivity=None),
+        predict_episode=lambda *given: SimpleNamespace(stacked_feedback_torque_and_sensitivity=None),
     )
     errors = _Errors(np.zeros(1), np.ones(1))
     recorded = make_dataclass("_Recorded", ["input_errors"])(errors)

@@ -17,12 +17,12 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.inference import smoother, smoother_model
 from yid_ocp.inference.smoother import (
     gap_locations_by_smoother_evidence,
-    smooth_unknowns_about_fit,
-    z_scores_of_smoothed_unknowns,
+    interval_edges_names_and_z_scores,
+    smooth_unknown_forces_and_biases,
 )
 from yid_ocp.inference.smoother_model import (
     _FORCE_POINT,
-    LinearResidualModel,
+    ResidualStateSpaceModel,
     SmoothedUnknownGroup,
     _generalized_forces_per_newton,
     _IntervalModel,
@@ -49,7 +49,7 @@ def one_thread():
         yield
 
 
-def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> LinearResidualModel:
+def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> ResidualStateSpaceModel:
     """A linear model of three unknowns; with `size` its residual holds disturbances of these standard deviations."""
     rng = np.random.default_rng(seed)
     intervals = []
@@ -62,7 +62,7 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
         intervals.append(_IntervalModel(residual, by_state, by_unknown, 0.5 * state, drive, outside, ROWS + 2))
     start = rng.standard_normal((STATES, len(SOURCES))), np.full(STATES, loose)
     told = 0.1 * np.arange(COUNT + 1), tuple(f"u{i}" for i in range(len(SOURCES))), SOURCES, np.ones(3)
-    model = LinearResidualModel(recording, tuple(intervals), *told, *start, DECAY, np.zeros(3))
+    model = ResidualStateSpaceModel(recording, tuple(intervals), *told, *start, DECAY, np.zeros(3))
     if size is not None:
         design, _ = dense(model)
         scale = np.concatenate([model.initial_state_std, np.tile(size, COUNT)])
@@ -72,7 +72,7 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
     return model
 
 
-def dense(model: LinearResidualModel) -> tuple[np.ndarray, np.ndarray]:
+def dense(model: ResidualStateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
     """Residual rows, and unknowns (COUNT, nd, ...), by the first state and all disturbances of unit variance."""
     nd, width = len(model.unknown_groups), STATES + len(model.unknown_groups) * COUNT
     unknown = np.zeros((COUNT, nd, width))
@@ -141,7 +141,9 @@ class Dense:
 def smoothed(monkeypatch, models, **limits):
     """The smoother on linear models as they are."""
     monkeypatch.setattr(smoother, "residual_models_with_smoother_unknowns", lambda *_: tuple(models))
-    return smooth_unknowns_about_fit(SimpleNamespace(has_process_noise=False, episodes=()), np.zeros(0), None, **limits)
+    return smooth_unknown_forces_and_biases(
+        SimpleNamespace(has_process_noise=False, episodes=()), np.zeros(0), None, **limits
+    )
 
 
 NOTHING = dict.fromkeys(SOURCES, 0.0)
@@ -352,7 +354,7 @@ def problem_of(system: System, recording: Recording, feedback: Literal["none", "
 def said_of(problem: EstimationProblem):
     """What the smoother says about the fit of a problem."""
     solution = fit_problem(problem, GaussNewton())
-    return smooth_unknowns_about_fit(problem, np.array(solution.x), solution.evaluation)
+    return smooth_unknown_forces_and_biases(problem, np.array(solution.x), solution.evaluation)
 
 
 @pytest.mark.parametrize("feedback", ["none", "lqr"])
@@ -413,7 +415,7 @@ def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     middle = (trace.interval_edges[:-1] >= 0.9) & (trace.interval_edges[1:] <= 1.25)
     size = trace.reference_std[column] * trace.posterior_mean[middle, column]
     assert np.abs(size).mean() == pytest.approx(push, rel=0.35)
-    edges, names, values = z_scores_of_smoothed_unknowns(found)
+    edges, names, values = interval_edges_names_and_z_scores(found)
     assert values.shape == (len(edges) - 1, len(names))
     assert np.isfinite(values[:, names.index(name)]).any()
 

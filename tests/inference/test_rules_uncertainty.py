@@ -31,11 +31,11 @@ from yid_ocp.inference.uncertainty import (
     _score_covariance,
     apply_profile_interval,
     assess_goodness_of_fit,
+    mask_of_unknowns_with_decisive_priors,
     misfit_robust_covariance,
     needs_no_profile_likelihood,
     parameter_estimates,
     parameter_verdict,
-    priors_that_determine_unknown,
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
 )
@@ -402,7 +402,7 @@ def test_numbers_of_a_result():
     assert [uncertainty.percent_number_text(part) for part in parts] == list(parts.values())
     assert [uncertainty.finite_or_none(x) for x in (2.0, math.inf, math.nan)] == [2.0, None, None]
     problem = MadeUp(linear(COLUMN, [1.0, 2.0, 5.0, 7.0]), stated=1, weak=1, noise=0.1, weighting="paper")
-    cost = uncertainty.cost_without_weak_priors(problem, problem.evaluate([0.0]))
+    cost = uncertainty.cost_with_stated_priors(problem, problem.evaluate([0.0]))
     assert cost == pytest.approx(0.5 * (1 + 4) / 0.1**2 + 0.5 * 25)
 
 
@@ -461,7 +461,7 @@ def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_fo
     low_pass, own = zero_phase_effort_filter(15.0), channels_with_residual_indices(problem)
     found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
     noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
-    lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)
+    lags = low_pass.decorrelation_stride_for_step(H) * np.arange(1, 4)
     assert found[0] == 1.0
     assert found[1:4] == pytest.approx([noise[:-lag] @ noise[lag:] / (noise @ noise) for lag in lags], abs=0.02)
     assert np.abs(found[5:]).max() < 0.02 < abs(found[1])
@@ -565,7 +565,7 @@ def test_a_mass_that_scales_with_a_motor_is_known_by_the_motors_priors(own_part,
     priors[[0, 1, 2], [1, 2, 3]] = 4.0, 4.0, 1.0
 
     def determined_by(count, column, known=priors):
-        mask = priors_that_determine_unknown(data[:, :count], known[:, :count], column)
+        mask = mask_of_unknowns_with_decisive_priors(data[:, :count], known[:, :count], column)
         return np.flatnonzero(mask).tolist()
 
     assert determined_by(4, 0) == named

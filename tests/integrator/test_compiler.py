@@ -253,14 +253,14 @@ def polynomial(scale=2.0):
 @needs_compiler
 def test_a_function_is_compiled_once_and_keeps_its_sparsity(cache, runs):
     plain = polynomial()
-    made = [compiler.compiled_casadi_function(plain) for _ in range(2)]
+    made = [compiler.compile_casadi_function(plain) for _ in range(2)]
     assert len([command for command in runs if "-shared" in command]) == 1
     for function in made:
         assert not function.is_a("SXFunction")
         assert function.sparsity_out(1) == plain.sparsity_out(1)
         for actual, expected in zip(function([1.0, 2.0, 3.0]), plain([1.0, 2.0, 3.0]), strict=True):
             np.testing.assert_allclose(np.array(actual), np.array(expected), rtol=1e-15)
-    assert float(compiler.compiled_casadi_function(polynomial(5.0))([1.0, 2.0, 3.0])[0][2]) == 45.0
+    assert float(compiler.compile_casadi_function(polynomial(5.0))([1.0, 2.0, 3.0])[0][2]) == 45.0
     assert float(made[0]([1.0, 2.0, 3.0])[0][2]) == 18.0
 
 
@@ -269,10 +269,10 @@ def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, choose, monkeypa
     plain = polynomial()
     with monkeypatch.context() as change:
         change.setattr(compiler.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
-        assert compiler.compiled_casadi_function(plain).is_a("SXFunction")
+        assert compiler.compile_casadi_function(plain).is_a("SXFunction")
     assert "cannot be loaded" in caplog.text
     choose("none")
-    assert compiler.compiled_casadi_function(polynomial(3.0)).is_a("SXFunction")
+    assert compiler.compile_casadi_function(polynomial(3.0)).is_a("SXFunction")
 
 
 @pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])

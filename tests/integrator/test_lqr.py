@@ -147,7 +147,7 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     """A filter that follows them pulls at nothing; the first node is stood at before the reference begins."""
     step, theta, (state, torque, internal), shift = moved(step_with(plain, names))
     read = torque + misread
-    loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.parameter_values_without_effects(theta))
+    loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.parameter_values_with_neutral_effects(theta))
     recorded, true = (JointMotionAndTorqueWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
     value, _ = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
@@ -159,7 +159,7 @@ def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(pla
     step = compile_step(system_with_link_mass_factors(plain, "mass_scale"), TIME_STEP, use_compiler=False)
     names = {"shoulder.mass_scale": 1.1, "elbow.mass_scale": 0.8, "elbow.damping": 0.4}
     step, theta, (state, torque, internal), shift = moved(step, names)
-    loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.parameter_values_without_effects(theta))
+    loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.parameter_values_with_neutral_effects(theta))
     recorded = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], torque, internal)
     value, slopes = shift.effect_momentum_shifts_and_sensitivities(recorded, recorded, theta, tuple(names))
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
@@ -211,8 +211,8 @@ def test_an_effect_away_from_neutral_or_sought_shifts_the_momentum(plain):
     shift = EffectMomentumCalculator(step)
     [name] = set(shift.parameter_names) - OWN
     theta = step.system.parameters.vector()
-    neutral = shift.parameter_values_without_effects(theta)
+    neutral = shift.parameter_values_with_neutral_effects(theta)
     assert neutral[step.system.parameters.index(name)] == 0.0
-    assert not shift.is_active(neutral, ())
-    assert shift.is_active(theta, ())
-    assert shift.is_active(neutral, (name,))
+    assert not shift.changes_momentum(neutral, ())
+    assert shift.changes_momentum(theta, ())
+    assert shift.changes_momentum(neutral, (name,))

@@ -11,7 +11,7 @@ from yid_ocp.integrator.statics import (
     _HOLD_STIFFNESS_WITH_COMMAND,
     _HOLD_STIFFNESS_WITH_TORQUE,
     EquilibriumSolver,
-    steady_effect_internal_coordinates,
+    steady_state_internal_coordinates,
 )
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
@@ -140,7 +140,7 @@ def test_internal_coordinates_of_an_object_that_has_long_been_there(parts):
     step = compile_step(system, 1e-3, use_compiler=False)
     q = np.linspace(0.1, 0.5, 9)
     np.testing.assert_allclose(
-        steady_effect_internal_coordinates(step, q, system.parameters.vector()), [q[0]], rtol=1e-12
+        steady_state_internal_coordinates(step, q, system.parameters.vector()), [q[0]], rtol=1e-12
     )
     plain = compile_step(parts.cable(), 1e-3, use_compiler=False)
-    assert steady_effect_internal_coordinates(plain, q, plain.system.parameters.vector()).shape == (0,)
+    assert steady_state_internal_coordinates(plain, q, plain.system.parameters.vector()).shape == (0,)

@@ -19,12 +19,12 @@ from yid_ocp.errors import ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, System, flexible_object, forward_kinematics
-from yid_ocp.model.flexible import edge_to_edge_transport_rotations
+from yid_ocp.model.flexible import edge_to_edge_rotations_from_vertices
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import OBJECT_KINDS, ObjectBuilder, init_object_templates
+from yid_ocp.model.objects.base import OBJECT_KINDS, ObjectBuilder, object_factories_for_init
 from yid_ocp.model.objects.foam_y import foam_y_object, foam_y_segments
 from yid_ocp.model.urdf import mechanism_to_urdf
-from yid_ocp.workflow.build import build_system, divided_joint_parameter_scale
+from yid_ocp.workflow.build import build_system, link_division_parameter_scale
 
 
 def stiffness(item):
@@ -109,7 +109,7 @@ def test_polyline_is_reproduced_by_forward_kinematics(seed, count):
     vertices = np.cumsum(rng.normal(size=(count, 3)), axis=0)
     start = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     start *= np.sign(np.linalg.det(start))
-    first, *later = edge_to_edge_transport_rotations(vertices, start)
+    first, *later = edge_to_edge_rotations_from_vertices(vertices, start)
     lengths = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
     segment = FlexibleSegment("C", 0.0, 1.0, 0.01, link_lengths=lengths, rest_rotation=first, link_rest_rotations=later)
     item = flexible_object([segment], root_placement=homogeneous_transform(start, vertices[0]))
@@ -118,7 +118,7 @@ def test_polyline_is_reproduced_by_forward_kinematics(seed, count):
 
 
 def test_polyline_turns_the_shortest_way():
-    straight, back, sideways = edge_to_edge_transport_rotations([[0, 0, 0], [0, 0, 1], [0, 0, 0], [0, 1, 0]])
+    straight, back, sideways = edge_to_edge_rotations_from_vertices([[0, 0, 0], [0, 0, 1], [0, 0, 0], [0, 1, 0]])
     np.testing.assert_array_equal(straight, np.eye(3))
     np.testing.assert_allclose(back @ [0, 0, 1], [0, 0, -1])
     assert np.trace(sideways) == pytest.approx(1.0)
@@ -186,7 +186,7 @@ def test_errors_of_a_segment(refused_with, name):
 )
 def test_a_degenerate_polyline_is_refused(vertices):
     with pytest.raises(ModelError, match="vertices"):
-        edge_to_edge_transport_rotations(vertices)
+        edge_to_edge_rotations_from_vertices(vertices)
 
 
 def test_the_paper_y_stands_where_it_should():
@@ -260,8 +260,8 @@ def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
     system = build_system(run, link_division=2)
     assert system.parameters["rod.taper"].value == 0.4
     assert len(system.layout_of_segment("rod").link_joints) == 8
-    assert divided_joint_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
+    assert link_division_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
     given = {"length": LENGTH, "mass": MASS, "radius": 0.006, "tip_radius": 0.003}
-    made = init_object_templates()["tapered_rod"].build(given, 4)
+    made = object_factories_for_init()["tapered_rod"].build(given, 4)
     assert made.settings == replace(rod(4), joint_axes="xy", gravity_fraction=1.0)
     assert set(made.start_values) == {"rod.bend", "rod.damping"}

@@ -18,7 +18,7 @@ from yid_ocp.model import FlexibleSegment, Mechanism, flexible_object, forward_k
 from yid_ocp.model.mechanism import (
     Inertia,
     homogeneous_transform,
-    merge_bodies,
+    merge_inertias,
     rotation_from_axis_sin_cos,
     rotation_from_rpy,
     rpy_from_rotation,
@@ -137,7 +137,7 @@ def test_merged_bodies_weigh_what_they_weigh_together():
     for _ in range(3):
         root = rng.normal(size=(3, 3))
         bodies.append(Inertia.from_values(rng.uniform(0.1, 2), rng.normal(size=3), root @ root.T))
-    one = merge_bodies(bodies)
+    one = merge_inertias(bodies)
     masses = np.array([float(b.mass) for b in bodies])
     centres = np.array([numbers(b.center_of_mass).ravel() for b in bodies])
     assert float(one.mass) == pytest.approx(masses.sum())
@@ -148,8 +148,8 @@ def test_merged_bodies_weigh_what_they_weigh_together():
         return numbers(body.inertia_about_com) + m * (c @ c * np.eye(3) - np.outer(c, c))
 
     np.testing.assert_allclose(about_origin(one), sum(about_origin(b) for b in bodies), atol=1e-12)
-    assert merge_bodies([]) is None
-    assert merge_bodies([Inertia.from_values(0.0, np.zeros(3), np.zeros((3, 3)))]) is None
+    assert merge_inertias([]) is None
+    assert merge_inertias([Inertia.from_values(0.0, np.zeros(3), np.zeros((3, 3)))]) is None
 
 
 def test_a_frame_that_the_file_does_not_have(urdf_folder):

@@ -15,7 +15,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import mechanism as mechanism_module
 from yid_ocp.model.kinematics import lagrangian_first_derivatives, lagrangian_second_derivatives, mass_matrix
-from yid_ocp.model.urdf import read_urdf, urdf_joint_dynamics
+from yid_ocp.model.urdf import joint_damping_and_friction, read_urdf
 from yid_ocp.workflow.build import build_system
 
 mujoco = pytest.importorskip("mujoco", reason="MJCF needs mujoco: pip install '.[blind]'")
@@ -202,7 +202,7 @@ def test_constants_of_joints_come_into_the_model_unless_the_settings_have_others
 
     found = values("robot.xml", "{joints: [joint1, joint2], mode: servo}")
     assert found["rotor_inertia@joint1.armature"] == 0.1
-    assert (found["joint1.damping"], urdf_joint_dynamics(tmp_path / "robot.xml")[0]["joint2"]) == (1.0, 1.0)
+    assert (found["joint1.damping"], joint_damping_and_friction(tmp_path / "robot.xml")[0]["joint2"]) == (1.0, 1.0)
     assert (found["joint1.servo_gain"], found["joint1.servo_damping"]) == (100.0, 10.0)
     found = values("servo.xml", "{joints: [pan, lift], mode: prescribed}", "  damping: {pan: 0.3, lift: 0.2}\n")
     assert found["joint_coulomb@pan.tau_c"] == 0.05

@@ -19,7 +19,7 @@ from yid_ocp.model import (
     flexible_object,
     forward_kinematics,
 )
-from yid_ocp.model.mechanism import merge_bodies, rotation_from_rpy
+from yid_ocp.model.mechanism import merge_inertias, rotation_from_rpy
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
@@ -149,7 +149,7 @@ def test_a_clamp_has_six_massless_coordinates():
     assert clamp.joint_names == tuple(f"hand_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))
     assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
     assert [j.parent_index for j in clamp.joints] == [-1, 0, 1, 2, 3, 4]
-    assert all(merge_bodies(j.bodies) is None for j in clamp.joints)
+    assert all(merge_inertias(j.bodies) is None for j in clamp.joints)
     assert clamp.frame("hand").joint_index == 5
 
 

@@ -13,7 +13,7 @@ from placed_frames import numbers
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import urdf as urdf_files
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, merge_bodies
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, merge_inertias
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, urdf_path_from_robot_name
 
@@ -47,7 +47,7 @@ def assert_equal_mechanisms(one, two, tolerance=1e-12):
             assert getattr(a, key) == getattr(b, key)
         np.testing.assert_allclose(a.axis, b.axis, rtol=0, atol=tolerance)
         pairs = [(a.placement.homogeneous_matrix(), b.placement.homogeneous_matrix())]
-        body, other = merge_bodies(a.bodies), merge_bodies(b.bodies)
+        body, other = merge_inertias(a.bodies), merge_inertias(b.bodies)
         assert (body is None) == (other is None)
         if body is not None and other is not None:
             keys = ("mass", "center_of_mass", "inertia_about_com")

@@ -60,7 +60,7 @@ def some_motion(experiment, seed=0, size=0.1):
 def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem, driven_experiment):
     experiment = driven_experiment
     w = some_motion(experiment)
-    planned, base = experiment.planned_estimation_problem(w), driven_problem
+    planned, base = experiment.problem_with_planned_recording_only(w), driven_problem
     spent = base.episodes[0].grid.steps * base.step.time_step
     for new, old in zip(planned.episodes[0].measurements, base.episodes[0].measurements, strict=True):
         assert new.sensor.channel_names == old.sensor.channel_names
@@ -91,7 +91,7 @@ def test_slopes_are_derivatives_of_the_sensitivities(kind, request):
 def test_prescribed_arms_tell_what_identifiability_says(moved_experiment):
     w = some_motion(moved_experiment, size=0.3)
     searched = moved_experiment.sensitivities_to_unknowns(w)
-    judged = identifiability(moved_experiment.planned_estimation_problem(w))
+    judged = identifiability(moved_experiment.problem_with_planned_recording_only(w))
     # the search sees fewer samples of points, each telling more
     np.testing.assert_allclose(np.diag(searched.T @ searched), np.diag(judged.fisher_information), rtol=0.05)
 
@@ -100,7 +100,7 @@ def test_driven_arms_tell_about_what_the_innovations_say(driven_experiment):
     for seed in range(2):
         w = some_motion(driven_experiment, seed, 0.3)
         searched = driven_experiment.sensitivities_to_unknowns(w)
-        judged = driven_experiment.planned_sensitivities_to_unknowns(w)
+        judged = driven_experiment.planned_recording_sensitivities(w)
         for criterion in (DOptimalityCriterion((i,), (0, 1)) for i in (0, 1)):  # logarithms of standard deviations
             told, true = (criterion.value_and_gradient_wrt_sensitivities(rows, False)[0] for rows in (searched, judged))
             assert told == pytest.approx(true, abs=0.5)
@@ -163,7 +163,7 @@ def searched(limits, rounds=50):
     read = {"sensitivities_to_unknowns": line, "sensitivity_derivatives_by_coefficients": slopes}
     experiment = SimpleNamespace(simulator=simulator, **read)
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
-    kept = SimpleNamespace(limit_rows=bounded, limited_values_and_jacobian=lambda rolled, w: values(w.ravel()))
+    kept = SimpleNamespace(limit_rows=bounded, constraints_and_jacobian=lambda rolled, w: values(w.ravel()))
     search = InformativeMotionSearch(experiment, kept, DOptimalityCriterion((0, 1), (0, 1)))
     return search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
 

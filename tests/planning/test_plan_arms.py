@@ -11,7 +11,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.step import simulate
 from yid_ocp.planning.joint_paths import FramePositionEvaluator
 from yid_ocp.workflow.plan import run_plan
-from yid_ocp.workflow.run_inputs import resolve_default_recording
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {
@@ -90,7 +90,7 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     assert outcome.result["swing"] < run.plan.point_rest_speed_tolerance
     found = outcome.output
     # it begins where the recording does, and both arms take part
-    recorded = read_recording(resolve_default_recording(run.recordings.estimate[0])).joints
+    recorded = read_recording(resolve_recording_path(run.recordings.estimate[0])).joints
     first = recorded.position[0, [recorded.names.index(name) for name in found.joint_names]]
     np.testing.assert_allclose(found.joint_positions[0], first, atol=5e-3)
     travel = dict(zip(found.joint_names, np.ptp(found.joint_positions, axis=0), strict=True))
@@ -121,7 +121,7 @@ def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit,
 
 def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):
     run = load_config(repository / "configs" / "deft_bdlo1.yaml")
-    if not resolve_default_recording(run.recordings.estimate[0]).is_file():
+    if not resolve_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, point_target_offset_from_start: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
     fewer = (

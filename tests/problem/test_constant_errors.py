@@ -9,7 +9,7 @@ from small_problems import H, pendulum_step, taken
 
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.evaluation import whitened_prediction_residual
+from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
 from yid_ocp.problem.measurements import (
     subtract_estimated_bias_and_clock_errors,
     whiten_against_sensor_biases,
@@ -115,7 +115,7 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
 def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
-    counted = whitened_prediction_residual(episode, problem.held_out_whitening_filters[0], result).residual
+    counted = whitened_residual_and_jacobian(episode, problem.held_out_whitening_filters[0], result).residual
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     plain = np.concatenate([samples.residual_and_jacobian(y).residual for samples, y in pairs])
     slopes = whitened_measurement_sensitivities_to_sensor_errors(episode.measurements)

@@ -17,7 +17,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
+from yid_ocp.problem.estimation_problem import held_out_prediction_arguments
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, fit_problem
 from yid_ocp.solvers.symbolic_transcription import transcribe
@@ -32,7 +32,7 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     correlation = np.array([[[1.0, 0.8, -0.3], [0.8, 1.0, 0.1], [-0.3, 0.1, 1.0]]] * 2)
     made = measured(efforts("a", "b", "c"), [0, 1], [0.0, 0.0], [[1.0, 2.0, 3.0], [4.0, NAN, 6.0]])
     made = replace(made, noise_correlation=correlation, weight=made.weight * 2.0)
-    mixing = made.output_decorrelation_matrix.toarray()
+    mixing = made.residual_decorrelation_matrix.toarray()
     np.testing.assert_allclose(mixing, mixing.T, atol=1e-12)
     covariance = np.zeros((5, 5))
     covariance[:3, :3] = correlation[0]
@@ -136,7 +136,7 @@ def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     [samples] = (s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     slopes = samples.weight[:, :, None] * np.diag(linear.reference_std[at])
     assert np.array_equal(samples.sensor.effort_joints, JOINTS)
-    seen = samples.output_decorrelation_matrix @ slopes[samples.positive_weight_mask]
+    seen = samples.residual_decorrelation_matrix @ slopes[samples.positive_weight_mask]
     # but for the first and the last step, of which a node sees half
     np.testing.assert_allclose(found, seen.T @ seen, rtol=0.03)
     assert abs(found[0, 1]) > 0.05 * found.diagonal().min()
@@ -312,6 +312,6 @@ def test_friction_that_holds_a_held_out_arm_is_estimated_from_its_first_efforts(
     still = np.tile([0.3, 0.2], (301, 1))
     problem = arm(step, still, needed(step, still) + np.array([0.0, 0.6 * friction["tau_c"]]))
     held = problem.with_episodes(problem.episodes, problem.episodes)
-    [(episode, _, offset)] = held_out_prediction_inputs(held, problem.initial_unknowns)
+    [(episode, _, offset)] = held_out_prediction_arguments(held, problem.initial_unknowns)
     assert episode.measurements[0].node[0] * 0.01 > 0.2
     assert offset == pytest.approx([0.6], abs=0.01)

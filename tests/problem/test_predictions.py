@@ -36,7 +36,7 @@ def test_what_is_simulated_is_what_is_found(problem):
     assert np.array_equal(made.points[0].t, problem.episodes[0].recording.points[0].t)
     again = EstimationProblem(problem.step, [made], FREE, problem.options)
     solution = yid.solve(again)
-    at_truth = again.evaluate(again.unknown_vector(truth), derivatives=False)
+    at_truth = again.evaluate(again.pack_unknowns(truth), derivatives=False)
     assert np.abs(at_truth.residual[again.residual_rows.data]).max() < 1e-9
     for name, value in truth.items():
         # but for the weak prior
@@ -73,7 +73,7 @@ def test_simulated_joints_are_read_with_the_errors_of_the_effects(urdf_folder, h
     options, source = ProblemOptions(path_cutoff=np.inf, **own), taken(step, 1, steps=200, camera=how == "driven")
     made = EstimationProblem(step, [source], list(READ), options).simulate_synthetic_recording(READ)
     again = EstimationProblem(step, [made], list(READ), options)
-    costs = [again.evaluate(again.unknown_vector(values), derivatives=False).cost for values in (READ, {})]
+    costs = [again.evaluate(again.pack_unknowns(values), derivatives=False).cost for values in (READ, {})]
     assert costs[0] < 1e-3 * costs[1]
 
 

@@ -14,11 +14,11 @@ from yid_ocp.model.objects.base import ClampPosePointNames
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,
-    mean_step_input_delay_derivative,
-    mean_step_inputs,
     prescribed_coordinates_at_nodes,
-    signal_kinds_for_effects,
+    recorded_signal_kinds,
     smoothed_joint_efforts,
+    step_mean_input_delay_derivative,
+    step_mean_inputs,
 )
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
 
@@ -46,12 +46,12 @@ HELD = {
 
 @pytest.mark.parametrize(("grid", "delay", "expected"), HELD.values(), ids=HELD)
 def test_a_torque_is_held_from_sample_to_sample_and_averaged_over_a_step(grid, delay, expected):
-    found = mean_step_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), grid, "run", np.array([delay]))
+    found = step_mean_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), grid, "run", np.array([delay]))
     np.testing.assert_allclose(found[:, 0], expected)
 
 
 def test_an_uneven_clock_weighs_samples_by_how_long_they_are_held():
-    found = mean_step_inputs(driven([1.0, 5.0, 9.0], [0.0, 0.15, 0.2]), ("a",), TimeGrid(0.0, 0.2, 1), "run")
+    found = step_mean_inputs(driven([1.0, 5.0, 9.0], [0.0, 0.15, 0.2]), ("a",), TimeGrid(0.0, 0.2, 1), "run")
     np.testing.assert_allclose(found, [[(0.15 * 1.0 + 0.05 * 5.0) / 0.2]])
 
 
@@ -74,7 +74,7 @@ UNEVEN = np.array([0.0, 0.1, 0.25, 0.3, 0.45, 0.5, 0.65])
 @pytest.mark.parametrize("delay", [0.0, 0.02])
 def test_sampled_torque_is_a_smooth_course_whose_mean_a_step_takes(kind, delay):
     grid = TimeGrid(0.05, 0.02, 20)
-    found = mean_step_inputs(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
+    found = step_mean_inputs(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
     expected = np.diff(summed_cubic(grid.node_times - delay)) / 0.02
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
 
@@ -82,12 +82,12 @@ def test_sampled_torque_is_a_smooth_course_whose_mean_a_step_takes(kind, delay):
 def test_mean_torque_keeps_the_mean_over_every_recorded_interval():
     effort = np.random.default_rng(2).normal(size=12)
     t = 0.1 * np.arange(12)
-    fine = mean_step_inputs(driven(effort, t, "mean"), ("a",), TimeGrid(0.0, 0.025, 44), "run")[:, 0]
+    fine = step_mean_inputs(driven(effort, t, "mean"), ("a",), TimeGrid(0.0, 0.025, 44), "run")[:, 0]
     np.testing.assert_allclose(fine.reshape(11, 4).mean(axis=1), effort[:11], rtol=1e-12)
     times = np.append(t, 1.2)
     smooth = np.diff(times + times**2 - 7 * times**3) / 0.1
     grid = TimeGrid(0.0, 0.05, 22)
-    found = mean_step_inputs(driven(smooth, t, "mean"), ("a",), grid, "run")[:, 0]
+    found = step_mean_inputs(driven(smooth, t, "mean"), ("a",), grid, "run")[:, 0]
     times = grid.node_times
     np.testing.assert_allclose(found, np.diff(times + times**2 - 7 * times**3) / 0.05, rtol=1e-9)
 
@@ -95,9 +95,9 @@ def test_mean_torque_keeps_the_mean_over_every_recorded_interval():
 @pytest.mark.parametrize(("kind", "first", "last"), [("command", 1, 5), ("sample", 1, 5), ("mean", 0.5, 5.5)])
 def test_beyond_the_recording_torque_is_held(kind, first, last):
     made = driven([1.0, 2.0, 3.0, 4.0, 5.0], kind=kind)
-    before = mean_step_inputs(made, ("a",), TimeGrid(-0.5, 0.1, 3), "run")[:, 0]
+    before = step_mean_inputs(made, ("a",), TimeGrid(-0.5, 0.1, 3), "run")[:, 0]
     np.testing.assert_allclose(before, first, rtol=1e-12)
-    after = mean_step_inputs(made, ("a",), TimeGrid(0.55, 0.1, 3), "run")[:, 0]
+    after = step_mean_inputs(made, ("a",), TimeGrid(0.55, 0.1, 3), "run")[:, 0]
     np.testing.assert_allclose(after, last, rtol=1e-12)
 
 
@@ -105,30 +105,30 @@ def test_beyond_the_recording_torque_is_held(kind, first, last):
 @pytest.mark.parametrize("delay", [0.03, 0.17, -0.04])
 def test_the_slope_by_the_delay_is_that_of_differences(delay, kind):
     made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0], kind=kind), TimeGrid(0.1, 0.1, 3)
-    ends = [mean_step_inputs(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
-    found = mean_step_input_delay_derivative(made, ("a",), grid, "run", np.array([delay]))
+    ends = [step_mean_inputs(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
+    found = step_mean_input_delay_derivative(made, ("a",), grid, "run", np.array([delay]))
     np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-6)
 
 
 def test_at_a_jump_the_slope_is_the_mean_of_both_sides():
     made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), TimeGrid(0.1, 0.1, 3)
     at, *sides = (
-        mean_step_input_delay_derivative(made, ("a",), grid, "run", np.array([delay])) for delay in (0.0, 1e-3, -1e-3)
+        step_mean_input_delay_derivative(made, ("a",), grid, "run", np.array([delay])) for delay in (0.0, 1e-3, -1e-3)
     )
     np.testing.assert_allclose(at, np.mean(sides, axis=0))
     # beyond the ends the torque is held, and so does not change
     for first in (0.7, -0.7):
-        beyond = mean_step_input_delay_derivative(made, ("a",), TimeGrid(first, 0.1, 2), "run", np.zeros(1))
+        beyond = step_mean_input_delay_derivative(made, ("a",), TimeGrid(first, 0.1, 2), "run", np.zeros(1))
         np.testing.assert_array_equal(beyond, np.zeros((2, 1)))
 
 
 def test_nothing_driven_needs_no_torque_and_a_driven_joint_does():
     silent = joints(["a"], [0.0, 0.1], np.zeros((2, 1)))
-    assert mean_step_inputs(silent, (), TimeGrid(0.0, 0.1, 3), "run").shape == (3, 0)
+    assert step_mean_inputs(silent, (), TimeGrid(0.0, 0.1, 3), "run").shape == (3, 0)
     with pytest.raises(DataError, match="joint efforts drive the model"):
-        mean_step_inputs(silent, ("a",), TimeGrid(0.0, 0.1, 3), "run")
+        step_mean_inputs(silent, ("a",), TimeGrid(0.0, 0.1, 3), "run")
     with pytest.raises(DataError, match=r"(?s)'b' of the model is not recorded.*leave it out of model\.arms\.joints"):
-        mean_step_inputs(driven([1.0, 2.0]), ("b",), TimeGrid(0.0, 0.1, 3), "run")
+        step_mean_inputs(driven([1.0, 2.0]), ("b",), TimeGrid(0.0, 0.1, 3), "run")
 
 
 def test_loads_are_smoothed_and_interpolated():
@@ -159,9 +159,9 @@ RECORDED = {
 
 @pytest.mark.parametrize(("made", "expected"), RECORDED.values(), ids=RECORDED)
 def test_sensors_are_known_by_what_was_recorded(made, expected):
-    assert signal_kinds_for_effects([made]) == expected
+    assert recorded_signal_kinds([made]) == expected
     with_efforts, both = RECORDED["efforts"]
-    assert signal_kinds_for_effects([with_efforts, made]) == expected | both
+    assert recorded_signal_kinds([with_efforts, made]) == expected | both
 
 
 def moving(*names):
@@ -269,7 +269,7 @@ def test_it_begins_and_ends_steadily_as_signal_processing_has_it(columns):
 def test_without_a_cutoff_values_are_as_they_were():
     values = np.random.default_rng(1).standard_normal((5, 2))
     assert PLAIN(np.arange(5.0), values) is values
-    assert PLAIN.decorrelation_stride(0.01) == 1
+    assert PLAIN.decorrelation_stride_for_step(0.01) == 1
 
 
 def test_an_uneven_clock_is_resampled_in_between():
@@ -280,7 +280,7 @@ def test_an_uneven_clock_is_resampled_in_between():
 
 def test_smoothed_values_tell_something_new_twice_a_period():
     for cutoff, step, stride in ((5.0, 0.01, 10), (5.0, 0.02, 5), (10.0, 0.01, 5), (30.0, 0.05, 1), (7.0, 0.01, 7)):
-        assert ZeroPhaseLowPassFilter(cutoff).decorrelation_stride(step) == stride
+        assert ZeroPhaseLowPassFilter(cutoff).decorrelation_stride_for_step(step) == stride
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 5.0])

@@ -21,7 +21,7 @@ NAN = math.nan
 
 def test_a_time_lies_between_two_nodes():
     times = [5.0, 5.05, 5.1, 5.1 + 5e-8, 5.1 - 5e-8, 5.1 + 5e-7, 5.275, 5.3, 5.4, 4.9]
-    node, fraction = TimeGrid(5.0, 0.1, 3).node_and_fraction(times)
+    node, fraction = TimeGrid(5.0, 0.1, 3).preceding_node_and_fraction(times)
     assert node.tolist() == [0, 0, 1, 1, 1, 1, 2, 2, 2, 0]
     assert fraction == pytest.approx([0.0, 0.5, 0.0, 0.0, 0.0, 5e-6, 0.75, 1.0, 2.0, -1.0], abs=1e-9)
 
@@ -115,8 +115,8 @@ def test_the_papers_cost_counts_the_end_twice_and_the_start_not_at_all():
 
 def test_predictions_are_interpolated_between_the_nodes_that_are_needed():
     made = measured(efforts("a", "b"), [2, 2, 5, 9], [0.0, 0.25, 0.0, 0.5], np.zeros((4, 2)))
-    assert made.evaluation_nodes.tolist() == [2, 3, 5, 9, 10]
-    at_nodes = np.array([[k, k**2] for k in made.evaluation_nodes], float)
+    assert made.evaluation_node_indices.tolist() == [2, 3, 5, 9, 10]
+    at_nodes = np.array([[k, k**2] for k in made.evaluation_node_indices], float)
     np.testing.assert_allclose(made.interpolate_to_samples(at_nodes), [[2, 4], [2.25, 5.25], [5, 25], [9.5, 90.5]])
     deep = np.stack([at_nodes, 10 * at_nodes], axis=2)
     np.testing.assert_allclose(made.interpolate_to_samples(deep)[:, :, 1], 10 * made.interpolate_to_samples(at_nodes))
@@ -124,7 +124,7 @@ def test_predictions_are_interpolated_between_the_nodes_that_are_needed():
 
 def test_a_sample_on_its_node_does_not_look_at_the_next_one():
     made = measured(efforts("a"), [2, 3], [0.0, 0.0], np.zeros((2, 1)))
-    assert made.evaluation_nodes.tolist() == [2, 3]
+    assert made.evaluation_node_indices.tolist() == [2, 3]
     np.testing.assert_array_equal(made.interpolate_to_samples(np.array([[1.0], [NAN]])), [[1.0], [NAN]])
 
 
@@ -152,11 +152,11 @@ def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
     made = made.shifted_earlier_by_delays(np.array([0.25, 2.0]))
     assert made.node.tolist() == [[5, 3], [5, 4]]
     np.testing.assert_allclose(made.fraction, [[0.25, 0.5], [0.75, 0.0]])
-    assert made.evaluation_nodes.tolist() == [2, 3, 4, 5, 6]
+    assert made.evaluation_node_indices.tolist() == [2, 3, 4, 5, 6]
     for node, nodes in ((0, [0, 1]), (3, [1, 2, 3])):
         near_an_end = measured(efforts("a"), [node], [0.0], [[1.0]], span=(0, 3)).shifted_earlier_by_delays(np.zeros(1))
-        assert near_an_end.evaluation_nodes.tolist() == nodes
-    at_nodes = np.array([[k, 10 * k] for k in made.evaluation_nodes], float)
+        assert near_an_end.evaluation_node_indices.tolist() == nodes
+    at_nodes = np.array([[k, 10 * k] for k in made.evaluation_node_indices], float)
     np.testing.assert_allclose(made.interpolate_to_samples(at_nodes), [[5.25, 35.0], [5.75, 40.0]])
 
 
@@ -176,12 +176,12 @@ RATES = {
 def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node, fraction, steps, rate):
     plain = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8))
     late = plain.shifted_earlier_by_delays(np.array([steps]))
-    at_nodes = np.array([[float(k**2)] for k in late.evaluation_nodes])
+    at_nodes = np.array([[float(k**2)] for k in late.evaluation_node_indices])
     np.testing.assert_allclose(late.prediction_change_per_step(at_nodes, plain, np.array([steps])), [[rate]])
     # others beside it make no difference
     several = measured(efforts("a"), [2, node, 8], [0.25, fraction, 0.0], np.ones((3, 1)), span=(2, 8))
     all_late = several.shifted_earlier_by_delays(np.array([steps]))
-    at_nodes = np.array([[float(k**2)] for k in all_late.evaluation_nodes])
+    at_nodes = np.array([[float(k**2)] for k in all_late.evaluation_node_indices])
     np.testing.assert_allclose(all_late.prediction_change_per_step(at_nodes, several, np.array([steps]))[1], [rate])
 
 

@@ -76,7 +76,7 @@ def test_forward_and_adjoint_derivatives_are_those_of_differences(problem):
     forward = evaluation.jacobian.T @ evaluation.residual
     np.testing.assert_allclose(gradient * scale, forward * scale, rtol=1e-6, atol=1e-8 * np.abs(forward * scale).max())
     assert cost == pytest.approx(evaluation.cost, rel=1e-12)
-    rows = problem.residual_rows.slice_without_weak_priors
+    rows = problem.residual_rows.slice_of_data_and_stated_priors
     for i in range(len(x)):
         step = np.zeros(len(x))
         step[i] = 1e-5 * scale[i]
@@ -135,7 +135,7 @@ def test_an_encoder_that_is_offset_moves_the_path(urdf_folder):
     episode = problem.episodes[0]
     inputs = problem.predictor.corrected_inputs(episode, problem.system.parameters.vector(values), ())
     np.testing.assert_allclose(inputs.prescribed_path - episode.prescribed_path, -0.05, atol=1e-12)
-    rollout = problem.evaluate(problem.unknown_vector(values), False).episode_predictions[0].rollout
+    rollout = problem.evaluate(problem.pack_unknowns(values), False).episode_predictions[0].rollout
     np.testing.assert_allclose(rollout.state[:, 0], inputs.prescribed_path[:, 0], atol=1e-12)
 
 

@@ -10,11 +10,11 @@ import scipy.optimize
 from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken, tip
 
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import mass_matrix_diagonal_at_zero, truncate_episode
-from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
+from yid_ocp.problem.estimation_problem import held_out_prediction_arguments
 from yid_ocp.problem.evaluation import (
     PriorResiduals,
     ResidualVectorLayout,
@@ -82,7 +82,7 @@ def test_start_bounds_and_values_by_name(make):
     assert upper[0] == math.inf
     np.testing.assert_array_equal(lower[3:], -np.inf)
     np.testing.assert_array_equal(upper[3:], np.inf)
-    found = problem.unknown_vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
+    found = problem.pack_unknowns({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
     changed = {"elbow.stiffness": 9.0, "shoulder.stiffness": 0.0, "start.q.elbow[run_1]": 0.5}
     assert named(found) == begin | changed
 
@@ -101,9 +101,9 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     found = mass_matrix_diagonal_at_zero(free_step, theta, ("elbow", "shoulder"))
     np.testing.assert_allclose(found, inertia[::-1], rtol=1e-9)
     assert problem.unknown_names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
-    assert problem.predictor.estimated_initial_state_entries == (0, 1, 2, 3)
+    assert problem.predictor.estimated_initial_state_indices == (0, 1, 2, 3)
     problem = make()
-    assert problem.predictor.estimated_initial_state_entries == ()
+    assert problem.predictor.estimated_initial_state_indices == ()
     assert problem.priors.initial_state_stds.shape == (0,)
     assert problem.unknown_names == FREE
 
@@ -124,7 +124,7 @@ def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_anothe
     np.testing.assert_allclose(rows, [[0.5, 0.0, 0.0], [0.0, 1 / (math.log(10.0) * 30.0), 0.0]])
     assert problem.positive_unknowns_mask.tolist() == [True, True, False]
     rows_of, at = problem.residual_rows, problem.residual_rows.data.stop + 1
-    assert (rows_of.weak_priors, rows_of.slice_without_weak_priors) == (slice(at, at + 1), slice(0, at))
+    assert (rows_of.weak_priors, rows_of.slice_of_data_and_stated_priors) == (slice(at, at + 1), slice(0, at))
     # at its bound the row is one that a step can follow: a thousandth of the start has its value but for 0.65
     low, slope = problem.priors.residual_and_jacobian(np.array([7.0, 0.0, 0.5]))
     assert low[1] == pytest.approx(-3.0 - 1.5 / math.log(10.0))
@@ -174,7 +174,7 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
     assert (rows.data, rows.stated_priors, rows.weak_priors) == (slice(0, 228), slice(228, 229), slice(229, 230))
     np.testing.assert_allclose(evaluation.residual[228:], [2.0, math.log(7.0 / 6.0) / math.log(5.0)])
     assert evaluation.cost == pytest.approx(0.5 * evaluation.residual @ evaluation.residual)
-    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
+    residual, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
     np.testing.assert_array_equal(residual, evaluation.residual[:229])
     np.testing.assert_array_equal(jacobian, evaluation.jacobian[:229])
     none = ResidualVectorLayout.from_episodes((), 2, 3)
@@ -190,7 +190,7 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
     assert problem.stated_rms_noise_of_data_residuals == pytest.approx(noise)
-    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
+    residual, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
     data = problem.residual_rows.data
     np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
     np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)
@@ -202,7 +202,7 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
 def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
     """Readings of the tip, interpolated between nodes, in the camera's frame: nothing else enters the residual."""
     problem = make(seeds=(1,))
-    x = problem.unknown_vector({"elbow.stiffness": 4.0})
+    x = problem.pack_unknowns({"elbow.stiffness": 4.0})
     evaluation = problem.evaluate(x, derivatives=False)
     assert evaluation.jacobian is None
     result = evaluation.episode_predictions[0]
@@ -287,16 +287,16 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
         return np.concatenate([*(samples.whitened_residual(y).ravel() for samples, y in pairs), offset / std])
 
     best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=std, xtol=1e-12, ftol=1e-14)
-    found = held_out_prediction_inputs(problem, x)[1][2]
+    found = held_out_prediction_arguments(problem, x)[1][2]
     np.testing.assert_allclose(found / std, best.x / std, atol=2e-3)
 
 
 def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, held):
     problem = make(held_out=held, local_parameters=("elbow.rest",), initial_state="estimated")
-    x = problem.unknown_vector({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
+    x = problem.pack_unknowns({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
     found = problem.predict_held_out(x)
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
-    offsets = [offset for *_, offset in held_out_prediction_inputs(problem, x)]
+    offsets = [offset for *_, offset in held_out_prediction_arguments(problem, x)]
     for (episode, result), offset in zip(found, offsets, strict=True):
         theta = problem.system.parameters.vector({"elbow.stiffness": 4.0, "elbow.rest": 0.1})
         expected = problem.predictor.predict_episode(episode, theta, offset, False)
@@ -308,8 +308,8 @@ def test_a_held_out_part_of_a_recording_shares_its_start_and_local_parameters(ma
     problem = make(initial_state="estimated", local_parameters=("elbow.rest",))
     part = replace(problem.episodes[1], initial_state_shared_with=1)
     split = problem.with_episodes(problem.episodes, [part])
-    x = problem.unknown_vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
-    assert held_out_prediction_inputs(split, x)[0][2].tolist() == problem.unpack_episode_unknowns(x, 1)[1].tolist()
+    x = problem.pack_unknowns({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
+    assert held_out_prediction_arguments(split, x)[0][2].tolist() == problem.unpack_episode_unknowns(x, 1)[1].tolist()
     np.testing.assert_array_equal(
         split.predict_held_out(x)[0][1].predicted_outputs[0],
         problem.evaluate(x, False).episode_predictions[1].predicted_outputs[0],
@@ -324,10 +324,10 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
         changed[first:] += 0.3
         moved = replace(episode, measurements=(replace(episode.measurements[0], value=changed),))
         other = problem.with_episodes(problem.episodes, [moved])
-        offsets = [held_out_prediction_inputs(one, x)[0][2] for one in (problem, other)]
+        offsets = [held_out_prediction_arguments(one, x)[0][2] for one in (problem, other)]
         assert np.allclose(*offsets, atol=1e-12) is same
     # a start at rest needs none
-    assert held_out_prediction_inputs(make(held_out=held), np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
+    assert held_out_prediction_arguments(make(held_out=held), np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
 
 
 def test_problems_that_free_other_parameters_share_all_else(make):

@@ -21,11 +21,11 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import input_or_servo_torques_of_rollout, simulate
+from yid_ocp.integrator.step import driven_joint_torques_of_rollout, simulate
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, ServoModelOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.problem.recorded_inputs import mean_step_inputs
+from yid_ocp.problem.recorded_inputs import step_mean_inputs
 from yid_ocp.solvers import GaussNewton
 
 VALUES = {
@@ -106,7 +106,7 @@ def test_the_torque_along_a_rollout_is_what_moves_it(urdf_folder, scale) -> None
     step = servo_step(urdf_folder, [("clock_scale", "clock", {"scale": scale})])
     made = problem_of(step, commanded(), ["shoulder.damping"])
     [result] = made.evaluate(made.initial_unknowns, False).episode_predictions
-    torque = input_or_servo_torques_of_rollout(step, made.theta, result.rollout)
+    torque = driven_joint_torques_of_rollout(step, made.theta, result.rollout)
     q = result.rollout.state[:, :2]
     rate, middle = np.diff(q, axis=0) * scale / H, (q[1:] + q[:-1]) / 2
     demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate
@@ -136,9 +136,9 @@ def test_commands_are_held_or_interpolated_and_late(urdf_folder, commands, expec
     system = servo_step(urdf_folder, commands=commands).system
     t = np.array([0.0, 0.2, 0.4])
     group = joints(PENDULUM, t, np.zeros((3, 2)), position_command=np.array([[1.0, 0.0], [3.0, 0.0], [2.0, 0.0]]))
-    found = mean_step_inputs(group, PENDULUM, TimeGrid(0.0, 0.1, 4), "run", servos=system.servos)
+    found = step_mean_inputs(group, PENDULUM, TimeGrid(0.0, 0.1, 4), "run", servos=system.servos)
     np.testing.assert_allclose(found[:, 0], expected)
-    late = mean_step_inputs(group, PENDULUM, TimeGrid(0.1, 0.1, 3), "run", np.array([0.1, 0.0]), system.servos)
+    late = step_mean_inputs(group, PENDULUM, TimeGrid(0.1, 0.1, 3), "run", np.array([0.1, 0.0]), system.servos)
     np.testing.assert_allclose(late[:, 0], expected[:3])
 
 
@@ -228,7 +228,7 @@ def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folde
     [effect] = limited.system.effects
     name = effect.amplitude_parameter_names[0]
     power = TORQUE_SATURATION_EXPONENT
-    told = effect.parameters_as_reported({name: 5.0**-power}, {name: 0.01 * power * 5.0**-power})["limit"]
+    told = effect.to_reported_parameters({name: 5.0**-power}, {name: 0.01 * power * 5.0**-power})["limit"]
     assert (told.value, told.std, told.unit) == (pytest.approx(5.0), pytest.approx(0.05), "N m")
     one = problem_of(limited, made, ["shoulder.damping"], far)
     other = problem_of(step, made, ["shoulder.damping"], {"shoulder.servo_torque_limit": 5.0})

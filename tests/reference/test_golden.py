@@ -8,7 +8,7 @@ import pytest
 
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.mechanism import merge_bodies
+from yid_ocp.model.mechanism import merge_inertias
 
 NAMES = ("single", "dual")
 TIPS = {"wT1": "w_T1", "wT2": "w_T2", "wT3": "w_T3", "left": "left_gripper", "right": "right_gripper"}
@@ -80,7 +80,7 @@ def test_model_numbers(case):
         assert joint.parent_index == node["parent"]
         np.testing.assert_allclose(number(joint.placement.homogeneous_matrix()), node["X"], rtol=0, atol=1e-10)
         np.testing.assert_array_equal(joint.axis, np.eye(3)["xyz".index(node["axis"])])
-        body = merge_bodies(joint.bodies)
+        body = merge_inertias(joint.bodies)
         if body is None:
             assert not node["mass"]
         else:

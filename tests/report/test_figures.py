@@ -131,7 +131,7 @@ def test_a_robot_wears_its_meshes_thinned(single_arm, worn):
     assert len(json.dumps(worn, separators=(",", ":"))) < 1_000_000
     assert set(worn["meshes"]) == {"", *single_arm.driven}
     assert 2000 < sum(len(faces) for _, faces in worn["meshes"].values()) / 3 < 10_001
-    whole = load_robot_meshes_by_joint("package:baxter", single_arm.numeric_mechanism())
+    whole = load_robot_meshes_by_joint("package:baxter", single_arm.mechanism_with_values())
     scale = worn["scenes"][0]["scale"]
     for name in single_arm.driven:
         mesh = whole[single_arm.mechanism.joint_index(name)]

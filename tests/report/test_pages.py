@@ -21,7 +21,7 @@ import pytest
 
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
-from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceHistory
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
@@ -257,7 +257,7 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     events = EventSet(
         (event,),
         (_Overspeed("run", "elbow", 1.5),),
-        (ForceHistory("run", "elbow", "elbow", "N m", t, pulse.filtered_force_at(t), np.eye(21), 0.1 + 0 * t, 0 * t),),
+        (ForceEstimate("run", "elbow", "elbow", "N m", t, pulse.filtered_force_at(t), np.eye(21), 0.1 + 0 * t, 0 * t),),
     )
     page = page_of(replace(found["no_gap"], events=events), tmp_path)
     assert 'id="events"' in page

@@ -22,7 +22,7 @@ from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
+from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 from yid_ocp.sensors import sensor_function_with_jacobians
 from yid_ocp.sensors.mounted import _Accelerometer, _Gyroscope
 from yid_ocp.sensors.wrist import _WristForceSensor, _WristTorqueSensor
@@ -129,7 +129,7 @@ def recorded(urdf: Path) -> Recording:
     )
     q, read = [], {site + kind: list[Array]() for site in ("lower", "w_T1") for kind in KINDS}
     for tick in range(6001):
-        controller.apply_and_return_input(tick * step)
+        controller.apply_and_return_control_input(tick * step)
         if tick % 50 == 0:
             mujoco.mj_forward(model, scene.data)
             q.append(scene.data.qpos[scene.joint_ids][:2])
@@ -203,7 +203,7 @@ def test_slopes_with_effects_are_those_of_differences(urdf: Path, recorded: Reco
         np.testing.assert_allclose(evaluation.jacobian[rows, i], numeric, atol=2e-6 * np.abs(numeric).max() + 4e-5)
     gradient = made.cost_and_gradient(x)[1]
     np.testing.assert_allclose(gradient, evaluation.jacobian.T @ evaluation.residual, rtol=1e-9)
-    with_sensors = candidate_kinds_and_locations(system, signal_kinds_for_effects([recorded]))
+    with_sensors = candidate_kinds_and_locations(system, recorded_signal_kinds([recorded]))
     places = {place for kind, place in with_sensors if kind == "sensor_bias"}
     assert places == {"wrist:lower", "imu:lower", "imu:w_T1"}
 

@@ -12,8 +12,8 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
     is_stationary_point,
+    max_abs_projected_gradient,
     predicted_cost_reduction_by_step,
-    projected_gradient_norm,
     size_limited_damped_step,
 )
 from yid_ocp.problem.evaluation import PriorResiduals
@@ -28,7 +28,9 @@ HIGH = [((1, 2), (1, -9), 1.0), ((1, 2), (1, 9), 18.0)]
 
 @pytest.mark.parametrize(("x", "gradient", "expected"), [*INSIDE, *LOW, *HIGH])
 def test_a_gradient_that_pushes_against_a_bound_does_not_count(x, gradient, expected):
-    found = projected_gradient_norm(np.array(x), np.array(gradient), np.zeros(2), np.full(2, 2.0), np.array([1.0, 2.0]))
+    found = max_abs_projected_gradient(
+        np.array(x), np.array(gradient), np.zeros(2), np.full(2, 2.0), np.array([1.0, 2.0])
+    )
     assert found == expected
 
 

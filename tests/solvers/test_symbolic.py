@@ -10,9 +10,9 @@ from small_problems import PENDULUM, STEPS, pendulum_step, taken
 
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import (
+    problem_with_exact_inputs,
     problem_with_sensor_noise_only,
     problem_with_whitening_at,
-    problem_without_input_errors,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, fit_problem
@@ -53,7 +53,7 @@ def problem_of(folder, case, seeds=(1, 2), **more):
     names = ("elbow.damping", *springs, *(n for e in step.system.effects for n in e.parameters.names))
     recordings = [taken(step, seed) for seed in seeds]
     settings = ProblemOptions(path_cutoff=math.inf, **options | more)
-    return problem_without_input_errors(EstimationProblem(step, recordings, names, settings))
+    return problem_with_exact_inputs(EstimationProblem(step, recordings, names, settings))
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -113,7 +113,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
     w, _ = rolled_out(problem, program, x)
     gradient, jacobian = values_at(program, w, program.grad_f, program.jac_g)
     own = [program.variables["theta"].index.ravel()] if problem.shared_parameters else []
-    rows = list(problem.predictor.estimated_initial_state_entries)
+    rows = list(problem.predictor.estimated_initial_state_indices)
     for episode in problem.episodes:
         if problem.local_parameters:
             own.append(program.variables[f"local[{episode.name}]"].index.ravel())
@@ -141,7 +141,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
 
 def test_the_program_and_condensing_have_one_solution(urdf_folder):
     """Of sensor noise alone, which is what condensing knows; the Hessian changes the way, not the end."""
-    problem = problem_without_input_errors(problem_of(urdf_folder, "driven, proportional", seeds=(1,)))
+    problem = problem_with_exact_inputs(problem_of(urdf_folder, "driven, proportional", seeds=(1,)))
     tight = {"tol": 1e-12, "acceptable_iter": 0, "mu_init": 1e-12, "mu_target": 1e-15}
     condensed = MultipleShooting(condensing=True, node_interval=5, cost_tolerance=1e-12, step_tolerance=1e-10)
     solvers = (condensed, MultipleShooting(ipopt_options=tight), MultipleShooting(hessian="exact", ipopt_options=tight))

@@ -48,7 +48,7 @@ Runs = Callable[..., SimulationResult]
 def grasp_gaps(system: System) -> ca.Function:
     """From a configuration to what the grasps leave open."""
     q = ca.SX.sym("q", system.n_coordinates)
-    return ca.Function("phi", [q], [system.constraint_residual(forward_kinematics(system.numeric_mechanism(), q))])
+    return ca.Function("phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism_with_values(), q))])
 
 
 @pytest.fixture(scope="module")

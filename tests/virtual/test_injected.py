@@ -16,7 +16,7 @@ from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_deriva
 from yid_ocp.model.system import MidpointStateSymbols
 from yid_ocp.virtual import injected
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error
-from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -152,7 +152,7 @@ def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
     hysteresis = InjectedEffect("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})
     braked = InjectedEffect("one_way_damping", "T3", {"size": 1.0})
     clean, pushed, light, again = (
-        run_experiment_with_effects(SYSTEM, TRUTH, effects, experiment).joints.effort
+        run_experiment_with_injected_effects(SYSTEM, TRUTH, effects, experiment).joints.effort
         for effects in ((), [hysteresis], [braked], ())
     )
     assert np.abs(pushed - clean).max() > 1e-3
@@ -169,7 +169,7 @@ def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
     assert tested == {*injected._MUJOCO_MODEL_KINDS, *injected._FORCES}
     assert set(injected._SENSOR_ERROR_KINDS) <= set(injected.INJECTABLE_EFFECT_KINDS)
     with pytest.raises(ConfigError, match="grasp_slip"):
-        run_experiment_with_effects(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])
+        run_experiment_with_injected_effects(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])
 
 
 class Bench:

@@ -26,7 +26,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
-from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, replay_mismatch_by_channel
@@ -52,7 +52,7 @@ def recorded(
     noise = ArmSensorNoise(position_std=5e-5, velocity_std=1e-3, effort_std=0.0)
     simulation = SimulationOptions(duration, time_step=2.5e-4)
     experiment = VirtualExperimentSettings(None, POSTURE, simulation, noise, camera=None, seed=seed)
-    return run_experiment_with_effects(arm(), {}, effects, experiment, friction)
+    return run_experiment_with_injected_effects(arm(), {}, effects, experiment, friction)
 
 
 def fitted(
@@ -68,7 +68,7 @@ def fitted(
     found = fit_problem(problem, GaussNewton(max_iterations=25))
     values = dict(zip(found.unknown_names, found.x, strict=True))
     stds = {name: found.std[name] for name in effect.parameters.names}
-    return {name: (entry.value, entry.std) for name, entry in effect.parameters_as_reported(values, stds).items()}
+    return {name: (entry.value, entry.std) for name, entry in effect.to_reported_parameters(values, stds).items()}
 
 
 def agrees(found: tuple[float, float], true: float, rel: float = 0.0) -> bool:
@@ -165,7 +165,7 @@ def test_what_lies_uphill_is_found_by_a_refit_from_where_its_screening_leads(kin
     start = fit_nominal_model(nominal, composed)
     [score] = screen_candidates(composed, (), start.values).candidate_scores
     found = refit_with_effects(composed, composed.candidate_effects, {**start.values, **score.predicted_values})
-    for name, reported in found.effects[0].parameters_as_reported(found.values, found.std).items():
+    for name, reported in found.effects[0].to_reported_parameters(found.values, found.std).items():
         assert reported.value == pytest.approx(values[name], rel=0.01 if kind == "effort_gain" else 0.05), name
     assert found.held_out_loss.chi2_per_sample < 0.01 * start.held_out_loss.chi2_per_sample
 
@@ -195,7 +195,7 @@ def played(system: System, *effects: InjectedEffect) -> Recording:
         camera=PointCamera(point_std=1e-6, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4)),
         **start,
     )
-    return run_experiment_with_effects(system, VALUES, effects, experiment)
+    return run_experiment_with_injected_effects(system, VALUES, effects, experiment)
 
 
 @pytest.fixture(scope="module")

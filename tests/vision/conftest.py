@@ -92,7 +92,7 @@ def tracked(system, run, recording, shape):
         )
         made.sequence.stamps[list(late)] += 0.15
         found = track_object(scene, recording, made.sequence, options)
-        were = np.array([shape.point_frame_positions(made.true_configuration_at(t)) for t in found.t])
+        were = np.array([shape.point_positions_at_configuration(made.true_configuration_at(t)) for t in found.t])
         return SimpleNamespace(made=made, track=found, errors=np.linalg.norm(found.position - were, axis=2))
 
     return make

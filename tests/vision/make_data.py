@@ -32,14 +32,14 @@ def main() -> None:
     pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
     camera = vision.VirtualCameraSetup(pose, timing=vision.VirtualCameraTiming(mean_rate=2.7), seed=5)
     made = vision.render_virtual_frames(vision.SceneDescription(system, "package:baxter"), run.t, run.q, camera)
-    tree = system.numeric_mechanism()
+    tree = system.mechanism_with_values()
     robot = ArticulatedSurfaces(tree, load_robot_meshes_by_joint("package:baxter", tree))
     region = ReachableObjectRegion(system, vision.CloudFilterOptions())
     pose, clouds = made.sequence.camera_pose, []
     true = [made.true_configuration_at(t) for t in made.capture_times]
     for i, q in enumerate(true):
         points = made.sequence.load_world_cloud(i)
-        cloud = voxel_averages(points[region.membership_test_at(q, pose[:3, 3])(points)], VOXEL)
+        cloud = voxel_averages(points[region.membership_mask_function_at(q, pose[:3, 3])(points)], VOXEL)
         cloud = cloud.select(statistical_inlier_mask(cloud))
         cloud = cloud.select(~robot.within_surface_distance_mask(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
@@ -51,7 +51,7 @@ def main() -> None:
     shape = ShapeFitter(system)
     truth = {
         "points": system.point_frames,
-        "position": [np.round(shape.point_frame_positions(q), 5).tolist() for q in true],
+        "position": [np.round(shape.point_positions_at_configuration(q), 5).tolist() for q in true],
     }
     (FOLDER / "truth.json").write_text(json.dumps(truth) + "\n")
 

@@ -21,11 +21,11 @@ from yid_ocp.vision.camera_registration import (
     CLOCK_OFFSET_INDEX,
     DEPTH_SCALE_INDEX,
     TRANSLATION_SLICE,
-    ArmSurface,
     CameraState,
+    MovingArmSurface,
     StampedCloud,
     _CalibrationEquations,
-    robust_gradient_and_hessian,
+    robust_cost_derivatives,
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
 
@@ -67,7 +67,7 @@ def robot(tmp_path_factory):
 
 
 def arm_of(robot, motion=lively):
-    return ArmSurface(robot, motion, lambda q: np.zeros((0, 3)), 0.08)
+    return MovingArmSurface(robot, motion, lambda q: np.zeros((0, 3)), 0.08)
 
 
 def clouds(robot, times, rng, motion=lively, scale=1.0, pose=POSE):
@@ -136,7 +136,7 @@ def test_slopes_of_the_state_are_derivatives():
         # the offset acts on measured depths, the factor on those with it: the same to first order in both
         assert np.allclose((ahead - behind) / 2e-6, slopes[:, :, k], atol=0.05 * np.abs(slopes[:, :, k]).max() + 1e-6)
     change = 0.05 * rng.standard_normal(CAMERA_STATE_SIZE)
-    assert np.allclose(state.with_state_increment(change).difference_from(state), change, atol=1e-12)
+    assert np.allclose(state.with_state_increment(change).state_increment_from(state), change, atol=1e-12)
     assert state.stamps_to_joint_clock(7.0) == pytest.approx(7.0 - 0.1 - 2e-3)
 
 
@@ -175,7 +175,7 @@ def test_standard_deviations_are_honest(robot):
     z = []
     for seed in range(4):
         found, true = found_of(robot, 10 + seed, turn=1.0, shift=0.01, latency=0.05, frames=3)
-        error = found.camera_state.difference_from(true) / np.sqrt(np.diag(found.state_covariance))
+        error = found.camera_state.state_increment_from(true) / np.sqrt(np.diag(found.state_covariance))
         z.append([error[CLOCK_OFFSET_INDEX], *displaced(found, true)[1].ravel()])
     size = np.sqrt(np.mean(np.square(z), axis=0))
     assert size.max() < 2.2
@@ -203,7 +203,7 @@ def test_errors_alike_in_a_frame_or_on_a_patch_count_as_one_and_others_only_once
     by_patch = own * 0.1 + 1e-2 * rng.standard_normal(patches)[np.newaxis, places[0]]
 
     def variance(errors):
-        found = robust_gradient_and_hessian(rows_of(errors, places), 10.0)
+        found = robust_cost_derivatives(rows_of(errors, places), 10.0)
         return found.score_covariance[0, 0] / found.hessian[0, 0]
 
     alone = variance(own)
@@ -217,7 +217,7 @@ def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
     """The sum over a frame is zero at the minimum: without a least value its errors would seem to be none."""
     rng = np.random.default_rng(1)
     error = np.tile(1e-2 * rng.standard_normal(50), 2) * np.repeat([1.0, -1.0], 50)
-    found = robust_gradient_and_hessian(rows_of([error], [np.arange(100)]), 10.0)
+    found = robust_cost_derivatives(rows_of([error], [np.arange(100)]), 10.0)
     assert abs(found.gradient[0]) < 1e-9 * found.hessian[0, 0]
     assert found.score_covariance[0, 0] / found.hessian[0, 0] == pytest.approx(0.41, rel=0.3)
 

@@ -101,7 +101,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
 
 
 def test_extra_meshes_hang_on_links(system):
-    tree = system.numeric_mechanism()
+    tree = system.mechanism_with_values()
     extra = [
         ExtraMesh(parent_frame="left_gripper", box_size=(0.1, 0.1, 0.1)),
         ExtraMesh(sphere_radius=0.2, xyz=(1, 2, 3)),

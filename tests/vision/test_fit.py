@@ -50,7 +50,7 @@ def whole(alone):
 
 def off(fit, shape, q):
     """How far the points are from where they should be [m]."""
-    return np.linalg.norm(fit.point_positions - shape.point_frame_positions(q), axis=1).max()
+    return np.linalg.norm(fit.point_positions - shape.point_positions_at_configuration(q), axis=1).max()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -87,7 +87,7 @@ def test_surface_and_centre_line_are_told_apart(alone, whole):
     sight = seen(whole, q)
     # with tubes of no thickness the fit would lie on the surface, on the camera's side
     thin = ShapeFitter(alone, values={"T1.radius": 1e-4, "T2.radius": 1e-4, "T3.radius": 1e-4})
-    flat = thin.fit_frame(sight, q).point_positions - whole.point_frame_positions(q)
+    flat = thin.fit_frame(sight, q).point_positions - whole.point_positions_at_configuration(q)
     assert 0.012 < flat[0, 0] < 0.04
     assert off(whole.fit_frame(sight, q), whole, q) < 0.003
 
@@ -138,7 +138,7 @@ def test_the_gripper_tells_where_the_end_is(system, shape, run):
     q = run.q[150]
     fit = shape.fit_frame(without(seen(shape, q), (5, 6, 7)), q)
     held = system.point_frames.index("w_T2")
-    assert np.linalg.norm(fit.point_positions[held] - shape.point_frame_positions(q)[held]) < 0.006
+    assert np.linalg.norm(fit.point_positions[held] - shape.point_positions_at_configuration(q)[held]) < 0.006
     assert fit.is_point_seen[held]
 
 

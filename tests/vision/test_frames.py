@@ -354,22 +354,22 @@ def patch(centre, size, step=0.004):
     ],
 )
 def test_a_place_without_points_is_hidden_or_empty(points, hidden):
-    assert OcclusionMap(points, HOME).hidden_mask(PLACE, RADIUS, 0.01).tolist() == [hidden]
+    assert OcclusionMap(points, HOME).occluded_position_mask(PLACE, RADIUS, 0.01).tolist() == [hidden]
     # what is expected to be asked about saves work and changes nothing
     for expected in (PLACE, PLACE + 0.3, np.empty((0, 3))):
         view = OcclusionMap(points, HOME, expected_points=expected)
-        assert view.hidden_mask(PLACE, RADIUS, 0.01).tolist() == [hidden]
+        assert view.occluded_position_mask(PLACE, RADIUS, 0.01).tolist() == [hidden]
 
 
 def test_nothing_is_seen_beside_the_picture_which_ends_where_points_stand_along_its_side():
     camera = CameraIntrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
     behind = patch([0.0, 0.0, 4.0], 1.0)
     places = np.array([[0.0, 0.0, 2.0], [1.2, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    found = OcclusionMap(behind, HOME, camera).hidden_mask(places, np.full(3, 0.02), 0.01)
+    found = OcclusionMap(behind, HOME, camera).occluded_position_mask(places, np.full(3, 0.02), 0.01)
     assert found.tolist() == [False, True, True]
     wall = patch([0.0, 0.0, 4.0], 2.0, 0.02)  # fills the picture, which is 0.5 wide in x/z
     places, radius = np.array([[0.2, 0.0, 2.0], [0.6, 0.0, 2.0]]), np.full(2, 0.02)
-    assert OcclusionMap(wall, HOME).hidden_mask(places, radius, 0.01).tolist() == [False, True]
+    assert OcclusionMap(wall, HOME).occluded_position_mask(places, radius, 0.01).tolist() == [False, True]
     # a cloud of the object alone has no such side: what is missing beside it is missing
     rod = np.column_stack([np.linspace(-0.2, 0.2, 200), np.zeros(200), np.full(200, 2.0)])
-    assert OcclusionMap(rod, HOME).hidden_mask(places, radius, 0.01).tolist() == [False, False]
+    assert OcclusionMap(rod, HOME).occluded_position_mask(places, radius, 0.01).tolist() == [False, False]

@@ -40,7 +40,7 @@ def test_outliers_go_and_the_surface_stays(share):
 
 
 def test_the_robot_goes_with_its_padding(system, run):
-    tree = system.numeric_mechanism()
+    tree = system.mechanism_with_values()
     meshes = load_robot_meshes_by_joint("package:baxter", tree)
     robot = ArticulatedSurfaces(tree, meshes)
     wrist = system.mechanism.joint_index("left_w1")
@@ -54,7 +54,7 @@ def test_the_robot_goes_with_its_padding(system, run):
 
 
 def test_where_the_object_can_be(system, run):
-    region = ReachableObjectRegion(system, CloudFilterOptions()).membership_test_at(run.q[0], CAMERA)
+    region = ReachableObjectRegion(system, CloudFilterOptions()).membership_mask_function_at(run.q[0], CAMERA)
     foot = np.array([0.85, 0.0, -0.93])
     # on the floor, behind the robot, beyond reach
     outside = np.array([[1.15, 0.0, -0.91], [-0.2, 0.0, 0.3], [0.85, 1.2, 0.47]])
@@ -63,7 +63,7 @@ def test_where_the_object_can_be(system, run):
     assert region((foot + np.array([0.0, 0.0, 0.1]))[None]).all()
     corners = {"box_lower": (0.5, -2.0, -2.0), "box_upper": (2.0, 2.0, 0.0)}
     box = CloudFilterOptions(**corners, floor_height=-0.9, max_depth_behind_robot_base=None)
-    region = ReachableObjectRegion(system, box).membership_test_at(run.q[0], CAMERA)
+    region = ReachableObjectRegion(system, box).membership_mask_function_at(run.q[0], CAMERA)
     points = np.array([[0.85, 0.0, -0.1], [0.4, 0.0, -0.1], [0.85, 0.0, 0.1], [0.85, 0.0, -0.91]])
     assert region(points).tolist() == [True, False, False, False]
 

@@ -94,7 +94,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert np.array_equal(first, one.sequence.load_cloud(1))
     assert not np.array_equal(one.capture_times[:3], two.capture_times[:3])
     # the object's surface is where the points are
-    tubes = ArticulatedSurfaces(system.numeric_mechanism(), _tube_meshes_by_joint(system))
+    tubes = ArticulatedSurfaces(system.mechanism_with_values(), _tube_meshes_by_joint(system))
     away, _, _ = tubes.distance_to_moving_surface(
         one.sequence.load_world_cloud(1), one.true_configuration_at(one.capture_times[1]), 0.2
     )
@@ -164,7 +164,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
 
 
 def test_baxters_meshes_are_found_and_move(system):
-    tree = system.numeric_mechanism()
+    tree = system.mechanism_with_values()
     meshes = load_robot_meshes_by_joint("package:baxter", tree)
     assert set(meshes) == {-1, *system.actuated_coordinate_indices}
     assert 0.1 < meshes[system.mechanism.joint_index("left_w2")].vertices[:, 2].max() < 0.5

@@ -72,7 +72,7 @@ def test_the_camera_and_its_clock_are_found(clean):
     true = CameraState(
         made.camera_pose, clock_offset=LATENCY, clock_reference_stamp=camera.camera_state.clock_reference_stamp
     )
-    assert (np.abs(camera.camera_state.difference_from(true)) < 4 * std).all()
+    assert (np.abs(camera.camera_state.state_increment_from(true)) < 4 * std).all()
     assert std[CLOCK_OFFSET_INDEX] < 0.01
     assert "clock offset" in camera.message
     assert camera.arm_visibility.there > 0.9

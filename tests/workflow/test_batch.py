@@ -14,9 +14,9 @@ from yid_ocp.diagnosis.blind_scores import BlindCaseScore, blind_case_score_summ
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import InlineExecutor
-from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
+from yid_ocp.report.diagnosis_summaries import blind_validation_markdown_lines
 from yid_ocp.report.html import write_report
-from yid_ocp.report.png_figures import draw_blind_results
+from yid_ocp.report.png_figures import draw_blind_validation_figures
 from yid_ocp.report.sections import ReportData
 from yid_ocp.workflow import blind
 from yid_ocp.workflow.batch import batch_runs_from_configs, run_batch
@@ -229,7 +229,7 @@ MARKS = [
 @pytest.mark.parametrize("marks", [MARKS, MARKS[8:], []], ids=["all", "clean", "none"])
 def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     result = to_json_types(blind_case_score_summary(marks)) | {"seed": 1, "purpose": "report", "versions": {}}
-    files = draw_blind_results(tmp_path, result)
+    files = draw_blind_validation_figures(tmp_path, result)
     assert [file.name for file in files] == ["detection.png", "confusion.png", "calibration.png"]
     for file in files:
         with Image.open(file) as picture:
@@ -241,11 +241,11 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     assert ("of 5 clean recordings, 0 gave a false alarm" in page) == bool(marks)
     assert page.count("case_000") >= len(marks)
     with pytest.raises(OutputError, match="cannot be written"):
-        draw_blind_results(tmp_path / "nowhere", result)
+        draw_blind_validation_figures(tmp_path / "nowhere", result)
 
 
 def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
-    lines = blind_tables_markdown(to_json_types(blind_case_score_summary(MARKS)))
+    lines = blind_validation_markdown_lines(to_json_types(blind_case_score_summary(MARKS)))
     assert "| false alarms on clean data | 0 % (0 of 5, 0 % to 52 %) |" in lines
     assert f"| 3 | 8 | {' | '.join([*2 * ['75 % (6 of 8, 35 % to 97 %)'], '50 % (4 of 8, 16 % to 84 %)'])} |" in lines
     assert "| two | 5 | 0 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines

@@ -18,8 +18,8 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton
-from yid_ocp.workflow.build import arms_are_estimated_states, build_system, load_system, settings_by_parameter_name
-from yid_ocp.workflow.build_problem import build_problem, load_problem, problem_options
+from yid_ocp.workflow.build import are_arm_states_estimated, build_system, load_system, settings_by_parameter_name
+from yid_ocp.workflow.build_problem import build_problem, load_problem, make_problem_options
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 
@@ -219,14 +219,14 @@ def test_a_problem_has_the_options_of_its_section(written):
         "parameters: {T1.bend: {prior_std: 2, per_recording: true}}\n"
     )
     run = load_config(written(text))
-    options = problem_options(run, build_system(run))
+    options = make_problem_options(run, build_system(run))
     assert (options.weighting, options.huber_threshold, options.duration) == ("paper", 3.0, 2.0)
     assert (options.initial_state_fit_parameters, options.local_parameters) == (("T1.mass",), ("T1.bend",))
     assert options.prior_stds == {"T1.bend": 2.0}
     assert options.sensors["points"].std == 0.1
     wrong = load_config(written("model: {object: {kind: foam_y}}\nproblem: {initial_state_fit_parameters: [T1.mas]}\n"))
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
-        problem_options(wrong, build_system(wrong))
+        make_problem_options(wrong, build_system(wrong))
     assert "line 2: problem.initial_state_fit_parameters" in caught.value.where
 
 
@@ -243,14 +243,14 @@ def test_a_problem_has_the_options_of_its_section(written):
 )
 def test_prescribed_arms_that_hold_an_object_are_states(repository, file, overrides, expected):
     run = load_config(repository / "configs" / f"{file}.yaml", overrides)
-    assert arms_are_estimated_states(run) is expected
+    assert are_arm_states_estimated(run) is expected
     assert bool(build_system(run).driven) == (expected or run.model.arms.mode == "driven")
 
 
 def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repository):
     file = repository / "configs" / "dual_arm_vision.yaml"
     run = load_config(file, ["model.arms.mode=prescribed", "recordings.held_out=[]", "problem.use_compiler=false"])
-    options = problem_options(run, build_system(run), read_recordings_of_role(run))
+    options = make_problem_options(run, build_system(run), read_recordings_of_role(run))
     used = {group: said.use for group, said in options.sensors.items()}
     assert used == {"joints.position": True, "points_arm": False}
 

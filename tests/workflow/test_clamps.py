@@ -10,7 +10,7 @@ from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import problem_with_earlier_runs
+from yid_ocp.diagnosis.baseline import problem_with_priors_and_baseline
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.solvers import GaussNewton, MultipleShooting, fit_problem
 from yid_ocp.workflow import run_history
@@ -106,7 +106,7 @@ def folder_of(path, values=(0.02, 5e-5), std=(2e-4, 1e-6), correlation=0.5, **mo
 
 def test_a_baseline_is_a_joint_prior_about_its_values(run, tmp_path):
     known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
-    problem, _ = problem_with_earlier_runs(build_problem(run), known)
+    problem, _ = problem_with_priors_and_baseline(build_problem(run), known)
     at = [problem.unknown_names.index(name) for name in ("beam.bend", "beam.damping")]
     assert problem.initial_unknowns[at] == pytest.approx([0.018, 4e-5])
     moved = problem.initial_unknowns.copy()
@@ -121,9 +121,9 @@ def test_the_baselines_effects_stay_in_the_model(run):
     values = ("kelvin_voigt@beam.tau",), np.array([0.01]), np.array([[1e-6]])
     known = RunEstimates("old", *values, effects={"kelvin_voigt@beam": {"tau": 0.01}})
     with pytest.raises(ConfigError, match="the effect kelvin_voigt@beam"):
-        problem_with_earlier_runs(build_problem(run), known)
+        problem_with_priors_and_baseline(build_problem(run), known)
     run = run_history.settings_with_baseline_effects(run, (known,))
-    problem, _ = problem_with_earlier_runs(build_problem(run), known)
+    problem, _ = problem_with_priors_and_baseline(build_problem(run), known)
     assert "kelvin_voigt@beam.tau" in problem.free
     assert problem.unknowns.named_values(problem.initial_unknowns)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
 
@@ -186,7 +186,7 @@ def test_a_program_with_node_states_has_the_same_joint_prior(tmp_path):
     """`python -m pytest -m slow tests/workflow/test_clamps.py`: some seconds in IPOPT."""
     run = settings(tmp_path, None, ("problem.initial_state=equilibrium",))
     known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
-    problem, _ = problem_with_earlier_runs(build_problem(run), known)
+    problem, _ = problem_with_priors_and_baseline(build_problem(run), known)
     rolled, program = (fit_problem(problem, method) for method in (GaussNewton(), MultipleShooting()))
     assert program.cost == pytest.approx(rolled.cost, rel=1e-6)
     assert program.x == pytest.approx(rolled.x, rel=1e-3)

@@ -190,8 +190,8 @@ def test_no_command_is_suggested_that_would_fail(odd, printed):
 
 def test_every_flag_is_a_key_of_the_section():
     from yid_ocp.config.settings import ImportSettings
-    from yid_ocp.options import options_by_key
+    from yid_ocp.options import class_options_by_key
 
     given = vars(build_argument_parser().parse_args(["import", "x"]))
     others = {"command", "run", "files", "out", "preview", "config", "quiet", "verbose", "json"}
-    assert set(given) - others == set(options_by_key(ImportSettings))
+    assert set(given) - others == set(class_options_by_key(ImportSettings))

@@ -186,13 +186,13 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
     problem = load_problem("cable.yaml", ["problem.use_compiler=false"])
     where = {f"{name}.{axis}": 0.0 for name in places for axis in "xyz"}
     assert set(problem.free) == {*UR5.truth, *where}
-    at_truth = problem.evaluate(problem.unknown_vector(UR5.truth | where), derivatives=False)
+    at_truth = problem.evaluate(problem.pack_unknowns(UR5.truth | where), derivatives=False)
     count = sum(len(group.t) * 3 * len(group.names) for group in recording.points)
     # the noise that the file states is what the data show, and the model that made them explains them
     assert 0.1 < 2 * at_truth.cost / count < 2
     for factor in (0.5, 2.0):
         other = UR5.truth | where | {"cable.bend": factor * UR5.truth["cable.bend"]}
-        assert problem.evaluate(problem.unknown_vector(other), derivatives=False).cost > 3 * at_truth.cost
+        assert problem.evaluate(problem.pack_unknowns(other), derivatives=False).cost > 3 * at_truth.cost
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
-from yid_ocp.inference.whitening import problem_with_whitening_at, problem_without_input_errors
+from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_whitening_at
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
@@ -180,7 +180,7 @@ def test_check_lists_noise_that_drives_the_motion_and_whether_anybody_stated_it(
     assert ("(estimated)" in words) is estimated
     assert words.endswith("; 0.0001 rad")
     assert ", offset 0.2 N m" in words
-    calm = problem_without_input_errors(problem)
+    calm = problem_with_exact_inputs(problem)
     assert _input_noise(calm, calm.episodes[0]) == {}
 
 

@@ -12,7 +12,7 @@ from yid_ocp.data.channel_checks import Issue
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import fit_problem
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import _is_modelled, all_issues_of_one_recording, build_problem
+from yid_ocp.workflow.build_problem import _is_modelled, build_problem, data_quality_issues_of_recording
 
 
 @pytest.fixture
@@ -149,11 +149,11 @@ def test_what_the_model_has_as_an_effect_is_no_doubt(repository, clean, tmp_path
     settings = [f"recordings.estimate=[{tmp_path / 'moved.h5'}]", "recordings.held_out=[]"]
     file = repository / "configs" / "single_arm_no_vision.yaml"
     run = load_config(file, settings)
-    (doubt,) = all_issues_of_one_recording(run, build_system(run), moved)
+    (doubt,) = data_quality_issues_of_recording(run, build_system(run), moved)
     assert (doubt.cause, doubt.channel) == ("encoder_offset", "position.left_e1")
     assert doubt.setting == "model.effects: [{kind: encoder_offset, location: left_e1, values: {offset: 0.05}}]"
     answered = load_config(file, [*settings, doubt.setting.replace(": ", "=", 1)])
-    assert all_issues_of_one_recording(answered, build_system(answered), moved) == []
+    assert data_quality_issues_of_recording(answered, build_system(answered), moved) == []
 
 
 @pytest.mark.parametrize("effect", ["effort_delay, location: left", "effort_lag, location: left_e1"])

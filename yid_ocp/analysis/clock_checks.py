@@ -177,7 +177,7 @@ def timestamp_correction_advice(late: float, drift: float, middle: float) -> str
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
-def clock_offset_drift_and_rms_distance(
+def point_clock_offset_drift_and_rms_error(
     path: PositionsAtTimesFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float, float]:
     """Find the clock offset [s] and drift that bring points nearest to a known path, and the remaining rms error [m].
@@ -213,7 +213,7 @@ def clock_offset_drift_and_rms_distance(
     return float(fine.x[0]), float(fine.x[1]) / span, math.sqrt(fine.fun)
 
 
-def problem_with_fitted_point_clocks(problem: EstimationProblem) -> tuple[EstimationProblem, list[Issue]]:
+def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[EstimationProblem, list[Issue]]:
     """Return the problem with corrected times of points whose clock is uncertain, and an issue for each correction.
 
     A group is corrected if its `clock_offset_std` exceeds half a sample period: the residual is not linear in so large

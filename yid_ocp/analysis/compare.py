@@ -21,7 +21,7 @@ from yid_ocp.inference.uncertainty import (
     mark_free_estimates_not_trusted,
     value_and_uncertainty_text,
 )
-from yid_ocp.inference.whitening import problem_without_input_errors
+from yid_ocp.inference.whitening import problem_with_exact_inputs
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.problem.options import ExcessResidualCriteria
@@ -83,7 +83,7 @@ def compare_methods(
     `truth` holds known true values by parameter. `callback` receives the method's name and every `Iterate`. `limits`
     states when a residual exceeds noise. Each method gets an equal part of the remaining `total_time_budget` [s].
     """
-    runs, whole, problem = [], problem, problem_without_input_errors(problem)
+    runs, whole, problem = [], problem, problem_with_exact_inputs(problem)
     deadline = time.perf_counter() + total_time_budget
 
     def listener(name: str, share: float = math.inf) -> Callable[[Iterate], None] | None:

@@ -15,7 +15,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
-from yid_ocp.inference.uncertainty import EstimateShiftByLinksAndTimeStep, ParameterEstimate, verdict_by_relative_std
+from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation, ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
@@ -167,7 +167,7 @@ def problem_corrected_for_few_links(
     if problem.has_process_noise or not (problem.options.divided_links_model and problem.system.segment_layouts):
         return None
     guesses, before = at_x.equilibrium_guesses, at_x.residual
-    own = problem.unknown_vector(fitted.unknowns.named_values(x))
+    own = problem.pack_unknowns(fitted.unknowns.named_values(x))
     try:
         refined, coarse = _refined_problem(problem, "links"), problem.evaluate(own, False, guesses)
         point, finer = refined._unknowns(problem.unknown_names, own), refined.problem
@@ -268,7 +268,7 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
     return fine.with_episodes(episodes, (), filters)
 
 
-def estimate_shifts_by_discretisation(
+def parameter_shifts_at_finer_discretisation(
     problem: EstimationProblem,
     x: Array,
     at_x: Evaluation,
@@ -276,7 +276,7 @@ def estimate_shifts_by_discretisation(
     progress: Progress = NULL_PROGRESS,
     *,
     model_difference_only: bool = False,
-) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
+) -> tuple[dict[str, EstimateShiftByDiscretisation], list[str]]:
     """Compute how much estimates change if every link is divided in two, and if the time step is halved.
 
     `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. If `x`
@@ -308,7 +308,7 @@ def estimate_shifts_by_discretisation(
                 notes.append(f"{said}: {_REFINED_SETTINGS[key]}")
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
-    return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
+    return {name: EstimateShiftByDiscretisation(links.get(name), steps.get(name)) for name in names}, notes
 
 
 def _refined_problem(
@@ -331,9 +331,9 @@ def _refined_problem(
     return _FinerDiscretisationProblem(made, factors, _fine_joints_by_coarse_joint(problem.system, step.system))
 
 
-def estimates_with_discretisation_error(
+def estimates_widened_by_discretisation_error(
     estimates: Mapping[str, ParameterEstimate],
-    found: Mapping[str, EstimateShiftByLinksAndTimeStep],
+    found: Mapping[str, EstimateShiftByDiscretisation],
     sizes: Mapping[str, float],
 ) -> dict[str, ParameterEstimate]:
     """Return estimates whose standard deviations, intervals and verdicts include the discretisation error.

@@ -25,11 +25,11 @@ from yid_ocp.inference.uncertainty import (
     typical_parameter_magnitudes,
 )
 from yid_ocp.model.objects.base import CableTopology
-from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER
+from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
-from yid_ocp.problem.estimation_problem import held_out_prediction_inputs
+from yid_ocp.problem.estimation_problem import held_out_prediction_arguments
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_and_count_by_channel
@@ -69,7 +69,7 @@ def solve(
         names, known = problem.unknown_names, problem.system.parameters
         if len(initial_unknowns) != len(names):
             what, allowed = f"{len(initial_unknowns)} values for {len(names)} unknowns", abbreviated_names_text(names)
-            hint = "use problem.unknown_vector({NAME: VALUE, ...})"
+            hint = "use problem.pack_unknowns({NAME: VALUE, ...})"
             raise ConfigError(what, where="initial_unknowns", allowed=f"values of {allowed}", hint=hint)
         for name, value, lower, upper in zip(names, initial_unknowns, *problem.bounds, strict=True):
             shared = name.partition("[")[0]
@@ -81,7 +81,7 @@ def solve(
     text = f"solving for {len(problem.initial_unknowns)} unknowns by {solver.name}"
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.fit_problem(problem, solver, initial_unknowns, callback, limits)
-    safe = choose_cable_memory_fit(problem, solver, found, limits)
+    safe = choose_fit_with_or_without_shape_memory(problem, solver, found, limits)
     solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
     checks = replace(solution.checks or EstimateChecksBeyondFit(), cable_memory_message=safe.message)
     return replace(solution, checks=checks)
@@ -131,9 +131,9 @@ def _with_discretisation_errors(
         return solution, EstimateChecksBeyondFit()
     kinds = problem.options.checked_discretisations
     fit = solution.x, solution.evaluation
-    shifts, notes = discretisation.estimate_shifts_by_discretisation(problem, *fit, kinds, progress)
+    shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(problem, *fit, kinds, progress)
     sizes = typical_parameter_magnitudes(problem, solution.x)
-    inflated = discretisation.estimates_with_discretisation_error(solution.parameters, shifts, sizes)
+    inflated = discretisation.estimates_widened_by_discretisation_error(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}
     uncounted = tuple(words for kind, words in _UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
@@ -189,7 +189,7 @@ _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 
 @dataclass(frozen=True)
-class CableMemoryChoice:
+class FitWithOrWithoutShapeMemory:
     """The chosen fit, with or without shape memory of the cable. `message` is the reason, empty if none is needed."""
 
     problem: EstimationProblem
@@ -197,12 +197,12 @@ class CableMemoryChoice:
     message: str = ""
 
 
-def choose_cable_memory_fit(
+def choose_fit_with_or_without_shape_memory(
     problem: EstimationProblem,
     solver: Solver,
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-) -> CableMemoryChoice:
+) -> FitWithOrWithoutShapeMemory:
     """Decide whether to keep the cable's shape memory in the fit, if the cable already moves when a recording starts.
 
     What loaded such a cable before is unknown, so its motion can be mistaken for memory. Leave-one-out prediction
@@ -213,27 +213,27 @@ def choose_cable_memory_fit(
     speeds = [0.0 if s is None else s.fitted_parameters.get(INITIAL_RMS_SPEED_PARAMETER, 0.0) for s in starts]
     moving = [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]
     if not _memory_parameters(problem) or not moving or solution.evaluation is None:
-        return CableMemoryChoice(problem, solution)
-    without = problem_without_cable_memory(problem)
+        return FitWithOrWithoutShapeMemory(problem, solution)
+    without = problem_without_shape_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
-    other = solvers.fit_problem(without, solver, without.unknown_vector(known).tolist(), limits=limits)
+    other = solvers.fit_problem(without, solver, without.pack_unknowns(known).tolist(), limits=limits)
     if other.evaluation is None:
-        return CableMemoryChoice(problem, solution)
+        return FitWithOrWithoutShapeMemory(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
         words = "cable memory is not kept: fewer than two recordings start in motion, too few to test it"
-        return CableMemoryChoice(without, other, words)
+        return FitWithOrWithoutShapeMemory(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
     told = "recordings that start in motion, each predicted from the others, have the rms error"
     errors = f"{told} {kept:.3g} with memory and {dropped:.3g} without (in standard deviations of the noise)"
     if kept < dropped:
-        return CableMemoryChoice(problem, solution, f"cable memory is kept: {errors}")
-    return CableMemoryChoice(without, other, f"cable memory is not kept: {errors}")
+        return FitWithOrWithoutShapeMemory(problem, solution, f"cable memory is kept: {errors}")
+    return FitWithOrWithoutShapeMemory(without, other, f"cable memory is not kept: {errors}")
 
 
-def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
+def problem_without_shape_memory(problem: EstimationProblem) -> EstimationProblem:
     """Return the problem with the shape memory of all cable segments (`SEGMENT.memory`) fixed at zero."""
     memory = _memory_parameters(problem)
-    free = tuple(name for name in problem.free if name not in (*memory, INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER))
+    free = tuple(name for name in problem.free if name not in (*memory, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME))
     return problem.with_free_parameters_without_recompiling(free).with_parameter_values(dict.fromkeys(memory, 0.0))
 
 
@@ -312,7 +312,7 @@ def _predict_held_out_with_expected_errors(
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
     pairs: list[PredictedEpisodeOrFailure] = []
     expected: dict[str, dict[str, float]] = {}
-    for episode, theta, offset in held_out_prediction_inputs(problem, x):
+    for episode, theta, offset in held_out_prediction_arguments(problem, x):
         outcome = predict(episode, theta, offset, False)
         pairs.append((episode, outcome))
         if isinstance(outcome, str):

@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, free_starts_and_grasps, unknowns_of_other_problem
-from yid_ocp.analysis.torque_error_propagation import sensitivities_and_information
+from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -27,7 +27,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.sensors import measuring_camera_pose
+from yid_ocp.sensors import camera_pose_of_point_group
 from yid_ocp.sensors.base import missing_noise_level_error
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -72,7 +72,7 @@ class UnchangedExperiment:
     def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Return the points that a camera sees, with times [s] and median noise [m]. Without any: None and defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
-        return self._sampling(episode, lambda g: measuring_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
+        return self._sampling(episode, lambda g: camera_pose_of_point_group(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_group_with_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Return the points that arms measure, with times [s] and median noise [m]. Without any: None and defaults."""
@@ -173,7 +173,7 @@ class VariantPositionSensitivities:
     """The derivatives of the positions of all measurable points in one variant of an experiment.
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
-    with respect to the nx unknowns and to q unknowns for torque and encoder errors (`sensitivities_and_information`).
+    with respect to the nx unknowns and q unknowns of torque and encoder errors (`point_sensitivities_and_information`).
     """
 
     problem: EstimationProblem  # with nuisance unknowns; every measurable frame is observed at every node
@@ -204,7 +204,7 @@ class VariantPositionSensitivities:
         key = (episode, view.point_group, view.frame, view.times.tobytes(), view.std.tobytes())
         if key not in self._known:
             inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)
-            node, fraction = grid.node_and_fraction(grid.start_time + view.times[inside])
+            node, fraction = grid.preceding_node_and_fraction(grid.start_time + view.times[inside])
             slopes = self.position_sensitivities[episode, view.point_group, view.frame]
             after = slopes[np.minimum(node + 1, grid.steps)]
             rows = slopes[node] + fraction[:, None, None] * (after - slopes[node])
@@ -276,7 +276,7 @@ class ExperimentVariantSensitivityBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = sensitivities_and_information(problem, evaluation, x, i, finest, encoders)
+            points, by_joints[i] = point_sensitivities_and_information(problem, evaluation, x, i, finest, encoders)
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
@@ -458,7 +458,7 @@ def _travel(system: System, values: Mapping[str, float], episode: Episode) -> fl
 
 def _frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
     symbol = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.numeric_mechanism(values), symbol)
+    kinematics = forward_kinematics(system.mechanism_with_values(values), symbol)
     at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
     return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
 

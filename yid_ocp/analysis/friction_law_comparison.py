@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.effects.law import torque_law_argument_along_rollout
+from yid_ocp.effects.law import torque_law_quantity_at_midpoints
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import whitened_prediction_residual
+from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
@@ -69,7 +69,7 @@ def cross_validate_over_motion_kinds(
         inside, outside = ([pair for pair in pairs if (pair[0].name in own) == out] for out in (False, True))
         (episodes, filters), (left, left_filters) = zip(*inside, strict=True), zip(*outside, strict=True)
         fold = problem.with_episodes(episodes, left, filters, left_filters)
-        start = fold.unknown_vector({name: known[name] for name in fold.unknown_names})
+        start = fold.pack_unknowns({name: known[name] for name in fold.unknown_names})
         found = GaussNewton(max_iterations=_MAX_FOLD_ITERATIONS).minimize_cost(fold, start, None)
         for episode, outcome in fold.predict_held_out(found.x):
             if isinstance(outcome, str):
@@ -79,7 +79,7 @@ def cross_validate_over_motion_kinds(
             own_episode = replace(episode, measurements=tuple(episode.measurements[i] for i in kept))
             outcome = replace(outcome, predicted_outputs=tuple(outcome.predicted_outputs[i] for i in kept))
             if is_whitened:
-                rows = whitened_prediction_residual(own_episode, None, outcome, np.inf).residual
+                rows = whitened_residual_and_jacobian(own_episode, None, outcome, np.inf).residual
             else:
                 rows = np.vstack([p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)])
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
@@ -112,7 +112,7 @@ def prediction_error_difference_and_std_error(
     return mean_and_std_error_over_motion_kinds(beyond, kinds)
 
 
-def simplest_fit_within_std_error(
+def simplest_fit_within_one_std_error(
     fits: Sequence[CrossValidatedFrictionLawFit], kinds: Mapping[str, Sequence[str]]
 ) -> CrossValidatedFrictionLawFit:
     """Choose the simplest friction law by the one-standard-error rule of cross-validation.
@@ -178,7 +178,7 @@ def measured_and_predicted_friction_torques(
         nodes["time_step"] = np.array(step.time_step)
         for name, found in parts.items():
             at = system.mechanism.joint_index(name)
-            load = torque_law_argument_along_rollout(system, name, "load", theta, nodes)[:, 0]
+            load = torque_law_quantity_at_midpoints(system, name, "load", theta, nodes)[:, 0]
             mean_load = (load[:-1] + load[1:]) / 2
             found.append(np.stack([speed[:, at], mean_load, -lacking[:, at], (given - lacking)[:, at]]))
     clouds = []

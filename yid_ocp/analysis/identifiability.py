@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.profile import (
     ParameterProfileLikelihood,
+    apply_function_per_parameter_at_optimum,
     compute_profile_likelihood_interval,
-    evaluate_for_each_parameter_at_optimum,
     mark_near_zero_estimate_unidentifiable,
 )
 from yid_ocp.arrays import Array, IntArray
@@ -22,7 +22,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress, ReprMixin, ReprTexts, count
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, failed_rollout_error, unknown_name_error_arguments
 from yid_ocp.inference import uncertainty
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.model.system import System
@@ -197,7 +197,7 @@ def _profiles(
         return found, said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    pairs = evaluate_for_each_parameter_at_optimum(one, problem, view.x, wanted, progress)
+    pairs = apply_function_per_parameter_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
 
@@ -281,7 +281,7 @@ class _Sensitivities:
     def of(
         problem: EstimationProblem, x: Array, evaluation: Evaluation, names: tuple[str, ...], inflation: float
     ) -> _Sensitivities:
-        jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)[1].copy()
+        jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)[1].copy()
         chosen = np.array([problem.unknown_names.index(name) for name in names], int)
         others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
         # prior knowledge of the parameters is not information of a sensor

@@ -60,7 +60,7 @@ class RecordedJointsModel:
         unknown = tuple(name for effect in loads for name in effect.parameters.names if name in free)
         return RecordedJointsModel(system, names, unknown) if names else None
 
-    def has_all_angles_recorded(self, recording: Recording) -> bool:
+    def recording_has_all_joint_angles(self, recording: Recording) -> bool:
         """Check whether a recording contains the angles of all joints. Clamps that follow measured points have none."""
         return all(name in recording.joint_names for name in self.joint_names)
 

@@ -150,13 +150,13 @@ def _changed_times(
 ) -> Iterator[_Change]:
     """Yield corrections of the clock: an offset relative to the joints or, if none explains the points, a drift."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
-    late, _, error = clock_checks.clock_offset_drift_and_rms_distance(path, knots, t, seen)
+    late, _, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words, advice = f"with times {late:+.3g} s off the joints' clock", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
         return
-    late, drift, error = clock_checks.clock_offset_drift_and_rms_distance(path, knots, t, seen, drifts=True)
+    late, drift, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words = f"with times {late:+.3g} s off the joints' clock, and {1e3 * drift:+.3g} parts per thousand fast,"
         yield _Change("clock_drift", words, clock_checks.timestamp_correction_advice(late, drift, middle), error)

@@ -15,7 +15,7 @@ from yid_ocp.display import NULL_PROGRESS, PartsDoneCounter, Progress
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
-    residual_and_jacobian_without_weak_priors,
+    residual_and_jacobian_with_stated_priors,
 )
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
@@ -114,11 +114,11 @@ def solution_with_profile_intervals(
 
     # each parameter takes about one and a half times as long as the solution
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood", 7.5 * len(asked), 5.2)
-    found = evaluate_for_each_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
+    found = apply_function_per_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def evaluate_for_each_parameter_at_optimum(
+def apply_function_per_parameter_at_optimum(
     judged: Callable[[str, Array, Evaluation], _Judgement],
     problem: EstimationProblem,
     x: Array,
@@ -192,7 +192,7 @@ class _Walk:
         self.anchored = self.others[self.positive[self.others]]
         self.centre = np.where(self.positive, np.log(np.where(self.positive, x, 1.0)), x)
         self.scale = max(1.0, uncertainty.unknowns_covariance_and_reduced_chi2(problem, best)[1])
-        self.first = uncertainty.cost_without_weak_priors(problem, best)
+        self.first = uncertainty.cost_with_stated_priors(problem, best)
         self.base = 0.0
         self.notes: list[str] = []
         self.points = [_Point(float(x[index]), self.centre, 0.0, *self._rows(best, self.centre))]
@@ -322,12 +322,12 @@ class _Walk:
         evaluation = self.problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             return None
-        chi2 = 2.0 * (uncertainty.cost_without_weak_priors(self.problem, evaluation) - self.first) / self.scale
+        chi2 = 2.0 * (uncertainty.cost_with_stated_priors(self.problem, evaluation) - self.first) / self.scale
         return _Point(float(x[self.index]), s.copy(), chi2, *self._rows(evaluation, s))
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
         """Return residual and Jacobian by the coordinates `s`, with logarithmic priors instead of the weak priors."""
-        residual, jacobian = residual_and_jacobian_without_weak_priors(self.problem, evaluation)
+        residual, jacobian = residual_and_jacobian_with_stated_priors(self.problem, evaluation)
         slope = np.where(self.positive, self._unknowns(s), 1.0)
         anchors = np.eye(len(s))[self.anchored] / _LOG_PRIOR_STD
         held = (s - self.centre)[self.anchored] / _LOG_PRIOR_STD

@@ -83,7 +83,7 @@ class _RunOutlierTest:
 
 
 @dataclass(frozen=True)
-class DriftAndOutlierTests:
+class DriftAndOutlierTestResults:
     """Tests of several runs for drifting parameters and outlier runs. `chi2` tests all parameters and runs at once."""
 
     run_names: tuple[str, ...]
@@ -135,7 +135,7 @@ def pool_estimates_and_chi2(runs: Sequence[RunEstimates]) -> tuple[RunEstimates,
     return RunEstimates(label, names, mean * unit, covariance, units, explains, effects), chi2, degrees
 
 
-def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
+def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTestResults:
     """Test which parameters changed from run to run (in order of time), and which run is an outlier.
 
     A run is an outlier if it differs significantly from the mean of the others, and the others agree: their own chi2 is
@@ -147,7 +147,7 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
     names, p = tuple(run.run_name for run in runs), chi2_p_value(chi2, degrees)
-    return DriftAndOutlierTests(names, drifts, against, chi2, degrees, p, level)
+    return DriftAndOutlierTestResults(names, drifts, against, chi2, degrees, p, level)
 
 
 def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDriftTest:

@@ -12,7 +12,7 @@ import casadi as ca
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_question
-from yid_ocp.integrator.codegen import COMPARISON_SIGNS
+from yid_ocp.integrator.codegen import COMPARISON_OPERATOR_SYMBOLS
 from yid_ocp.integrator.discrete import DiscreteEquations
 
 # Binding strength of an expression: an operand that binds less than required gets parentheses.
@@ -30,7 +30,7 @@ _TEXT_TEMPLATES: dict[int, tuple[str, int, tuple[int, ...]]] = {
     ca.OP_INV: ("1/{0}", _PRODUCT, (_POWER,)),
     ca.OP_SQ: ("{0}^2", _POWER, (_ATOM,)),
     **dict.fromkeys((ca.OP_POW, ca.OP_CONSTPOW), ("{0}^{1}", _POWER, (_ATOM, _ATOM))),
-    **{op: (f"{{0}} {sign} {{1}}", _COMPARISON, (_SUM, _SUM)) for op, sign in COMPARISON_SIGNS.items()},
+    **{op: (f"{{0}} {sign} {{1}}", _COMPARISON, (_SUM, _SUM)) for op, sign in COMPARISON_OPERATOR_SYMBOLS.items()},
     ca.OP_AND: ("{0} and {1}", _COMPARISON, (_ATOM, _ATOM)),
     ca.OP_OR: ("{0} or {1}", _COMPARISON, (_ATOM, _ATOM)),
     ca.OP_NOT: ("not {0}", _COMPARISON, (_ATOM,)),
@@ -160,7 +160,7 @@ class EquationOrDerivativeFormula:
         """True if the expression is zero for all values of the variables."""
         return bool(self.expression.is_zero())
 
-    def numeric_value(self, variables: ca.SX, at: Array) -> float:
+    def evaluate_numerically(self, variables: ca.SX, at: Array) -> float:
         """Compute the expression for the values `at` (k,) of the symbols `variables` (k, 1)."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
@@ -250,7 +250,7 @@ class NamedStepEquations(ReprMixin):
         at = [entry.name for entry in blocks].index(block)
         return slice(ends[at], ends[at + 1])
 
-    def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:
+    def equation_or_derivative_by_name(self, text: str) -> EquationOrDerivativeFormula:
         """Return the equation with a given name or, for `ROW, COLUMN`, its derivative with respect to a variable.
 
         Examples of `text`: `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]`, `constraint[left.x], T2.length`. Raises
@@ -287,7 +287,7 @@ class NamedStepEquations(ReprMixin):
             row = self._row_expressions[at]
             count = count_operations([row], self.all_variable_symbols)
             if count <= _MAX_PRINTED_OPERATIONS:
-                said += self.equation_or_derivative(name).text_lines
+                said += self.equation_or_derivative_by_name(name).text_lines
             else:
                 used = self._summarize_columns(place[symbol.element_hash()] for symbol in ca.symvar(row))
                 said.append(_headline(name, count, used))

@@ -28,7 +28,7 @@ _NEGLIGIBLE_STD = 0.1  # standard deviation of a reading that may be neglected, 
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
-def sensitivities_and_information(
+def point_sensitivities_and_information(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -101,7 +101,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
         raise failed_rollout_error(evaluation.message)
     for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
         if samples.sensor.position_joints:
-            read = samples.interpolate_to_samples(blur[samples.evaluation_nodes])
+            read = samples.interpolate_to_samples(blur[samples.evaluation_node_indices])
             own = samples.residual_and_jacobian(np.zeros(samples.value.shape), read).jacobian
             assert own is not None
             return np.hstack([evaluation.jacobian[rows], own])
@@ -135,7 +135,7 @@ class _Motion:
 
     def __init__(self, course: NominalTrajectory, errors: TorqueAndAngleErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        correction = course.model_functions.reference_momentum_correction
+        correction = course.model_functions.effect_momentum_calculator
         momentum = correction.momentum_derivative_by_previous_torque(course.theta)
         self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
         nu, count = len(errors.torque_std), len(errors.sample_of_step)

@@ -73,7 +73,7 @@ class ChangedExperimentResult:
 
 
 @dataclass(frozen=True, repr=False)
-class ExperimentChangesByIdentifiableCount(ReprMixin):
+class ExperimentChangesRankedByIdentifiability(ReprMixin):
     """The possible changes of an experiment, ranked by the number of parameters that they make identifiable.
 
     `single_changes` are sorted by this number, then by information gain [nat]; changes that could not be evaluated come
@@ -108,7 +108,7 @@ def what_if(
     considered_changes: Collection[str] | None = None,
     progress: Progress = NULL_PROGRESS,
     evaluate_changes: _ChangeSetsEvaluationFunction | None = None,
-) -> ExperimentChangesByIdentifiableCount:
+) -> ExperimentChangesRankedByIdentifiability:
     """Rank changes of an experiment by how many parameters they make identifiable, without new measurements.
 
     The readings of a new sensor are simulated along the recorded motion, on which the tracking filter keeps the arms.
@@ -139,7 +139,7 @@ def what_if(
     changes = [c for c in outcomes.possible if considered_changes is None or c.name in considered_changes]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
     smallest = _rank_results(_smallest(outcomes, changes, base))
-    return ExperimentChangesByIdentifiableCount(base, tuple(singles), tuple(smallest), len(outcomes.known))
+    return ExperimentChangesRankedByIdentifiability(base, tuple(singles), tuple(smallest), len(outcomes.known))
 
 
 def evaluate_experiment_change_sets(

@@ -196,12 +196,12 @@ def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_Ke
     sections = schema.section_variants_from_annotation(hint)
     merges = bool(value) and isinstance(before, dict) and isinstance(value, dict)
     if merges and sections is not None and sections.selector_key in value:
-        merges = sections.selected_variant_name(value) == sections.selected_variant_name(before)
+        merges = sections.read_variant_name(value) == sections.read_variant_name(before)
     if not merges:
         for known in [known for known in places if known[: len(path)] == path]:
             del places[known]
         return value
-    keys = {} if sections is None else sections.options_of_variant(sections.selected_variant_name({**before, **value}))
+    keys = {} if sections is None else sections.options_of_variant(sections.read_variant_name({**before, **value}))
     for name, entry in value.items():
         kind = keys[name].type_hint if name in keys else options.mapping_value_type(hint)
         before[name] = _merged(kind, before.get(name), entry, (*path, name), places)
@@ -216,7 +216,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
     sections, values = schema.section_variants_from_annotation(hint), options.mapping_value_type(hint)
     inner = schema.section_variants_from_annotation(values)
     if sections is not None:
-        known = sections.options_of_variant(sections.selected_variant_name(raw))
+        known = sections.options_of_variant(sections.read_variant_name(raw))
         if name not in known:
             raise schema.unknown_key_error(name, known, origin)
         below = known[name].type_hint
@@ -224,7 +224,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
         allowed = f"a key that ends in '{name}'"
         raise ConfigError(f"there are no keys below '{name}'", where=origin, allowed=allowed, hint="shorten the key")
     elif inner is not None and inner.selector_key == "name":
-        below = inner.variants_for_entry(name, origin).classes[""]
+        below = inner.variants_for_named_entry(name, origin).classes[""]
     else:
         known = {} if inner is None else inner.options_of_variant()
         cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
@@ -264,7 +264,7 @@ class _Reader:
             if raw is not None and not isinstance(raw, dict):
                 raise self._wrong(raw, hint, path)
             return {
-                name: self._section(inner.variants_for_entry(name, self.where((*path, name))), own, (*path, name))
+                name: self._section(inner.variants_for_named_entry(name, self.where((*path, name))), own, (*path, name))
                 for name, own in (raw or {}).items()
             }
         try:
@@ -281,7 +281,7 @@ class _Reader:
             keys = list(sections.options_of_variant(sections.default_variant))
             what, hint = f"{self._name(path)} = {_shown(raw)} is not a section", _key_meant(self._name(path), keys)
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
-        word = sections.selected_variant_name(raw)
+        word = sections.read_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:
             at = (*path, sections.selector_key) if sections.selector_key in raw else path
             raise sections.unknown_variant_error(word, self.where(at))
@@ -292,7 +292,7 @@ class _Reader:
                 within += f" with {sections.selector_key}: {word}" if within and len(sections.classes) > 1 else ""
                 raise schema.unknown_key_error(name, known, self.where((*path, name)), within)
         values: dict[str, Any] = {}
-        for name, option in options.options_by_key(kind).items():
+        for name, option in options.class_options_by_key(kind).items():
             if name in raw:
                 values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
             elif option.default_value is MISSING:

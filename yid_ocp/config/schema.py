@@ -27,7 +27,7 @@ class SectionVariants:
     variant_noun: str = ""  # word for a class in messages, such as "solver"
     is_nullable: bool = False  # whether null is allowed instead of a section
 
-    def selected_variant_name(self, raw: Any) -> Any:
+    def read_variant_name(self, raw: Any) -> Any:
         """Return the value of the selector key in the unchecked section `raw`, or `default_variant` if it is absent."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
@@ -35,12 +35,12 @@ class SectionVariants:
     def options_of_variant(self, word: Any = "") -> Mapping[str, options.Option]:
         """Return all options, by key, of the settings class named `word` (default: the first class)."""
         known = isinstance(word, str) and word in self.classes
-        own = options.options_by_key(self.classes[word] if known else next(iter(self.classes.values())))
+        own = options.class_options_by_key(self.classes[word] if known else next(iter(self.classes.values())))
         if self.selector_key in ("", *own):
             return own
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
-    def variants_for_entry(self, name: str, where: str) -> SectionVariants:
+    def variants_for_named_entry(self, name: str, where: str) -> SectionVariants:
         """Return the class for the entry `name` of a mapping if names select classes; otherwise return all classes."""
         if self.selector_key != "name":
             return self
@@ -98,7 +98,7 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
     named = section_variants_from_annotation(values)
     below: dict[str, Any] = {}
     if sections is not None:
-        known = sections.options_of_variant(sections.selected_variant_name(raw))
+        known = sections.options_of_variant(sections.read_variant_name(raw))
         below = {name: option.type_hint for name, option in known.items()}
     elif named is not None and named.selector_key == "name":
         below = dict(named.classes)
@@ -122,12 +122,12 @@ def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
     sections = section_variants_from_annotation(hint)
     if sections is None:
         return
-    having = [word for word, kind in sections.classes.items() if name in options.options_by_key(kind)]
+    having = [word for word, kind in sections.classes.items() if name in options.class_options_by_key(kind)]
     if having:
         choice = "" if len(having) == len(sections.classes) else f" with {sections.selector_key}: {', '.join(having)}"
         yield (f"`{at}`" if at else "the file itself") + choice
     for kind in sections.classes.values():
-        for key, option in options.options_by_key(kind).items():
+        for key, option in options.class_options_by_key(kind).items():
             yield from _sections_with_key(option.type_hint, name, f"{at}.{key}" if at else key)
 
 
@@ -154,7 +154,7 @@ def _type_schema(hint: Any) -> dict[str, Any]:
         return {"type": "array", "items": _described_schema(entries)}
     inner = section_variants_from_annotation(values)
     if inner is not None and inner.selector_key == "name":
-        named = {name: _section_schema(inner.variants_for_entry(name, ""), "") for name in inner.classes}
+        named = {name: _section_schema(inner.variants_for_named_entry(name, ""), "") for name in inner.classes}
         return {"type": "object", "properties": named, "additionalProperties": False}
     if inner is not None:
         return {"type": "object", "additionalProperties": _described_schema(values)}
@@ -167,7 +167,7 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
     required = []
     if sections.selector_key == "name":
         properties["name"] = {"const": word, "description": f"the {sections.variant_noun}"}
-    for name, option in options.options_by_key(kind).items():
+    for name, option in options.class_options_by_key(kind).items():
         properties[name] = _described_schema(option.type_hint)
         default = option.default_value
         if default is MISSING:

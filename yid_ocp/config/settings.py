@@ -26,7 +26,7 @@ from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.model.objects import OBJECT_KINDS, ObjectBuilder
 from yid_ocp.model.objects.base import MountSettings
 from yid_ocp.model.servos_and_springs import ServoModelOptions
-from yid_ocp.options import OptionInfo, RegistryChoice, options_by_key, split_annotated
+from yid_ocp.options import OptionInfo, RegistryChoice, class_options_by_key, split_annotated
 from yid_ocp.planning.joint_paths import PlanOptions
 from yid_ocp.problem.options import ExcessResidualCriteria, ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
@@ -472,7 +472,7 @@ def config_yaml_with_defaults(run: RunSettings) -> str:
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         result: dict[str, Any] = {}
-        for name, option in options_by_key(type(value)).items():
+        for name, option in class_options_by_key(type(value)).items():
             item = getattr(value, option.field_name)
             if item is not None or option.default_value is not None:
                 markers = split_annotated(option.type_hint)[1]

@@ -58,7 +58,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         rests = [run for run in runs if run[2] <= unseen and _comes_to_rest(values, *run[:2])]
         if joints is not None and quantity == "effort":  # a command that holds a joint still is constant
             angle = joints.position[:, joints.names.index(name)]
-            most = 10 * seen_noise_std(t, angle)  # range of noise, or three counts
+            most = 10 * noise_or_quantization_std(t, angle)  # range of noise, or three counts
             rests = [run for run in runs if run in rests or np.ptp(angle[run[0] : run[1] + 1]) <= most]
         if len(rests) == len(runs):
             continue
@@ -106,12 +106,12 @@ def white_noise_std(t: Array, values: Array) -> float:
     return float(1.4826 * np.median(np.abs(np.diff(values, NOISE_ESTIMATE_DIFFERENCE_ORDER)[together])) / size)
 
 
-def seen_noise_std(t: Array, values: Array) -> float:
+def noise_or_quantization_std(t: Array, values: Array) -> float:
     """Estimate the noise standard deviation of a channel: the larger one of white noise and quantization noise."""
     return max(white_noise_std(t, values), quantization_step(values) / math.sqrt(12))
 
 
-def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, channel: str) -> float:
+def _stated(recording: Recording, choice: SensorOptionsFunction, group: str, channel: str) -> float:
     """Noise standard deviation of a channel as the settings or else the recording state it; zero if neither does."""
     joints = recording.joints
     quantity, _, name = channel.partition(".")
@@ -135,7 +135,7 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
     return float(np.nanmedian(spread)) if np.any(np.isfinite(spread)) else 0.0
 
 
-def excess_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
+def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) -> Iterator[Issue]:
     """Find channels whose quantization or noise far exceeds the stated noise. Rates below 20 Hz are not checked."""
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) < 100 or median_sample_period(t) > 0.05:
@@ -166,7 +166,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsLookup) -> I
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
-def recording_overstated_noise_issues(recording: Recording, options: SensorOptionsLookup) -> Iterator[Issue]:
+def overstated_noise_std_issues(recording: Recording, options: SensorOptionsFunction) -> Iterator[Issue]:
     """Find channels whose noise is far below the noise that the recording states.
 
     Channels of a sensor with equal stated noise are judged together. Noise stated in the settings (`options`) is not
@@ -343,7 +343,7 @@ _LINES = Path(__file__).with_name("issue_causes.yaml").read_text(encoding="utf-8
 ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = dict(line.split(": ", 1) for line in _LINES[1:])  # a tenth of YAML's time
 """Description of every cause of an issue, as shown in tables."""
 
-SensorOptionsLookup = Callable[[str], SensorOptions]
+SensorOptionsFunction = Callable[[str], SensorOptions]
 
 
 def mean_sample_rate(t: Array) -> float:

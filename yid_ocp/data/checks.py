@@ -21,7 +21,7 @@ from yid_ocp.data.channel_checks import (
     LIMIT_VIOLATION_RATIO_CAP,
     QUALITY_LIMITS,
     Issue,
-    SensorOptionsLookup,
+    SensorOptionsFunction,
     median_sample_period,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -110,7 +110,7 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
-def recording_quality_issues(recording: Recording, options: SensorOptionsLookup) -> list[Issue]:
+def recording_quality_issues(recording: Recording, options: SensorOptionsFunction) -> list[Issue]:
     """Return the issues of one recording that all checks without a model find.
 
     `options` returns the sensor options for a settings key, such as `joints.effort`.
@@ -123,7 +123,7 @@ def recording_quality_issues(recording: Recording, options: SensorOptionsLookup)
         _velocities(recording),
         channel_checks.stuck_channel_issues(recording),
         channel_checks.excess_noise_issues(recording, options),
-        channel_checks.recording_overstated_noise_issues(recording, options),
+        channel_checks.overstated_noise_std_issues(recording, options),
         channel_checks.saturated_effort_issues(recording),
         _standstill(recording),
     )

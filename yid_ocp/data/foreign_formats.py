@@ -250,7 +250,7 @@ OTHER_JOINT_MESSAGE_TYPES = (
 )
 """Message types with joint values that can be read, other than JointState."""
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-ESTIMATED_WRENCH_RECORDING_GROUP = "wrist_estimated"
+ESTIMATED_WRENCH_GROUP_NAME = "wrist_estimated"
 """Recording group of the external wrench that a driver estimates from joint torques, in the frame that it states."""
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, unknown_name_error_arguments
-from yid_ocp.sensors.base import CHANNEL_KINDS, EffortSamplingKind, channel_kinds_of_sensor_group
+from yid_ocp.sensors.base import CHANNEL_KINDS, EffortSamplingKind, channel_specs_for_group_name
 
 RecordedOrNominalClock = Literal["recorded", "nominal"]
 
@@ -465,7 +465,7 @@ def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
 
 def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    declared = {channel.quantity: channel for channel in channel_kinds_of_sensor_group(group.name)}
+    declared = {channel.quantity: channel for channel in channel_specs_for_group_name(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
     allowed, hint = ", ".join(declared), "add one of the allowed datasets, or leave the group out"

@@ -37,7 +37,7 @@ from yid_ocp.data.recording import (
 )
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.sensors import CHANNEL_KINDS
-from yid_ocp.sensors.base import channel_kinds_of_sensor_group
+from yid_ocp.sensors.base import channel_specs_for_group_name
 
 _RECORDING_FORMAT = "yid-recording/1"
 
@@ -84,7 +84,7 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
             content = {**vars(group), "sensor": group.sensor_name, "pose": group.camera_pose}
             _write_group(file.create_group(group.name), content, _POINT_UNITS, attributes)
         for channels in recording.channel_groups:
-            units = {"t": "s"} | {c.quantity: c.unit for c in channel_kinds_of_sensor_group(channels.name)}
+            units = {"t": "s"} | {c.quantity: c.unit for c in channel_specs_for_group_name(channels.name)}
             content, stds = {**vars(channels), **channels.values_by_quantity}, channels.noise_and_bias_stds_by_attribute
             _write_group(file.create_group(channels.name), {**content, **stds}, units, ("names", "clock", *stds))
         if recording.marker_reference_pose is not None:
@@ -118,7 +118,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
-        where, declared = f"{origin}: {name}", channel_kinds_of_sensor_group(name)
+        where, declared = f"{origin}: {name}", channel_specs_for_group_name(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_question(name, ("joints", "points", *further, _STRAIGHT))
         what, hint = f"{_RECORDING_FORMAT} files have no group '{name}'", hint or "rename or delete the group"
@@ -237,7 +237,7 @@ def check_readable_in_child_process(path: Path, complaint: Callable[[Path], str]
         try:
             faulthandler.disable()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
-            with files.process_memory_limit():
+            with files.limit_process_memory():
                 said = complaint(path)
             os.write(there, f".{said}".encode(errors="replace")[:2000])
         finally:

@@ -23,7 +23,7 @@ from yid_ocp.display import Progress
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, failed_rollout_error, nearest_name_question
 from yid_ocp.files import attributes_to_dict
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
@@ -59,7 +59,7 @@ class ParameterShiftsSinceBaseline:
     parameter_shifts: tuple[_ParameterShift, ...]
 
     @property
-    def changed_parameters(self) -> tuple[_ParameterShift, ...]:
+    def significant_parameter_shifts(self) -> tuple[_ParameterShift, ...]:
         """The parameters that have changed significantly, with the smallest p-value first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
         return tuple(sorted(changed, key=lambda entry: entry.p_value))
@@ -141,11 +141,11 @@ class EarlierRunsBaseline:
     def fit_parameters_differ_from_baseline(self, fit: RefittedModel, limits: Thresholds) -> bool:
         """Return whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
         found = self.parameter_shifts_of_fit(fit, limits)
-        return found is not None and bool(found.changed_parameters)
+        return found is not None and bool(found.significant_parameter_shifts)
 
-    def errors_on_recordings_with_and_without_effects(
+    def predict_counterfactual_errors(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> CounterfactualErrorsOfFoundEffects | None:
+    ) -> CounterfactualPredictionErrors | None:
         """Return prediction errors that test the effects of `last`, for example before and after a repair.
 
         Reference recordings are predicted by `last` without its effects, and the diagnosed recordings by the parameters
@@ -166,11 +166,11 @@ class EarlierRunsBaseline:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return CounterfactualErrorsOfFoundEffects(removed, _nothing(present, error.what))
-        return CounterfactualErrorsOfFoundEffects(removed, _predicted(last, present, then, {**then, **effects}))
+            return CounterfactualPredictionErrors(removed, _nothing(present, error.what))
+        return CounterfactualPredictionErrors(removed, _predicted(last, present, then, {**then, **effects}))
 
 
-def problem_with_earlier_runs(
+def problem_with_priors_and_baseline(
     problem: EstimationProblem, baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline
 ) -> tuple[EstimationProblem, EarlierRunsBaseline]:
     """Return the problem with the estimates of earlier runs as priors, unless it has such priors, and these runs."""
@@ -186,7 +186,7 @@ def problem_with_earlier_runs(
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
     """Return the variance of every unknown by name, from the stated noise and priors alone."""
     problem = fit.problem
-    jacobian = residual_and_jacobian_without_weak_priors(problem, fit.evaluation)[1] * problem.unknown_scales
+    jacobian = residual_and_jacobian_with_stated_priors(problem, fit.evaluation)[1] * problem.unknown_scales
     variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
     return dict(zip(problem.unknown_names, map(float, variance), strict=True))
 
@@ -230,7 +230,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class CounterfactualErrorsOfFoundEffects:
+class CounterfactualPredictionErrors:
     """The prediction errors on reference recordings without the effects, and on diagnosed recordings with them."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model
@@ -270,7 +270,7 @@ def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProbl
 def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Sequence[EffectBase]) -> _ChannelErrors:
     if problem.has_process_noise:
         problem = problem_with_sensor_noise_only(problem)
-    found = problem.predict_held_out(problem.unknown_vector({**neutral_effect_parameter_values(effects), **values}))
+    found = problem.predict_held_out(problem.pack_unknowns({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:
         raise failed_rollout_error(failed[0], "held-out recordings")

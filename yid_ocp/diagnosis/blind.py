@@ -31,7 +31,7 @@ from yid_ocp.virtual.injected import (
     INJECTABLE_EFFECT_KINDS,
     OUT_OF_LIBRARY_FORCE_BUILDERS,
     InjectedEffect,
-    run_experiment_with_effects,
+    run_experiment_with_injected_effects,
     typical_friction_amplitude_range,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
@@ -176,7 +176,7 @@ def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
-def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
+def read_labels_checking_sha256(text: str, commitment: str) -> list[CaseGroundTruth]:
     """Read the sealed labels of cases from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         what, hint = "the labels are not those sealed before the diagnosis", "restore this file of the blind test"
@@ -288,7 +288,7 @@ class BlindCaseGenerator:
         is_held = self.conditions.ordinary_friction is not None
         conditions = replace(self.conditions, ordinary_friction=tuple(friction) if is_held else None)
         conditions = replace(conditions, is_brisk=planned is not None and planned.is_brisk)
-        made = record_random_motion(nominal, system, posture, own, values, injected, rng, conditions)
+        made = simulate_random_motion(nominal, system, posture, own, values, injected, rng, conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
     def _linearize_clean_recordings(self) -> ProjectedCandidatesLinearization:
@@ -404,7 +404,7 @@ class BlindCaseGenerator:
         reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
         times = min(wanted * DETECTABLE_AMPLITUDE_Z / seen, float(reach))
         values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
-        reported = {name: told.value for name, told in effect.parameters_as_reported(values).items()}
+        reported = {name: told.value for name, told in effect.to_reported_parameters(values).items()}
         relative_size = times * seen / DETECTABLE_AMPLITUDE_Z
         return InjectedEffect(effect.kind, effect.location, reported), relative_size
 
@@ -436,7 +436,7 @@ class BlindCaseGenerator:
         return float(np.nanmax(np.abs(recorded.effort[:, recorded.names.index(joint)])))
 
 
-def record_random_motion(
+def simulate_random_motion(
     nominal: System,
     simulated: System,
     posture: Mapping[str, float],
@@ -463,7 +463,7 @@ def record_random_motion(
         camera=PointCamera() if conditions.has_camera else None,
         seed=int(rng.integers(2**31)),
     )
-    return run_experiment_with_effects(simulated, values, injected, experiment, conditions.ordinary_friction)
+    return run_experiment_with_injected_effects(simulated, values, injected, experiment, conditions.ordinary_friction)
 
 
 def first_recorded_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:

@@ -23,8 +23,8 @@ from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStati
 from yid_ocp.diagnosis.screening import (
     EMPTY_SCREENING_RESULT,
     CandidateDetectability,
-    CandidateScore,
     ConfusabilityMatrix,
+    ScoreTestResult,
     ScreeningResult,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -530,7 +530,7 @@ class _RecordedCase:
         overlaps = np.eye(len(data["labels"]))
         for i, j, fraction in data["alike"]:
             overlaps[i, j] = fraction
-        scores = tuple(CandidateScore(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
+        scores = tuple(ScoreTestResult(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
         seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in data["detectable"].items())
         confusability = ConfusabilityMatrix(tuple(data["labels"]), overlaps)
         return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, confusability=confusability)

@@ -18,7 +18,7 @@ from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import hypotheses
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_earlier_runs
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.gap_law import find_gap_law
@@ -47,7 +47,7 @@ from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import whitened_prediction_residual
+from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
 from yid_ocp.problem.measurements import ResidualAndJacobian
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
@@ -98,11 +98,11 @@ def diagnose(
     """
     with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         begun = time.perf_counter()
-        problem, earlier = problem_with_earlier_runs(problem, baseline)
-        composed = hypotheses.compose_candidates(problem, candidates, exclude, held_out, progress)
+        problem, earlier = problem_with_priors_and_baseline(problem, baseline)
+        composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
-        search.end_stage("compose")
+        search.record_stage_end("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 10.5)
         nominal = fit_nominal_model(problem, composed, known_fits.solution, known_fits.store, thresholds)
         return _diagnosed(problem, _examined(search, nominal), earlier)
@@ -133,13 +133,13 @@ def _examined(
     """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
     limits = search.thresholds
     search, nominal, cuts = _followed(search, nominal, known)
-    search.end_stage("nominal")
+    search.record_stage_end("nominal")
     search.progress.begin_stage("looking for events", 2.0, 8.5)
     with_events = search
     search, nominal, events, smoothed = _without_events(search, nominal)
-    search.end_stage("events")
+    search.record_stage_end("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
-    effects = search.problem.candidates_with_prior_ranges_for(states)
+    effects = search.problem.candidates_with_prior_ranges_from_states(states)
     held_out_test, spread = _held_out_null_test_and_spread(nominal, limits)
     tests = _estimation_null_test(nominal, limits), held_out_test
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
@@ -158,10 +158,10 @@ def _examined(
         if not own.step.time_step > _MAX_STEP_OF_LAST_HALVING:
             raise
         return _at_half_time_step(seen, "the model with all candidates fails", 0.0)
-    search.end_stage("screening")
+    search.record_stage_end("screening")
     evidence = replace(evidence, screening=screened)
     seen, gap = replace(seen, evidence=evidence), screened.largest_predicted_chi2_decrease
-    return (evidence.warrants_search(limits) and _at_finer_discretisation(seen, nominal, gap)) or seen
+    return (evidence.warrants_effect_search(limits) and _at_finer_discretisation(seen, nominal, gap)) or seen
 
 
 def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined | None:
@@ -203,7 +203,7 @@ def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined | None:
 
 def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examined | None:
     """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
-    problem = seen.with_events.problem.with_effort_noise_of_effects(fit.effects, fit.values)
+    problem = seen.with_events.problem.with_encoder_noise_in_efforts(fit.effects, fit.values)
     if problem is None:
         return None
     seen.search.progress.begin_stage(f"going on with the noise beside {hypotheses.join_effect_labels(fit.effects)}")
@@ -246,7 +246,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[HeldOutTruncation, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = {cut.recording: cut for cut in known}
-    for fraction in hypotheses.KEPT_FRACTIONS_BEFORE_FAILURE:
+    for fraction in hypotheses.HELD_OUT_TRUNCATION_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
@@ -299,7 +299,7 @@ def _happened(
     if not evaluation.ok:
         return NO_EVENTS, None
     least = limits.min_log_bayes_factor
-    smoothed = smoother.smooth_unknowns_about_fit(own, x, evaluation, least) if is_flagged else None
+    smoothed = smoother.smooth_unknown_forces_and_biases(own, x, evaluation, least) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
     (pushed, others), share = found.split_force_from_other_events(), 1 - _MIN_FORCE_EVENT_GAP_FRACTION
     if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
@@ -309,7 +309,7 @@ def _happened(
 
 def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     """r'r of a fit minus the number of used samples, over all recordings; infinite if they cannot be predicted."""
-    x, guesses = problem.unknown_vector(fit.values), fit.evaluation.equilibrium_guesses
+    x, guesses = problem.pack_unknowns(fit.values), fit.evaluation.equilibrium_guesses
     judged = problem_with_whitening_at(problem, x, guesses)
     evaluation = judged.evaluate(x, False, guesses)
     if evaluation.ok:
@@ -338,9 +338,9 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         search.progress.begin_stage("locating the gap", 1.0, 2.0)
         # without events, the smoother already ran on all fitted data
         known = nominal.problem, nominal.unknowns, nominal.evaluation
-        smoothed = seen.smoothed or smoother.smooth_unknowns_about_fit(*known, limits.min_log_bayes_factor)
+        smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
-    search.end_stage("localisation")
+    search.record_stage_end("localisation")
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selected_effects:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
@@ -350,18 +350,18 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         tests = _estimation_null_test(final, limits), remaining
         if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria):
             known = final.problem, final.unknowns, final.evaluation
-            left = smoother.smooth_unknowns_about_fit(*known, limits.min_log_bayes_factor)
+            left = smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)
             rest = smoother.gap_locations_by_smoother_evidence(left)
         flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
         events = _happened(seen.with_events.problem.problem_with_all_samples, final, limits)[0]
-    search.end_stage("remaining")
+    search.record_stage_end("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
     law = find_gap_law(search, problem, final, places, seen.events)
-    search.end_stage("law")
+    search.record_stage_end("law")
     ends = search.stage_ends
     finding = DiagnosisResult(
         **(vars(evidence) | vars(judged)),
@@ -379,7 +379,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         stage_seconds={name: ends[name] - ends[last] for last, name in itertools.pairwise(ends)},
         events=events,
         baseline_comparison=earlier.parameter_shifts_of_fit(final, limits),
-        counterfactual=earlier.errors_on_recordings_with_and_without_effects(nominal, final, search.progress),
+        counterfactual=earlier.predict_counterfactual_errors(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_used_time_step=(problem.step.time_step, nominal.problem.step.time_step),
         is_corrected_for_links=seen.is_corrected_for_links,
@@ -413,7 +413,7 @@ def fit_nominal_model(
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
     solution = solution or fit_problem(problem, GaussNewton(max_iterations=30), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
-    composed = composed.with_input_errors_of(solution.problem)
+    composed = composed.with_smoothed_input_errors_of(solution.problem)
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
 
 
@@ -435,7 +435,7 @@ def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool 
     for (episode, result), whitening in pairs:
         if isinstance(result, str):
             raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
-        found.append(whitened_prediction_residual(episode, whitening, result))
+        found.append(whitened_residual_and_jacobian(episode, whitening, result))
     return found
 
 

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from yid_ocp.diagnosis.baseline import CounterfactualErrorsOfFoundEffects, ParameterShiftsSinceBaseline
+from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors, ParameterShiftsSinceBaseline
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.gap_law import GapLaw
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.screening import CandidateScore, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, bic_difference, held_out_gap_closure, total_closure
+from yid_ocp.diagnosis.screening import ScoreTestResult, bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, bic_difference, held_out_gap_closure, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprMixin, ReprTexts
@@ -44,7 +44,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
     baseline_comparison: ParameterShiftsSinceBaseline | None = None
-    counterfactual: CounterfactualErrorsOfFoundEffects | None = None
+    counterfactual: CounterfactualPredictionErrors | None = None
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[HeldOutTruncation, ...] = ()
@@ -59,7 +59,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprTexts:
-        closed = total_closure(self.accepted_selected_effects).text
+        closed = total_gap_closure(self.accepted_selected_effects).text
         said = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects), closed]
         rows = [("candidate", "parameters", "closure alone", "p")]
         for entry in judgement_to_dict(self, self, ())["which"][:8]:
@@ -152,7 +152,7 @@ def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: S
     found = {
         "verdict": judged.verdict,
         "probability": judged.probability,
-        "gap": {"before": before, **total_closure(added).to_dict()},
+        "gap": {"before": before, **total_gap_closure(added).to_dict()},
         "where": [attributes_to_dict(place, _PLACE_KEYS) for place in where],
         "which": _ranked_candidates(judged, seen),
         "effects": [attributes_to_dict(entry.effect, _EFFECT_KEYS) for entry in added],
@@ -175,13 +175,13 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
     probabilities = judged.selected_effect_and_equivalent_probabilities
     found = [
-        *((e.effect, e.effect.parameters_as_reported(fit.values, fit.std)) for e in added for fit in last),
-        *((fit.effects[0], fit.effects[0].parameters_as_reported(fit.values, fit.std)) for fit in alone),
-        *((s.effect, s.effect.parameters_as_reported(s.predicted_values)) for s in scores.values()),
+        *((e.effect, e.effect.to_reported_parameters(fit.values, fit.std)) for e in added for fit in last),
+        *((fit.effects[0], fit.effects[0].to_reported_parameters(fit.values, fit.std)) for fit in alone),
+        *((s.effect, s.effect.to_reported_parameters(s.predicted_values)) for s in scores.values()),
     ]
     listed: dict[str, dict[str, Any]] = {}
     for effect, reported in found:
-        score = scores.get(effect.label, CandidateScore(effect, {}, 0.0, 0.0, 1.0))
+        score = scores.get(effect.label, ScoreTestResult(effect, {}, 0.0, 0.0, 1.0))
         entry = {
             **attributes_to_dict(effect, _EFFECT_KEYS),
             "parameters": {name: attributes_to_dict(own, "value std unit") for name, own in reported.items()},

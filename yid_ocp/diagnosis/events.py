@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
     CompiledInverseDynamics,
     DetectedForcePulse,
-    ForceHistory,
+    ForceEstimate,
     detect_force_pulses,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
@@ -105,7 +105,7 @@ class EventSet:
 
     disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
-    force_estimates: tuple[ForceHistory, ...] = ()
+    force_estimates: tuple[ForceEstimate, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.disturbances or self.overspeeds)
@@ -187,7 +187,7 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
         yield _Overspeed(episode.name, names[places[int(speed[at].argmax())]], float(at * h))
 
 
-def _before_overspeed(history: ForceHistory, ends: EventSet) -> ForceHistory | None:
+def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """Return a history up to the recording's overspeed, without the end that a filter distorts. None if too short."""
     until = ends._end_of(history.recording) - zero_phase_effort_filter(history.filter_cutoff).end_distortion_duration
     keep = np.flatnonzero(history.t <= until)
@@ -207,7 +207,7 @@ def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: In
 
 def _read_forces(
     problem: EstimationProblem, run: _RecordingRollout, torques: CompiledInverseDynamics, limits: Thresholds
-) -> Iterator[ForceHistory]:
+) -> Iterator[ForceEstimate]:
     """Yield force estimates at prescribed joints with compared efforts: required minus measured torque."""
     episode, result, _ = run
     unbiased = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
@@ -229,10 +229,10 @@ def _read_forces(
             score, information = together @ (square * value[:, column]), np.diag(together @ square)
             what = (episode.name, joint, joint, generalised_force_unit(problem.system, joint))
             allowed = (mean @ error[:, at], mean @ held[:, at], problem.options.path_cutoff)
-            yield from _spans(ForceHistory(*what, mean @ times, score, information, *allowed), limits)
+            yield from _spans(ForceEstimate(*what, mean @ times, score, information, *allowed), limits)
 
 
-def _spans(whole: ForceHistory, limits: Thresholds) -> Iterator[ForceHistory]:
+def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
     """Yield parts of a long history, which overlap by twice the longest pulse. Cost grows with the cube of a part."""
     overlap = math.ceil(2 * limits.max_event_duration / whole.time_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
@@ -247,10 +247,10 @@ def _driving_forces(
     runs: Sequence[_RecordingRollout],
     smoothed: SmoothedUnknownsResult,
     torques: CompiledInverseDynamics,
-) -> list[ForceHistory]:
+) -> list[ForceEstimate]:
     """Return force estimates at coordinates where the smoother found forces, but only for a small part of the time."""
     sought = {trace.recording: _short(smoothed, i) for i, trace in enumerate(smoothed.smoothed_unknowns)}
-    found: list[ForceHistory] = []
+    found: list[ForceEstimate] = []
     if not any(sought.values()):
         return found
     with threadpoolctl.threadpool_limits(1):
@@ -271,7 +271,7 @@ def _driving_forces(
                     at, unit = problem.system.mechanism.joint_index(name), generalised_force_unit(problem.system, name)
                     what = (model.recording, source.location, name, unit, middle[full])
                     told = (score[full] / size, information[full, full] / size**2)
-                    found.append(ForceHistory(*what, *told, error[full, at], held[full, at]))
+                    found.append(ForceEstimate(*what, *told, error[full, at], held[full, at]))
     return found
 
 
@@ -287,7 +287,7 @@ def _short(smoothed: SmoothedUnknownsResult, recording: int) -> list[str]:
 
 
 def _one_each(
-    found: Sequence[tuple[ForceHistory, DetectedForcePulse]], problem: EstimationProblem
+    found: Sequence[tuple[ForceEstimate, DetectedForcePulse]], problem: EstimationProblem
 ) -> list[ForceOrFaultEvent]:
     """Return force events. A force that moves the model counts once, at the coordinate with the smallest p-value."""
     prescribed = set(problem.system.prescribed)
@@ -354,7 +354,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         for column, channel in enumerate(samples.channel_name_per_output):
             location = channel.rpartition(".")[2]
             if sensor.outputs_per_channel > 1:
-                location = sensor_bias_location_name(problem.system, sensor, sensor.measurement_frame_names[column])
+                location = sensor_bias_location_name(problem.system, sensor, sensor.frame_name_per_output[column])
             seen, about = samples.positive_weight_mask[:, column], (location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
             yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)

@@ -12,20 +12,20 @@ import scipy.linalg
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
-from yid_ocp.diagnosis.hypotheses import KEPT_FRACTIONS_BEFORE_FAILURE, AllCandidatesProblem
+from yid_ocp.diagnosis.hypotheses import HELD_OUT_TRUNCATION_FRACTIONS, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
-from yid_ocp.diagnosis.select import GapClosure, held_out_gap_closure, held_out_improvement_and_error
+from yid_ocp.diagnosis.select import HeldOutGapClosure, held_out_chi2_decrease_and_std_error, held_out_gap_closure
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.law import (
     TORQUE_LAW_QUANTITY_UNITS,
     TorqueLaw,
     TorqueLawTable,
     allowed_torque_law_quantity_names,
-    torque_law_argument_along_rollout,
     torque_law_from_tables,
+    torque_law_quantity_at_midpoints,
 )
 from yid_ocp.files import to_json_types
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
@@ -49,7 +49,7 @@ class GapLaw:
     location: str
     tables: tuple[TorqueLawTable, ...]  # one table per quantity
     visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
-    closure: GapClosure  # closure of the held-out gap of the model without the law
+    closure: HeldOutGapClosure  # closure of the held-out gap of the model without the law
     runner_up: tuple[str, str, float] | None  # location, quantities and closure of the second best law
     model: RefittedModel  # the fitted model with the law
     has_accepted_effects: bool  # whether the model also has accepted effects
@@ -149,7 +149,7 @@ def find_gap_law(
             best = better[0]
     closure = held_out_gap_closure(before.held_out_loss, best.loss)
     least = _MIN_LEFTOVER_CLOSURE if last.effects else _MIN_CLOSURE
-    gained, error = held_out_improvement_and_error(before.held_out_loss, best.loss)
+    gained, error = held_out_chi2_decrease_and_std_error(before.held_out_loss, best.loss)
     if not (gained > error and closure.ci_low > least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
@@ -182,7 +182,7 @@ def _refitted_families(
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
-    composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_FRACTIONS_BEFORE_FAILURE[0])
+    composed, _ = composed.truncate_failing_held_out_recordings(start, HELD_OUT_TRUNCATION_FRACTIONS[0])
     composed = composed.with_whitening_linearized_at(last.values, last.effects)
     before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
     if before is None:
@@ -201,7 +201,7 @@ def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw],
     """Return whether a refit predicts about as well as the best (the first), with the fewest quantities of such."""
 
     def is_as_good(own: _RefittedLaw) -> bool:
-        gained, error = held_out_improvement_and_error(own.loss, found[0].loss)
+        gained, error = held_out_chi2_decrease_and_std_error(own.loss, found[0].loss)
         return gained <= max(2 * error, slack)
 
     fewest = min(len(own.law.quantities) for own in found if is_as_good(own))
@@ -236,7 +236,7 @@ def _visited(model: RefittedModel, place: str, quantity: str) -> Array:
         theta = problem.predictor.theta_with_episode_values(episode, problem.unpack_episode_unknowns(x, i)[0])
         nodes = {name: getattr(result.rollout, name) for name in ("state", "torque", "multipliers")}
         nodes["time_step"] = np.array(episode.grid.time_step)
-        found.append(torque_law_argument_along_rollout(problem.system, place, quantity, theta, nodes).ravel())
+        found.append(torque_law_quantity_at_midpoints(problem.system, place, quantity, theta, nodes).ravel())
     values = np.concatenate(found)
     return values[np.isfinite(values)]
 
@@ -249,10 +249,10 @@ def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[flo
 def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[TorqueLaw]) -> list[_Family]:
     """Return the laws to refit, ordered by the evidence of a fit that is linearised about the model without a law."""
     own = composed.with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
-    evaluation = own.evaluate(own.unknown_vector(before.values), True, before.evaluation.equilibrium_guesses)
+    evaluation = own.evaluate(own.pack_unknowns(before.values), True, before.evaluation.equilibrium_guesses)
     if not evaluation.ok or evaluation.jacobian is None:
         return []
-    residual, jacobian = residual_and_jacobian_without_weak_priors(own, evaluation)
+    residual, jacobian = residual_and_jacobian_with_stated_priors(own, evaluation)
     names = list(own.unknown_names)
     ours = {name for law in laws for name in law.parameters.names}
     nuisance = [i for i, name in enumerate(names) if name not in ours]

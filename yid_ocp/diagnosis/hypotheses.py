@@ -13,7 +13,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import Progress
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
-from yid_ocp.effects.friction import effect_as_sharp_as_nominal_friction
+from yid_ocp.effects.friction import effect_with_lowest_smoothing_speed
 from yid_ocp.errors import ConfigError, DataError, SolverError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
@@ -26,18 +26,18 @@ from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, episode_with_effort_noise_at, truncate_episode
+from yid_ocp.problem.episodes import Episode, episode_with_encoder_effort_noise, truncate_episode
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions
-from yid_ocp.problem.recorded_inputs import signal_kinds_for_effects
+from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
 _BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
 _MIN_NOISE_GROWTH = 1.05  # of efforts beside effects from which weights are computed anew
 _MIN_PREDICTED_DURATION = 1.0  # shortest part of a truncated held-out recording that is kept [s]
-KEPT_FRACTIONS_BEFORE_FAILURE = (0.9, 0.5, 0.0)
+HELD_OUT_TRUNCATION_FRACTIONS = (0.9, 0.5, 0.0)
 """Fractions of the duration until the simulation of a held-out recording fails, of which it keeps one. All are below 1,
 because the simulation deviates before it fails. The next fraction is tried if the refitted model fails earlier."""
 
@@ -51,7 +51,7 @@ def make_candidate_effects(
     out effects of the system. Raises `ConfigError` if the list is empty, or a kind does not exist, has no location here
     or is an effect of the system. Raises `ModelError` if a location does not exist.
     """
-    where, sensors = "diagnosis.candidates", signal_kinds_for_effects(recordings)
+    where, sensors = "diagnosis.candidates", recorded_signal_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
     if choice == "all":
@@ -77,7 +77,7 @@ def make_candidate_effects(
 
 
 def _make_candidate(kind: str, place: str, system: System) -> EffectBase:
-    return effect_as_sharp_as_nominal_friction(make_effect(kind, place, system), system)
+    return effect_with_lowest_smoothing_speed(make_effect(kind, place, system), system)
 
 
 def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
@@ -187,7 +187,7 @@ class AllCandidatesProblem:
         """The names of the free parameters of the nominal problem."""
         return self.problem.free
 
-    def candidates_with_prior_ranges_for(self, states: Sequence[Array]) -> tuple[EffectBase, ...]:
+    def candidates_with_prior_ranges_from_states(self, states: Sequence[Array]) -> tuple[EffectBase, ...]:
         """Return the candidates with prior ranges for the largest joint angles of each segment in `states` (N, nx)."""
         mechanism, largest = self.problem.system.mechanism, {}
         for segment in self.problem.system.segment_layouts:
@@ -207,7 +207,7 @@ class AllCandidatesProblem:
         # filters of the nominal step are those of all candidates, which are neutral
         made = (self if effects else self.restricted_to_effects(())).problem
         # filters are linearised about the estimated torques, so these must be known first
-        x, errors = made.unknown_vector(values), (episode.input_errors for episode in made.episodes)
+        x, errors = made.pack_unknowns(values), (episode.input_errors for episode in made.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
         made = problem_with_held_out_kalman_whitening(problem_with_whitening_at(made, x, rounds=1 if known else 2), x)
         made = problem_with_reestimated_held_out_torque_biases(problem_relinearized_at_torque_bias(made, x, x), x, x)
@@ -221,7 +221,7 @@ class AllCandidatesProblem:
         held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(time_step)
         return replace(self, problem=made.with_episodes(made.episodes, held.episodes), held_out_spread=None)
 
-    def with_input_errors_of(self, fitted: EstimationProblem | None) -> AllCandidatesProblem:
+    def with_smoothed_input_errors_of(self, fitted: EstimationProblem | None) -> AllCandidatesProblem:
         """Return the problem with the smoothed errors of torques and angles of a fit to the same recordings."""
         if fitted is None:
             return self
@@ -229,7 +229,7 @@ class AllCandidatesProblem:
         told = [replace(episode, input_errors=own.input_errors) for episode, own in pairs]
         return replace(self, problem=self.problem.with_episodes(told, held_out))
 
-    def with_effort_noise_of_effects(
+    def with_encoder_noise_in_efforts(
         self, effects: Sequence[EffectBase], values: Mapping[str, float]
     ) -> AllCandidatesProblem | None:
         """Return the problem with the noise of compared efforts that encoder noise causes beside `effects`.
@@ -237,8 +237,8 @@ class AllCandidatesProblem:
         None if no joint's noise is clearly larger than now. Whitening is by sensor noise alone.
         """
         own, now = self.with_nominal_and_effects_free(effects), self.problem
-        theta, _ = own.unpack_episode_unknowns(own.unknown_vector(values), 0)
-        told = partial(episode_with_effort_noise_at, now.step, options=now.options, theta=theta)
+        theta, _ = own.unpack_episode_unknowns(own.pack_unknowns(values), 0)
+        told = partial(episode_with_encoder_effort_noise, now.step, options=now.options, theta=theta)
         made = now.with_episodes([*map(told, now.episodes)], [*map(told, now.held_out)])
         pairs = zip(now.episodes, made.episodes, strict=True)
         samples = (own for before, after in pairs for own in zip(before.measurements, after.measurements, strict=True))
@@ -254,7 +254,7 @@ class AllCandidatesProblem:
         A truncated recording keeps `kept_fraction` of the duration until the failure, and is left out if this is less
         than 1 s. If none remains, blocks of the estimation recordings are held out. Whitening is by sensor noise alone.
         """
-        problem, x = self.problem, self.problem.unknown_vector(values)
+        problem, x = self.problem, self.problem.pack_unknowns(values)
         kept, cuts = [], []
         for episode in problem.held_out:
             whole, h = episode.grid.steps, episode.grid.time_step
@@ -291,7 +291,7 @@ class AllCandidatesProblem:
         own = self.with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
-    def relinearize_held_out_filters(
+    def with_relinearized_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Return `own` (a problem with free `effects`) with filters of held-out recordings linearised at `at`."""
@@ -300,7 +300,7 @@ class AllCandidatesProblem:
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))
 
 
-def compose_candidates(
+def make_all_candidates_problem(
     problem: EstimationProblem,
     candidates: CandidateNamesOrAll,
     leave_out: Sequence[str],
@@ -372,7 +372,7 @@ def _on_step_of_fewer_effects(problem: EstimationProblem, functions: ModelFuncti
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
     """Return the unknowns for the parameters `at`, and for `at` with neutral effects, to linearise filters."""
-    return own.unknown_vector(at), own.unknown_vector({**at, **neutral_effect_parameter_values(effects)})
+    return own.pack_unknowns(at), own.pack_unknowns({**at, **neutral_effect_parameter_values(effects)})
 
 
 def _same(a: Recording, b: Recording) -> bool:

@@ -27,7 +27,7 @@ import scipy.sparse
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.integrator.step import Step, input_or_servo_torques_of_rollout
+from yid_ocp.integrator.step import Step, driven_joint_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.system import MidpointStateSymbols, System
@@ -67,7 +67,7 @@ class CompiledInverseDynamics:
         function = self._function.map(len(nodes))
         squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
         applied = np.zeros((len(nodes), n))
-        torque = input_or_servo_torques_of_rollout(self._step, theta, rollout)
+        torque = driven_joint_torques_of_rollout(self._step, theta, rollout)
         driven, prescribed = system.actuated_coordinate_indices, system.prescribed_coordinate_indices
         for indices, effort in ((driven, torque), (prescribed, rollout.effort)):
             if indices:
@@ -126,7 +126,7 @@ _MAX_PULSE_RANGE_RATIO = 1.5  # largest ratio of a pulse to the range of the his
 
 
 @dataclass(frozen=True)
-class ForceHistory:
+class ForceEstimate:
     """An estimate of an unknown force f over time at one location, as its log likelihood g'f - f'L f / 2."""
 
     recording: str
@@ -146,7 +146,7 @@ class ForceHistory:
         """The median time between neighbouring points [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def subset_at_time_indices(self, keep: IntArray) -> ForceHistory:
+    def subset_at_time_indices(self, keep: IntArray) -> ForceEstimate:
         """Return the estimate at only the time points with the indices `keep`."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
@@ -256,7 +256,7 @@ class _Rest:
     lost: Array
 
     @staticmethod
-    def of(history: ForceHistory, error: float, floor: float, slow: float) -> _Rest:
+    def of(history: ForceEstimate, error: float, floor: float, slow: float) -> _Rest:
         apart = np.abs(history.t[:, None] - history.t)
         quick = np.sqrt((error * history.model_error_std) ** 2 + floor**2 + history.friction_limit**2 / 3)
         covariance = np.outer(quick, quick) * (np.eye(len(apart)) + np.exp(-apart / _MODEL_ERROR_TIME)) / 2
@@ -307,7 +307,7 @@ class _Rest:
 
 
 def detect_force_pulses(
-    history: ForceHistory, limits: Thresholds = DEFAULT_THRESHOLDS
+    history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[list[DetectedForcePulse], float]:
     """Return the force pulses in a force estimate, largest evidence first, and the number of windows searched.
 
@@ -369,7 +369,7 @@ def _both_shapes(begin: Array, end: Array) -> _Windows:
     return _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
 
 
-def _rests(history: ForceHistory) -> list[_Rest]:
+def _rests(history: ForceEstimate) -> list[_Rest]:
     values = history.max_likelihood_force
     least = 1e-9 + float(np.median(history.model_error_std))
     spread = max(1.4826 * float(np.median(np.abs(values - np.median(values)))), least)
@@ -378,7 +378,7 @@ def _rests(history: ForceHistory) -> list[_Rest]:
     return [_Rest.of(history, error, floor * spread, slow * slowest) for error, floor, slow in grid]
 
 
-def _refined(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
+def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
     """Return the window with start, end and shape changed for the largest evidence."""
     spacing = history.time_spacing
     first, last, shortest = history.t[0] + spacing, history.t[-1] - spacing, _MIN_PULSE_POINTS * spacing
@@ -397,7 +397,7 @@ def _refined(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter
     return window
 
 
-def _other(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
+def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
     """Return a step or biphasic profile (M,) that explains as much as the pulse, which is then no event; else None."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, gain = end - begin, float(rest.gains(seen(window, t))[0])
@@ -413,7 +413,7 @@ def _other(history: ForceHistory, rest: _Rest, window: _Windows, seen: _Filter) 
 
 
 def _stands_out(
-    history: ForceHistory, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
+    history: ForceEstimate, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
 ) -> bool:
     """Return whether a pulse has an allowed length, fits the measured range, and exceeds the rest of the history."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
@@ -431,7 +431,7 @@ def _stands_out(
 
 
 def _sized(
-    history: ForceHistory, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
+    history: ForceEstimate, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
 ) -> list[DetectedForcePulse]:
     """Return the pulses with their sizes, which are estimated together on the background of largest evidence."""
     if not found:

@@ -32,7 +32,7 @@ from yid_ocp.inference.whitening import (
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, whitened_prediction_residual
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, whitened_residual_and_jacobian
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
@@ -152,7 +152,7 @@ class RefittedModel(RefitStatistics):
     @property
     def unknowns(self) -> Array:
         """The fitted values of the problem's unknowns, shape (nx,)."""
-        return self.problem.unknown_vector(self.values)
+        return self.problem.pack_unknowns(self.values)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class RefitContext:
     # effects that are refitted in one round, and the number of refits, likewise
     rounds: list[tuple[tuple[EffectBase, ...], int]] = field(default_factory=list)
 
-    def end_stage(self, name: str) -> None:
+    def record_stage_end(self, name: str) -> None:
         """Record that a stage ends now."""
         self.stage_ends[name] = time.perf_counter()
 
@@ -241,10 +241,10 @@ class RefitContext:
 
         return self._answer(self.record.screenings, name, screened)
 
-    def ranked_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
+    def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
-        ranked = screened.joint_score_model.ranked_candidate_pairs
+        ranked = screened.joint_score_model.rank_candidate_pairs
         return self._answer(self.record.pairs, without, lambda: tuple(ranked(labels))[:_MAX_RECORDED_PAIRS])
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:
@@ -289,7 +289,7 @@ def refit_with_effects(
     if not finish.ok:
         return None
     values = own.unknowns.named_values(outcome.x)
-    own = problem.relinearize_held_out_filters(own, effects, values)
+    own = problem.with_relinearized_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
     ranges = ((name, *ends) for effect in effects for name, ends in effect.prior_ranges.items())
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
@@ -305,8 +305,8 @@ def _evaluated(
 ) -> tuple[EstimationProblem, Evaluation]:
     """The problem with effects at known values, and its evaluation there."""
     own = problem.with_effects_and_relinearized_filters(effects, values)
-    finish = own.evaluate(own.unknown_vector(values))
-    return problem.relinearize_held_out_filters(own, effects, values), finish
+    finish = own.evaluate(own.pack_unknowns(values))
+    return problem.with_relinearized_held_out_filters(own, effects, values), finish
 
 
 def reevaluate_refit_with_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
@@ -321,7 +321,7 @@ def _model(
     known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation, spread: Array | None
 ) -> RefittedModel:
     kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
-    loss = held_out_loss(own, own.unknown_vector(known.values), end, spread)
+    loss = held_out_loss(own, own.pack_unknowns(known.values), end, spread)
     return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
 
 
@@ -331,7 +331,7 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
     own = problem.with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
-        outcome = REFIT_SOLVER.minimize_cost(own, own.unknown_vector({**start, **drawn}), None)
+        outcome = REFIT_SOLVER.minimize_cost(own, own.pack_unknowns({**start, **drawn}), None)
         if outcome.status != Status.FAILED:
             break
     found = _seen(problem, effects, outcome)
@@ -454,7 +454,7 @@ def held_out_loss(
         residuals.append(np.full(len(block), np.inf))
         errors.append(np.zeros((len(block), factor.shape[1])))
         if not isinstance(result, str):
-            part = whitened_prediction_residual(episode, whitening, result)
+            part = whitened_residual_and_jacobian(episode, whitening, result)
             residuals[-1], errors[-1] = part.residual, np.asarray(part.jacobian)[:, : len(factor)] @ factor
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
 

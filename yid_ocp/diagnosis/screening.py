@@ -29,7 +29,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference import null_test
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.null_test import ChannelResidualIndices, channels_with_residual_indices
 
 DETECTABLE_AMPLITUDE_Z = 2.576 + 1.282  # found with 90 % power at the 1 % level [standard deviations]
@@ -75,7 +75,7 @@ class CandidateDetectability:
 
 
 @dataclass(frozen=True)
-class CandidateScore:
+class ScoreTestResult:
     """The score test of one candidate effect: predicted parameter values, predicted decrease of chi2, and p-value."""
 
     effect: EffectBase
@@ -104,11 +104,11 @@ def linearize_candidates(
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
     placed = problem.with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
-    scatter = null_test.encoder_noise_residual_covariance_factor(placed, placed.unknown_vector(values))[rows.data]
+    scatter = null_test.encoder_noise_residual_covariance_factor(placed, placed.pack_unknowns(values))[rows.data]
     is_in_scatter = np.any(scatter, axis=1)
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
-    redrawn = [null_test.episodes_with_added_path_noise(placed, rng) for _ in draws]
+    redrawn = [null_test.episodes_with_added_encoder_noise(placed, rng) for _ in draws]
     # changes by encoder noise hardly depend on the effects in the model
     known = problem.changes_by_encoder_noise
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
@@ -117,11 +117,11 @@ def linearize_candidates(
         amplitudes = [name for effect, _ in chosen for name in effect.amplitude_parameter_names]
         trial = placed.with_free_parameters_without_recompiling((*placed.free, *amplitudes))
         trial = trial.with_parameter_values({name: value for _, shape in chosen for name, value in shape.items()})
-        evaluation = trial.evaluate(trial.unknown_vector(values), equilibrium_guesses=warm)
+        evaluation = trial.evaluate(trial.pack_unknowns(values), equilibrium_guesses=warm)
         if not evaluation.ok:
             raise failed_rollout_error(evaluation.message, "model with the candidate effects")
         warm = evaluation.equilibrium_guesses
-        data, jacobian = residual_and_jacobian_without_weak_priors(trial, evaluation)
+        data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
         places = [trial.unknown_names.index(name) for name in amplitudes]
         basis, follow = _basis_and_coefficients(np.delete(jacobian, places, axis=1), jacobian[:, places])
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
@@ -129,9 +129,9 @@ def linearize_candidates(
         if point not in known:
             known[point] = []
             for again in (trial.with_episodes(episodes, ()) for episodes in redrawn):
-                outcome = again.evaluate(again.unknown_vector(values))
+                outcome = again.evaluate(again.pack_unknowns(values))
                 if outcome.ok:
-                    other, slopes = residual_and_jacobian_without_weak_priors(again, outcome)
+                    other, slopes = residual_and_jacobian_with_stated_priors(again, outcome)
                     by_name = dict(zip(trial.unknown_names, (slopes - jacobian)[rows.data].T, strict=True))
                     known[point].append(((other - data)[rows.data] * ~is_in_scatter, by_name))
         errors, shifts = [], []
@@ -217,7 +217,7 @@ def _score_candidates(
     point: ProjectedCandidatesLinearization,
     series: Sequence[ChannelResidualIndices],
     visible: Sequence[CandidateDetectability],
-) -> tuple[CandidateScore, ...]:
+) -> tuple[ScoreTestResult, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
     found = []
     for grid in (own for entry, own in zip(visible, point._grids, strict=True) if entry.is_detectable):
@@ -228,7 +228,7 @@ def _score_candidates(
     return tuple(sorted(found, key=lambda s: -s.predicted_chi2_decrease))
 
 
-def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[CandidateScore]) -> float:
+def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[ScoreTestResult]) -> float:
     """Return the smallest p-value of the candidates after Bonferroni correction, or 1 if there are no candidates."""
     return min([1.0, *(score.p_value * len(ranked) for score in ranked)])
 
@@ -245,7 +245,7 @@ def _promised(information: Array, slope: Array, room: Array) -> tuple[Array, flo
     return step, float((2 * slope - information @ step) @ step)
 
 
-def _score(signature: _EffectSignature, residual: Array, series: Sequence[ChannelResidualIndices]) -> CandidateScore:
+def _score(signature: _EffectSignature, residual: Array, series: Sequence[ChannelResidualIndices]) -> ScoreTestResult:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = signature.score_bias - x.T @ residual
     room = _room(effect)
@@ -258,7 +258,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Channe
     if room[0].tolist() == [0.0]:
         statistic, p_value = (statistic, p_value / 2) if step[0] > 0 else (0.0, 1.0)
     values = _values(effect, step) | signature.shape_values
-    return CandidateScore(effect, values, max(decrease, 0.0), statistic, p_value)
+    return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value)
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
@@ -274,7 +274,7 @@ class ConfusabilityMatrix:
     labels: tuple[str, ...]
     overlap_fractions: Array  # shape (nj, nj): of row j's signature by column i's
 
-    def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
+    def candidates_confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
         """List the other candidates that explain at least the fraction `limit` of the signature of `label`."""
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
@@ -298,7 +298,7 @@ class _JointScoreModel:
         ends = np.cumsum([len(effect.amplitude_parameter_names) for effect in self.effects])
         return np.split(np.arange(len(self.score_vector)), ends)
 
-    def ranked_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
+    def rank_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
         """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
@@ -315,7 +315,7 @@ class _JointScoreModel:
 
 
 def _make_joint_score_model(
-    point: ProjectedCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
+    point: ProjectedCandidatesLinearization, chosen: Sequence[ScoreTestResult] = ()
 ) -> _JointScoreModel:
     """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
@@ -350,7 +350,7 @@ class ScreeningResult:
     """The detectability, score tests and confusability of all candidates at one point, with their joint model."""
 
     detectability: tuple[CandidateDetectability, ...]
-    candidate_scores: tuple[CandidateScore, ...]  # best first
+    candidate_scores: tuple[ScoreTestResult, ...]  # best first
     confusability: ConfusabilityMatrix
     joint_score_model: _JointScoreModel
 

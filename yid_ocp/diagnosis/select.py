@@ -28,7 +28,7 @@ _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 
 @dataclass(frozen=True)
-class GapClosure:
+class HeldOutGapClosure:
     """The fraction of the held-out gap that a model closes, with its 95 % interval. NaN if there is no gap."""
 
     fraction: float
@@ -45,7 +45,7 @@ class GapClosure:
         return {"closure": self.fraction, "closure_ci": [self.ci_low, self.ci_high]}
 
 
-UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
+UNDEFINED_GAP_CLOSURE = HeldOutGapClosure(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class SelectedEffect:
 
     effect: EffectBase
     refitted_model: RefitStatistics  # refit with all effects up to this one
-    cumulative_closure: GapClosure  # closure of the whole gap by all effects up to this one
+    cumulative_closure: HeldOutGapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
     extended_models: tuple[RefitStatistics, ...] = ()  # `refitted_model` with one plausible effect more
 
 
-def total_closure(entries: Sequence[SelectedEffect]) -> GapClosure:
+def total_gap_closure(entries: Sequence[SelectedEffect]) -> HeldOutGapClosure:
     """Return the fraction of the gap that all effects close together, that of the last one. Undefined without any."""
     return next((entry.cumulative_closure for entry in reversed(entries)), UNDEFINED_GAP_CLOSURE)
 
 
-def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
+def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> HeldOutGapClosure:
     """Compute the fraction of the held-out gap that closes from `before` to `after`, with a bootstrap interval."""
     if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
         return UNDEFINED_GAP_CLOSURE
@@ -77,7 +77,7 @@ def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> GapClosure:
         np.maximum((loss.block_chi2[draws].sum(axis=1) + loss.baseline_chi2) / n - 1.0, 0.0) for loss in (before, after)
     )
     low, high = np.quantile(1 - g1[g0 > 0] / g0[g0 > 0], [0.025, 0.975])
-    return GapClosure(fraction, float(low), float(high))
+    return HeldOutGapClosure(fraction, float(low), float(high))
 
 
 def _leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
@@ -85,7 +85,7 @@ def _leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
     return fit.held_out_loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
 
 
-def held_out_improvement_and_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
+def held_out_chi2_decrease_and_std_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
     """Compute the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
     total = float(before.block_sample_counts.sum())
     difference = before.block_chi2 - after.block_chi2
@@ -148,7 +148,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     The larger of both counts, because a few large blocks dominate the error of the sum.
     """
     loss, best = fit.held_out_loss, other.held_out_loss
-    lost, error = held_out_improvement_and_error(loss, best)
+    lost, error = held_out_chi2_decrease_and_std_error(loss, best)
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
     spread = float(np.std(ratios, ddof=1)) / math.sqrt(len(ratios))
     return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
@@ -157,7 +157,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better."""
     before, after = without.held_out_loss, fit.held_out_loss
-    gained, error = held_out_improvement_and_error(before, after)
+    gained, error = held_out_chi2_decrease_and_std_error(before, after)
     is_clear = gained > error
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
@@ -184,7 +184,7 @@ def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[Effe
     ranked = [score for score in screened.candidate_scores if score.p_value < limits.significance_level]
     best, others = ranked[: limits.n_refit_per_round], ranked[limits.n_refit_per_round :]
     table, most = screened.confusability, limits.signature_overlap
-    names = {name for s in best for name in table.confusable_with(s.effect.label, most)}
+    names = {name for s in best for name in table.candidates_confusable_with(s.effect.label, most)}
     alike = [s for s in others if s.effect.label in names][: limits.n_refit_per_round]
     return [((s.effect,), s.predicted_values) for s in (*best, *alike)]
 
@@ -221,7 +221,7 @@ def select_effects(
     first = sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
     while better := next((fit for fit, _ in near if _is_needed(chosen.fit, fit, limits)), None):
         # untried confusable candidates cannot be excluded yet
-        alike = seen.confusability.confusable_with(better.effects[-1].label, limits.signature_overlap)
+        alike = seen.confusability.candidates_confusable_with(better.effects[-1].label, limits.signature_overlap)
         untried = [(own[0], 0.0) for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
         rivals = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.fit.effects]
         before, chosen = chosen.fit, chosen.replaced(better, [*rivals, *untried])
@@ -270,10 +270,10 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
     limits, chosen = search.thresholds, list[EffectsWithStart]()
 
     def same(one: EffectBase, other: EffectBase) -> bool:
-        alike = screened.confusability.confusable_with(one.label, limits.signature_overlap)
+        alike = screened.confusability.candidates_confusable_with(one.label, limits.signature_overlap)
         return other.label in (one.label, *alike)
 
-    for (a, b), values, _ in search.ranked_candidate_pairs(screened, without.label):
+    for (a, b), values, _ in search.rank_candidate_pairs(screened, without.label):
         before = [order for pair, _ in chosen for order in (pair, pair[::-1])]
         if not any(same(a, c) and same(b, d) for c, d in before):
             chosen.append(((a, b), values))
@@ -364,7 +364,7 @@ def selected_effect_alone(
     return replace(entry, equivalent_effects=effects, shares=shares)
 
 
-def with_stds_that_include_model_error(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:
+def refit_with_model_error_in_stds(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:
     """Return the refit of `entry`, with stds of at least the rms change of a value by one effect more.
 
     This holds if the refit leaves a gap, in which any further effect may have a part.

@@ -17,7 +17,7 @@ from yid_ocp.display import abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
-from yid_ocp.inference.uncertainty import priors_that_determine_unknown, value_and_uncertainty_text
+from yid_ocp.inference.uncertainty import mask_of_unknowns_with_decisive_priors, value_and_uncertainty_text
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
@@ -74,7 +74,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     )
     text += _applying(notes)
     events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
-    text += [_listed("Excluded as brief disturbances: ", events), *ignored_after_overspeed_messages(result.events)]
+    text += [_listed("Excluded as brief disturbances: ", events), *overspeed_truncation_messages(result.events)]
     return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
 
 
@@ -84,7 +84,7 @@ def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     return f"The nominal model follows {cut.recording} for {used:.3g} of {whole:.3g} s only; the rest is ignored."
 
 
-def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
+def overspeed_truncation_messages(events: EventSet) -> list[str]:
     """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
     said, why = "s are ignored in", "moves too fast for the model."
     return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
@@ -202,7 +202,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         data, priors = (fit.evaluation.jacobian[part] for part in (rows.data, rows.stated_priors))
         others: dict[str, None] = {}
         for name in own.amplitude_parameter_names:
-            by = priors_that_determine_unknown(data, priors, names.index(name))
+            by = mask_of_unknowns_with_decisive_priors(data, priors, names.index(name))
             others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
         beside = f"These motions determine {own.label} only in relation to "
         text.append(_listed(beside, others, ": state one of them exactly."))
@@ -212,7 +212,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """An effect with its estimates, and warnings if one is far outside its expected range or no size is determined."""
     values, odd, neutral = [], "", effect.neutral_values
-    for name, r in effect.parameters_as_reported(fit.values, fit.std).items():
+    for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
         known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
     for name in fit.implausible_parameters(effect, limits):
@@ -246,7 +246,7 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
     since, swapped, text = result.baseline_comparison, result.counterfactual, list[str]()
     if since is not None:
         moved = []
-        for own in since.changed_parameters:
+        for own in since.significant_parameter_shifts:
             before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
             now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
             moved.append(f"{own.name} goes from {before} to {now} {own.unit}")

@@ -10,7 +10,7 @@ from typing import Literal
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, select_effects
+from yid_ocp.diagnosis.select import HeldOutGapClosure, SelectedEffect, select_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
@@ -45,7 +45,7 @@ class EffectAmplitudeTransferCheck:
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
-    def std_of_significant_disagreement(self) -> float:
+    def disagreement_std_if_significant(self) -> float:
         """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
         apart = abs(self.estimation_value - self.held_out_value)
         spread = math.hypot(self.estimation_std, self.held_out_std)
@@ -63,7 +63,7 @@ class NominalModelGapEvidence:
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
     discretisation_chi2: float = 0.0  # r'r that a finer discretisation may still remove
 
-    def exceeds_noise(self, limits: Thresholds) -> bool:
+    def residual_exceeds_noise(self, limits: Thresholds) -> bool:
         """Check whether the residual as a whole exceeds noise by a relevant amount."""
         whole = ExcessResidualCriteria(limits.gap_significance_level, limits.min_excess_chi2_per_dof)
         return residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
@@ -76,7 +76,7 @@ class NominalModelGapEvidence:
         scores = self.screening.candidate_scores
         seen = [score for score in scores if score.predicted_chi2_decrease > self.discretisation_chi2]
         is_along_candidate = bonferroni_corrected_min_candidate_p_value(seen) < limits.gap_significance_level
-        return self.has_left_baseline or is_along_candidate or self.exceeds_noise(limits)
+        return self.has_left_baseline or is_along_candidate or self.residual_exceeds_noise(limits)
 
     @property
     def are_data_sufficient(self) -> bool:
@@ -84,7 +84,7 @@ class NominalModelGapEvidence:
         is_seen = any(entry.is_detectable for entry in self.screening.detectability)
         return is_seen and self.nominal_test.degrees_of_freedom > len(self.nominal_model.values)
 
-    def warrants_search(self, limits: Thresholds) -> bool:
+    def warrants_effect_search(self, limits: Thresholds) -> bool:
         """Check whether there may be a gap and the data suffice to search for its cause."""
         return self.may_have_gap(limits) and self.are_data_sufficient
 
@@ -102,9 +102,9 @@ class Judgement:
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
 
     @property
-    def closure_by_selected_effects(self) -> GapClosure:
+    def closure_by_selected_effects(self) -> HeldOutGapClosure:
         """The fraction of the gap that all selected effects close together. Undefined without effects."""
-        return select.total_closure(self.selected_effects)
+        return select.total_gap_closure(self.selected_effects)
 
     @property
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
@@ -177,9 +177,9 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     """
     limits, nominal = search.thresholds, evidence.nominal_model
     fits, added = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...]()
-    if evidence.warrants_search(limits):
+    if evidence.warrants_effect_search(limits):
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
-    search.end_stage("refits")
+    search.record_stage_end("refits")
 
     def judged(chosen: tuple[SelectedEffect, ...]) -> Judgement:
         carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
@@ -187,11 +187,11 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             last = chosen[-1].refitted_model
             explained = _explained_fraction(nominal, last, limits)
             carried = _check_effect_amplitude_transfer(search, last)
-            last = select.with_stds_that_include_model_error(chosen[-1], limits)
+            last = select.refit_with_model_error_in_stds(chosen[-1], limits)
             last = _inflate_fit_stds_by_disagreement(last, carried)
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
-        verdict, reason = _verdict(said, evidence.exceeds_noise(limits), evidence.are_data_sufficient, limits)
+        verdict, reason = _verdict(said, evidence.residual_exceeds_noise(limits), evidence.are_data_sufficient, limits)
         return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
     said = judged(added)
@@ -199,7 +199,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
         # a further effect that only corrects errors of the first is no reason to doubt this one
         alone = judged((select.selected_effect_alone(added[0], nominal, fits, limits),))
         said = alone if alone.verdict != "unknown" else said
-    search.end_stage("transfer")
+    search.record_stage_end("transfer")
     return said
 
 
@@ -250,7 +250,7 @@ def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
-        least = _DISAGREEMENT_Z * entry.std_of_significant_disagreement
+        least = _DISAGREEMENT_Z * entry.disagreement_std_if_significant
         away.append(abs(entry.estimation_value - effect.neutral_values[name]) > least)
         found.append(entry)
     return [replace(entry, is_consistent=any(away)) for entry in found]
@@ -260,5 +260,5 @@ def _inflate_fit_stds_by_disagreement(
     fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
 ) -> RefitStatistics:
     """The fit with stds of at least |difference|/sqrt(2) for amplitudes that disagree between recordings."""
-    least = {f"{e.effect_label}.{e.parameter}": e.std_of_significant_disagreement for e in entries}
+    least = {f"{e.effect_label}.{e.parameter}": e.disagreement_std_if_significant for e in entries}
     return replace(fit, std={name: max(std, least.get(name, 0.0)) for name, std in fit.std.items()})

@@ -137,7 +137,7 @@ class EffectBase(Effect):
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
     @property
-    def sticking_speed(self) -> float:
+    def max_sticking_speed(self) -> float:
         """The joint speed [rad/s] below which this friction can hold the joint. It is 0 if it cannot hold a joint."""
         return 0.0
 
@@ -146,7 +146,7 @@ class EffectBase(Effect):
         """The lowest and highest expected value of every parameter, by name, in the parameter's unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
-    def parameters_as_reported(
+    def to_reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
         """Convert the parameters to the form used in reports. For example, a compliance is reported as a stiffness.

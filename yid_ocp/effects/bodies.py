@@ -13,7 +13,7 @@ import numpy as np
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, ReportedParameterValue
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
-from yid_ocp.model.mechanism import Inertia, merge_bodies, symbolic_rotation_from_rpy
+from yid_ocp.model.mechanism import Inertia, merge_inertias, symbolic_rotation_from_rpy
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.model.system import EffectStepTerms, ForceWithFactoredDerivatives, MidpointStateSymbols, System
 
@@ -36,7 +36,7 @@ class _CarriedBody(NamedTuple):
 
 def _carried_body(system: System, joint: int) -> _CarriedBody:
     """Nominal mass properties of the bodies on a joint's moving side, in its frame. Without bodies the mass is zero."""
-    whole = merge_bodies([replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies])
+    whole = merge_inertias([replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies])
     if whole is None:
         return _CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
     parameters = system.parameters
@@ -180,11 +180,11 @@ class _Payload(EffectBase):
         other = float(np.clip(opposite, self.definitions[0].lower, self.definitions[0].upper))
         return {f"{self.label}.mass": other} if other * mass < 0 else None
 
-    def parameters_as_reported(
+    def to_reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameterValue]:
         """Return the mass and the limited first moments for reports. Moments at their limit have the std NaN."""
-        found = super().parameters_as_reported(values, stds)
+        found = super().to_reported_parameters(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
         kept = float(_kept(ca.SX(mass), ca.SX(ca.DM(moments)), own))

@@ -44,7 +44,7 @@ class _JointFriction(EffectBase):
     possible_locations = base.arm_joint_names
 
     @property
-    def sticking_speed(self) -> float:
+    def max_sticking_speed(self) -> float:
         """The speed 3 v_s [rad/s], at which tanh(v/v_s) is 0.995."""
         return 3 * self.sign_smoothing_speed
 
@@ -68,7 +68,7 @@ def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Eff
     return replace(effect, sign_smoothing_speed=speed)
 
 
-def effect_as_sharp_as_nominal_friction(effect: EffectBase, system: System) -> EffectBase:
+def effect_with_lowest_smoothing_speed(effect: EffectBase, system: System) -> EffectBase:
     """Return a joint friction with the lowest smoothing speed of all at its joint. Other effects are unchanged."""
     if not isinstance(effect, _JointFriction):
         return effect
@@ -84,7 +84,7 @@ class _JointViscous(_JointFriction):
     equation = "F = -b v"
     declared_parameters = (effort_limit_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
 
-    sticking_speed = 0.0
+    max_sticking_speed = 0.0
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["b"] * v

@@ -161,7 +161,7 @@ def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[st
     return ("angle", "speed", *driven, *(("command",) if location in system.servos else ()), "time")
 
 
-def torque_law_argument_along_rollout(
+def torque_law_quantity_at_midpoints(
     system: System, location: str, quantity: str, theta: Array, nodes: Mapping[str, Array]
 ) -> Array:
     """Compute `quantity` (N, joints), such as speed or load, at the midpoints of the N steps of a rollout.

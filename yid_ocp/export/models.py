@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element, SubElement
 import casadi as ca
 import numpy as np
 
-from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_bodies, rpy_from_rotation
+from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_inertias, rpy_from_rotation
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.virtual import mjcf
@@ -68,7 +68,7 @@ def _xml_text(root: Element) -> str:
 
 def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, mjcf.JointDynamicsTerms]]:
     """Return the mechanism with numbers and without separate weights of bodies, and the dynamics of its joints."""
-    tree = system.numeric_mechanism(values).with_gravity_fraction(None)
+    tree = system.mechanism_with_values(values).with_gravity_fraction(None)
     return tree, mjcf.system_joint_dynamics_terms(system, mjcf.ExpressionEvaluator(system, values))
 
 
@@ -77,7 +77,7 @@ def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
     link = SubElement(model, "link", name=f"{joint.name}_link")
     above = {} if joint.parent_index < 0 else {"relative_to": f"{tree.joints[joint.parent_index].name}_link"}
     _sdf_pose(link, joint.placement, above)
-    body = merge_bodies(joint.bodies)
+    body = merge_inertias(joint.bodies)
     if body is None:
         body = Inertia.from_values(_MIN_LINK_MASS, np.zeros(3), _MIN_LINK_INERTIA * np.eye(3))
     inertial = SubElement(link, "inertial")
@@ -133,7 +133,7 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
-    known = mjcf.format_elements_by_model_aspect()[aspect]
+    known = mjcf.file_format_elements_by_aspect()[aspect]
     if aspect == "reading":
         return _READING
     if form not in known:
@@ -142,7 +142,7 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 
 
 _READING = FeatureExportSupport(
-    "not representable", f"{mjcf.format_elements_by_model_aspect()['reading']['is']}: correct the readings instead"
+    "not representable", f"{mjcf.file_format_elements_by_aspect()['reading']['is']}: correct the readings instead"
 )
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is omitted")
 _UNUSED = FeatureExportSupport("native", "it has no influence on this model")

@@ -101,7 +101,7 @@ class KalmanStepMatrices:
         return (found + found.T) / 2, cross, added
 
 
-def kalman_matrices_and_next_covariance(
+def kalman_gains_covariance_and_logdet(
     covariance: Array, observation: Array, transition: StateTransition
 ) -> tuple[KalmanStepMatrices, Array, float]:
     """Compute the gains of a filter step, the next state covariance without process noise, and log det S.
@@ -218,7 +218,7 @@ def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_v
     return (ctypes.c_void_p * len(arrays))(*(None if array is None else array.ctypes.data for array in arrays))
 
 
-def kalman_steps_and_covariance(
+def kalman_filter_and_covariance(
     covariance: Array,
     observation: Array,
     row_start: Sequence[int],
@@ -240,7 +240,7 @@ def kalman_steps_and_covariance(
     if library is None:
         roots, parameters = np.split(white, np.cumsum(count**2)[:-1]), np.arange(ns, len(covariance))
         for k, (span, transition) in enumerate(zip(found._spans, found._transitions, strict=True)):
-            step, covariance, _ = kalman_matrices_and_next_covariance(covariance, observation[span], transition)
+            step, covariance, _ = kalman_gains_covariance_and_logdet(covariance, observation[span], transition)
             roots[k][:], projected[span] = step.whitening.ravel(), step.projected_covariance
             covariance[parameters, parameters] += variance[k]
             covariance[:ns, :ns] += moves[k, :, known:] @ moves[k, :, known:].T

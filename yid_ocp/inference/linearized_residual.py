@@ -82,11 +82,11 @@ class ResidualDerivativesByStateAndEffort:
         readings = []
         for samples in trajectory.measurements:
             read_sensor = trajectory.model_functions.compiled_sensor_function(samples.sensor)
-            values = trajectory.rollout_node_values.select_nodes(samples.evaluation_nodes)
+            values = trajectory.rollout_node_values.select_nodes(samples.evaluation_node_indices)
             readings.append(read_sensor(values, theta))
         n_forces, width = (step.sizes["m"], 4) if any(read.needs_neighbours for read in readings) else (0, 2)
         for samples, read in zip(trajectory.measurements, readings, strict=True):
-            used = samples.evaluation_nodes
+            used = samples.evaluation_node_indices
             if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
                 message = f"sensor '{name}' measures velocities, accelerations or constraint forces"
@@ -147,15 +147,13 @@ class ResidualDerivativesByStateAndEffort:
 _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
-def residual_and_jacobian_without_weak_priors(
-    problem: EstimationProblem, evaluation: Evaluation
-) -> tuple[Array, Array]:
+def residual_and_jacobian_with_stated_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
     """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
     units = np.ones(len(evaluation.residual))
     units[rows.data] = problem.stated_rms_noise_of_data_residuals
-    units = units[kept := rows.slice_without_weak_priors]
+    units = units[kept := rows.slice_of_data_and_stated_priors]
     return evaluation.residual[kept] / units, evaluation.jacobian[kept] / units[:, None]
 
 
@@ -211,7 +209,7 @@ def size_limited_damped_step(
     return size * bounded_levenberg_marquardt_step(jacobian * size, residual, mu, low, high)
 
 
-def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
+def max_abs_projected_gradient(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
     """Return the largest absolute entry of the scaled gradient, except entries that push against an active bound."""
     free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))

@@ -162,14 +162,14 @@ def encoder_noise_residual_covariance_factor(
         return nothing
     rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
     for _ in range(_N_PATH_NOISE_DRAWS):
-        after = residual_of(problem.with_episodes(episodes_with_added_path_noise(problem, rng), ()))
+        after = residual_of(problem.with_episodes(episodes_with_added_encoder_noise(problem, rng), ()))
         if after is not None:
             found.append(np.zeros(len(before)))
             found[-1][at] = (after - before)[at]
     return np.stack(found, axis=1) / np.sqrt(len(found)) if found else nothing
 
 
-def episodes_with_added_path_noise(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
+def episodes_with_added_encoder_noise(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
     """Return the recordings with one more random draw of encoder noise in the prescribed motion, not in sensor data."""
     return [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
 
@@ -271,4 +271,4 @@ def _noise_autocorrelation(low_pass: SmoothingFilter | None, step: float) -> Arr
     times = step * np.arange(2 * half + 1, dtype=float)
     response = low_pass(times, impulse)[:, 0]
     full = np.correlate(response, response, "full")[2 * half :]
-    return np.asarray(full[:half] / full[0])[:: low_pass.decorrelation_stride(step)]
+    return np.asarray(full[:half] / full[0])[:: low_pass.decorrelation_stride_for_step(step)]

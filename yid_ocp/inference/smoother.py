@@ -26,9 +26,9 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, kalman_matrices_and_next_covariance
+from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, kalman_gains_covariance_and_logdet
 from yid_ocp.inference.smoother_model import (
-    LinearResidualModel,
+    ResidualStateSpaceModel,
     SmoothedUnknownGroup,
     residual_models_with_smoother_unknowns,
 )
@@ -39,7 +39,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import subtract_estimated_bias_and_clock_errors
 
-_Models = Sequence[LinearResidualModel]
+_Models = Sequence[ResidualStateSpaceModel]
 _Groups = Sequence[SmoothedUnknownGroup]
 _Variances = dict[SmoothedUnknownGroup, float]  # [squared reference]
 
@@ -118,7 +118,7 @@ class _Update(NamedTuple):
 class _Filtered:
     """Filter of one recording at given variances, for states and unknowns of nonzero variance, which are `used`."""
 
-    model: LinearResidualModel
+    model: ResidualStateSpaceModel
     used: IntArray
     products: Array  # V' S^-1 V, shape (1 + ntheta, 1 + ntheta)
     log_determinant: float  # infinite if large variances make the filter ill-conditioned
@@ -135,7 +135,7 @@ class _Smoothed(NamedTuple):
     left: tuple[Array, ...]  # smoothed residuals
 
 
-def _forwards(model: LinearResidualModel, variance: Array) -> _Filtered:
+def _forwards(model: ResidualStateSpaceModel, variance: Array) -> _Filtered:
     """Filter one recording with given variances of the unknowns, shape (nd,)."""
     variance = variance[used := np.flatnonzero(variance > 0)]
     ns, nd = len(model.initial_state_std), len(used)
@@ -152,7 +152,7 @@ def _forwards(model: LinearResidualModel, variance: Array) -> _Filtered:
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
         transition = StateTransition(move, np.full(nd, model.interval_correlation))
-        step, later, own = kalman_matrices_and_next_covariance(p, design, transition)
+        step, later, own = kalman_gains_covariance_and_logdet(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, used, products, math.inf, ())
         white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)
@@ -221,7 +221,7 @@ class _State:
 def _run(models: _Models, variance: _Variances) -> _State:
     """Filter all recordings at given variances."""
 
-    def run(model: LinearResidualModel) -> _Filtered:
+    def run(model: ResidualStateSpaceModel) -> _Filtered:
         return _forwards(model, model.prior_variances_of_unknowns(variance))
 
     filtered = tuple(map_in_threads(run, models))
@@ -343,7 +343,7 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
     return -float(outcome.fun), 10.0 ** float(outcome.x)
 
 
-def smooth_unknowns_about_fit(
+def smooth_unknown_forces_and_biases(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, least: float = DEFAULT_MIN_LOG_BAYES_FACTOR
 ) -> SmoothedUnknownsResult:
     """Select and estimate unknown forces, offsets and biases that raise the log evidence at `x` by more than `least`.
@@ -388,7 +388,7 @@ def smooth_unknowns_about_fit(
 
 
 def force_log_likelihood_coefficients(
-    model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknowns: Sequence[int]
+    model: ResidualStateSpaceModel, variance: Mapping[SmoothedUnknownGroup, float], unknowns: Sequence[int]
 ) -> list[tuple[Array, Array]]:
     """Return g (J,) and L (J, J) in the log likelihood g'f - f'L f / 2 of unknowns with values f (J,) in J intervals.
 
@@ -407,7 +407,7 @@ def force_log_likelihood_coefficients(
     return found
 
 
-def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedDisturbances:
+def _trace(model: ResidualStateSpaceModel, done: _Smoothed, state: _State) -> SmoothedDisturbances:
     """The unknowns of one recording. Their standard deviations include the uncertainty of the free parameters."""
     smoothed, by_theta = done.mean[:, :, 0] - done.mean[:, :, 1:] @ state.shift, done.mean[:, :, 1:]
     spread = np.sqrt(np.maximum(done.covariance + np.sum((by_theta @ state.spread) * by_theta, axis=2), 0.0))
@@ -552,7 +552,7 @@ def gap_locations_from_effects_and_smoother(
     return _by_share(found)
 
 
-def z_scores_of_smoothed_unknowns(
+def interval_edges_names_and_z_scores(
     smoothed: SmoothedUnknownsResult, recording: int = 0
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Return the interval edges (J + 1,) [s], the names of nd smoothed unknowns, and their z scores (J, nd).

@@ -31,7 +31,7 @@ from yid_ocp.inference.linearized_residual import (
 )
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import (
-    input_or_servo_torques_of_rollout,
+    driven_joint_torques_of_rollout,
     iterate_step_derivatives,
     reachable_and_observable_state_mask,
 )
@@ -119,7 +119,7 @@ def _smoother_unknowns(course: _LinearizedEpisode) -> _SmootherUnknowns:
         for column, name in enumerate(sensor.output_names):
             if not np.any(samples.positive_weight_mask[:, column]):
                 continue
-            frame = sensor.measurement_frame_names[column]
+            frame = sensor.frame_name_per_output[column]
             biased.append((k, column))
             names.append(name)
             sources.append(SmoothedUnknownGroup(sensor_bias_location_name(course.system, sensor, frame), "bias"))
@@ -150,7 +150,7 @@ def _unknown_forces(course: _LinearizedEpisode) -> tuple[list[str], list[Smoothe
 def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str:
     """Return the location of a sensor's bias: `camera`, `wrist:FRAME`, the frame's grasp, or the sensor's group."""
     held = (grasp.name for grasp in system.grasps if frame in (grasp.held_frame, grasp.holder_frame))
-    return sensor.bias_location(frame) or next(held, sensor.group_name)
+    return sensor.bias_location_name_for_frame(frame) or next(held, sensor.group_name)
 
 
 def _loads(course: _LinearizedEpisode) -> Array:
@@ -164,7 +164,7 @@ def _loads(course: _LinearizedEpisode) -> Array:
         values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.nominal.theta)).ravel()
         for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-    torque = input_or_servo_torques_of_rollout(course.problem.step, course.nominal.theta, rollout)
+    torque = driven_joint_torques_of_rollout(course.problem.step, course.nominal.theta, rollout)
     for indices, force in (
         (system.actuated_coordinate_indices, torque),
         (system.prescribed_coordinate_indices, rollout.effort),
@@ -212,7 +212,7 @@ class _IntervalModel:
 
 
 @dataclass(frozen=True)
-class LinearResidualModel:
+class ResidualStateSpaceModel:
     """A linear state-space model of one recording's residual, with one set of matrices for each time interval."""
 
     recording: str
@@ -233,7 +233,7 @@ class LinearResidualModel:
 
 def residual_models_with_smoother_unknowns(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, interval: float = _MIN_INTERVAL
-) -> tuple[LinearResidualModel, ...]:
+) -> tuple[ResidualStateSpaceModel, ...]:
     """Linearize every recording's residual with respect to unknown forces, offsets and biases.
 
     `evaluation` is the evaluation at the unknowns `x`, with a Jacobian. The unknown forces, offsets and biases are
@@ -304,7 +304,7 @@ def _steps(
     return np.concatenate(a), np.concatenate(e), np.concatenate(effort)
 
 
-def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, shortest: float) -> LinearResidualModel:
+def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, shortest: float) -> ResidualStateSpaceModel:
     """Linear model of one recording from its whitened residuals and their derivatives."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
     length = int(max(round(shortest / h), math.ceil(steps * _MIN_INTERVAL / (_MAX_INTERVAL_COUNT * shortest)), 1))
@@ -345,7 +345,7 @@ def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, short
     told = h * edges, unknowns.names, unknowns.sources, unknowns.reference
     start = at_rest, np.zeros(ns) if rests else _loose_start(course)[moving]
     noise = _torque_noise(course, unknowns, span, decay)
-    return LinearResidualModel(course.episode.name, tuple(intervals), *told, *start, decay, noise)
+    return ResidualStateSpaceModel(course.episode.name, tuple(intervals), *told, *start, decay, noise)
 
 
 def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span: float, decay: float) -> Array:

@@ -13,7 +13,7 @@ import scipy.special
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.inference import null_test
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -79,7 +79,7 @@ class ParameterEstimate:
 
 
 @dataclass(frozen=True)
-class EstimateShiftByLinksAndTimeStep:
+class EstimateShiftByDiscretisation:
     """The change of an estimate if the number of links is doubled or the time step halved. None if not computed."""
 
     links: float | None = None
@@ -118,7 +118,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
     spread, chi2 = noise_only_covariance_sqrt(problem, evaluation), _chi2_per_dof(problem, evaluation)
     scale = max(1.0, chi2)
-    priors = residual_and_jacobian_without_weak_priors(problem, evaluation)[1][problem.residual_rows.stated_priors]
+    priors = residual_and_jacobian_with_stated_priors(problem, evaluation)[1][problem.residual_rows.stated_priors]
     pull = spread @ (priors @ spread).T * math.sqrt(max(0.0, problem.options.stated_std_factor**-2 - scale))
     return spread @ spread.T * scale + pull @ pull.T, chi2
 
@@ -126,7 +126,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 def noise_only_covariance_sqrt(problem: EstimationProblem, evaluation: Evaluation) -> Array:
     """Compute F (nx, nx) of the unknowns' covariance F F' from noise alone. F is precise in weak directions, too."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
-    _, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
+    _, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
     if len(vectors) < count:
         rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
@@ -142,13 +142,13 @@ def effective_parameter_count(problem: EstimationProblem, evaluation: Evaluation
     count, rows = len(problem.unknown_names), problem.residual_rows.stated_priors
     if evaluation.jacobian is None or rows.start == rows.stop:
         return count
-    priors = residual_and_jacobian_without_weak_priors(problem, evaluation)[1][rows]
+    priors = residual_and_jacobian_with_stated_priors(problem, evaluation)[1][rows]
     return count - float(np.sum((priors @ noise_only_covariance_sqrt(problem, evaluation)) ** 2))
 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
     """Chi2 of the data per degree of freedom. Stated priors count as observations."""
-    residual, _ = residual_and_jacobian_without_weak_priors(problem, evaluation)
+    residual, _ = residual_and_jacobian_with_stated_priors(problem, evaluation)
     data = residual[problem.residual_rows.data]
     return float(data @ data) / max(len(residual) - len(problem.initial_unknowns), 1)
 
@@ -163,7 +163,7 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     """
     if evaluation.jacobian is None or not len(covariance):
         return covariance
-    residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
+    residual, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
     jacobian = jacobian * (scale := problem.unknown_scales)
     priors = jacobian[problem.residual_rows.stated_priors] / problem.options.stated_std_factor
     information = jacobian.T @ jacobian
@@ -254,7 +254,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
             moved = np.clip(x + sign * step * covariance[:, i] / covariance[i, i], lower, upper)
             trial = problem.evaluate(moved, False, evaluation.equilibrium_guesses)
             if trial.ok:
-                rise = cost_without_weak_priors(problem, trial) - cost_without_weak_priors(problem, evaluation)
+                rise = cost_with_stated_priors(problem, trial) - cost_with_stated_priors(problem, evaluation)
                 heights.append(max(2.0 * rise / scale, 1e-12) / (step / spread[i]) ** 2)
         if heights and min(heights) < _MIN_COST_RISE_RATIO:
             spread[i] /= math.sqrt(min(heights))
@@ -284,7 +284,7 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
     return {"names": [names[i] for i in at], "matrix": kept.tolist()}
 
 
-def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
+def cost_with_stated_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
     """Return the cost r'r/2 of data (in units of noise) and stated priors, without weak priors."""
     rows = problem.residual_rows
     weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
@@ -413,7 +413,7 @@ def parameter_estimates(
             std = math.inf
         elif side:
             # slope of the cost in units of the noise, which includes the misfit
-            residual, jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)
+            residual, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
             pull = std * abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
             # one-sided 95 % end: pull d/std + d^2/(2 std^2) = 2.71/2 at a distance d from the bound
             reach = std * (math.sqrt(pull**2 + _CHI2_95_ONE_SIDED) - pull)
@@ -491,7 +491,7 @@ def interval_text(lower: float | None, upper: float | None) -> str:
     return f"above {lower:.4g}" if upper is None else f"{lower:.4g} to {upper:.4g}"
 
 
-def priors_that_determine_unknown(data: Array, priors: Array, column: int) -> BoolArray:
+def mask_of_unknowns_with_decisive_priors(data: Array, priors: Array, column: int) -> BoolArray:
     """Return a mask (nx,) of the unknowns whose priors determine the unknown `column`. All False if the data do.
 
     `data` (n, nx) and `priors` (k, nx) are Jacobians of whitened residuals. Priors determine an unknown if its standard
@@ -522,7 +522,7 @@ class EstimateChecksBeyondFit:
     ----------
     data_std : mapping of str to float
         Standard deviation of every free parameter, without discretisation error.
-    discretisation_shifts : mapping of str to EstimateShiftByLinksAndTimeStep
+    discretisation_shifts : mapping of str to EstimateShiftByDiscretisation
         Shift of every free parameter in each finer model that was tried.
     notes, uncounted_errors : tuple of str
         Why a shift is unknown; discretisations whose error the standard deviations do not include.
@@ -533,7 +533,7 @@ class EstimateChecksBeyondFit:
     """
 
     data_std: Mapping[str, float] = field(default_factory=dict)
-    discretisation_shifts: Mapping[str, EstimateShiftByLinksAndTimeStep] = field(default_factory=dict)
+    discretisation_shifts: Mapping[str, EstimateShiftByDiscretisation] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     uncounted_errors: tuple[str, ...] = ()
     held_out_predictions: tuple[PredictedEpisodeOrFailure, ...] = ()

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import FixedGainKalmanFilter, kalman_steps_and_covariance
+from yid_ocp.inference.kalman import FixedGainKalmanFilter, kalman_filter_and_covariance
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
     ResidualDerivativesByStateAndEffort,
@@ -49,7 +49,7 @@ from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel
-from yid_ocp.problem.estimation_problem import held_out_parameter_vector, held_out_prediction_inputs
+from yid_ocp.problem.estimation_problem import held_out_parameter_vector, held_out_prediction_arguments
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import subtract_estimated_bias_and_clock_errors
 
@@ -162,7 +162,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErr
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
     still = np.eye(len(kept), len(kept) + nu)[None], 0, np.ones((1, 2 * nu)), np.zeros((1, 2 * nu))
-    kalman, covariance = kalman_steps_and_covariance(covariance, observe, (0, len(rows)), *still)
+    kalman, covariance = kalman_filter_and_covariance(covariance, observe, (0, len(rows)), *still)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
     last = _FilterPart(count, rows, np.full(len(rows), count), kalman, none)
     return WhiteningFilter((steps, last), errors, first, live, spread)
@@ -187,7 +187,7 @@ def _filter_steps(
         feedback = None
     elif feedback is not None:
         # momenta that the filter follows contain torques of the previous step
-        shift = course.model_functions.reference_momentum_correction
+        shift = course.model_functions.effect_momentum_calculator
         momentum = shift.momentum_derivative_by_previous_torque(course.theta)
         driving = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
         # only errors of the filter's reference angles count; those of momenta average out
@@ -216,7 +216,7 @@ def _filter_steps(
         observe[own, known:] = observe[own, ns:known]
         observe[own, :ns] += before[own]
         starts, noise = (ends[span.start : span.stop + 1] - own.start).tolist(), (inputs.shape[2] - nu, decay[span])
-        steps, covariance = kalman_steps_and_covariance(covariance, observe[own], starts, move, *noise, variance[span])
+        steps, covariance = kalman_filter_and_covariance(covariance, observe[own], starts, move, *noise, variance[span])
         blocks.append(steps.whitening)
         projected[own] = steps.projected_covariance
         begun = span.stop
@@ -230,7 +230,7 @@ def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, wh
 
 
 def _innovations_and_bias(episode: Episode, result: EpisodePrediction, by: ProcessNoiseWhitener) -> tuple[Array, Array]:
-    rows, push = _plain(episode, result)[:, None], result.feedback_torque_and_sensitivity
+    rows, push = _plain(episode, result)[:, None], result.stacked_feedback_torque_and_sensitivity
     return by.whiten_residuals_and_estimate_torque_bias(rows, push)
 
 
@@ -277,7 +277,7 @@ def _about_smoothed(
     """Episode with smoothed torque errors and, if encoders are measurements, a smoothed reference motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
-    plain, push = _plain(episode, result), result.feedback_torque_and_sensitivity
+    plain, push = _plain(episode, result), result.stacked_feedback_torque_and_sensitivity
     bias, noise, state_error = before._smooth_input_errors(plain, push)
     own = predictor.theta_with_episode_values(episode, theta)
     errors = replace(errors, torque_bias=bias, torque_noise=noise)
@@ -355,7 +355,7 @@ def problem_with_held_out_kalman_whitening(
     recording whose rollout fails is weighted by sensor noise only.
     """
     x, episodes, made = np.asarray(x, float), [], []
-    known = zip(problem.held_out_whitening_filters, held_out_prediction_inputs(problem, x), strict=True)
+    known = zip(problem.held_out_whitening_filters, held_out_prediction_arguments(problem, x), strict=True)
     for held, (before, (own, theta, offset)) in zip(problem.held_out, known, strict=True):
         whitening, at = _own_filter(before), (theta, offset)
         result = problem.predictor.predict_episode(own, *at, False) if own.input_errors else None
@@ -379,7 +379,7 @@ def problem_with_reestimated_held_out_torque_biases(
     problem: EstimationProblem, x: Array, frozen: Array
 ) -> EstimationProblem:
     """Return a problem with held-out whitening filters at the torque offsets of `x`, and the gains at `frozen`."""
-    pairs = zip(held_out_prediction_inputs(problem, x), problem.held_out, strict=True)
+    pairs = zip(held_out_prediction_arguments(problem, x), problem.held_out, strict=True)
     at = [(*own, held_out_parameter_vector(problem, frozen, held)) for own, held in pairs]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
     return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
@@ -390,7 +390,7 @@ def problem_with_sensor_noise_only(problem: EstimationProblem) -> EstimationProb
     return _with_errors(problem, lambda errors: errors.with_torque_bias_only)
 
 
-def problem_without_input_errors(problem: EstimationProblem) -> EstimationProblem:
+def problem_with_exact_inputs(problem: EstimationProblem) -> EstimationProblem:
     """Return the problem with its recorded torques and angles treated as exact."""
     return _with_errors(problem, lambda errors: None)
 

@@ -174,7 +174,7 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
     nt, nqz = n + nz + m, n + nz
 
     def at(key: str) -> tuple[IntArray, IntArray]:
-        return nonzero_indices(functions.sparsity_patterns[key])
+        return nonzero_rows_and_columns(functions.sparsity_patterns[key])
 
     related = np.zeros((n, n), bool)
     ancestors = tuple(np.array(system.mechanism.ancestor_joint_indices(j), np.int32) for j in range(n))
@@ -280,7 +280,7 @@ def _kernel_tables(functions: StepFunctions, tables: StepSparsityTables) -> list
     ragged("p1_old", "col", tables.p1_old_columns)
     ragged("p1_new", "col", tables.p1_new_columns)
     for key, pattern in functions.sparsity_patterns.items():
-        row, column = nonzero_indices(pattern)
+        row, column = nonzero_rows_and_columns(pattern)
         table(f"{key}_row", row)
         table(f"{key}_col", column)
     return lines
@@ -303,7 +303,7 @@ def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
     return generator.dump()
 
 
-def nonzero_indices(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
+def nonzero_rows_and_columns(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
     """Return the row and column indices (nnz,) of the structural nonzeros in a sparsity pattern."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)
@@ -324,7 +324,7 @@ def _runs(entries: _Indices) -> list[int]:
 _UNARY_FUNCTIONS = "exp log tan asin acos atan sinh cosh tanh asinh acosh atanh floor ceil erf log1p expm1"
 _BINARY_FUNCTIONS = ("pow", "constpow", "atan2", "fmod", "remainder", "copysign", "hypot")
 _ARITHMETIC_SIGNS = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
-COMPARISON_SIGNS: Mapping[int, str] = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!="}
+COMPARISON_OPERATOR_SYMBOLS: Mapping[int, str] = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!="}
 _OPERATION_FORMS = {
     ca.OP_ASSIGN: "{0}",
     **{op: f"{{0}} {sign} {{1}}" for op, sign in _ARITHMETIC_SIGNS.items()},
@@ -337,7 +337,7 @@ _OPERATION_FORMS = {
     ca.OP_SIGN: "sign_of({0})",
     ca.OP_FMIN: "lesser({0}, {1})",
     ca.OP_FMAX: "larger({0}, {1})",
-    **{op: f"truth({{0}} {sign} {{1}})" for op, sign in COMPARISON_SIGNS.items()},
+    **{op: f"truth({{0}} {sign} {{1}})" for op, sign in COMPARISON_OPERATOR_SYMBOLS.items()},
     ca.OP_NOT: "truth({0} == 0)",
     ca.OP_AND: "truth(({0} != 0) & ({1} != 0))",
     ca.OP_OR: "truth(({0} != 0) | ({1} != 0))",

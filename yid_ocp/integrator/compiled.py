@@ -27,8 +27,8 @@ from yid_ocp.integrator.step_model import (
     StepEquationsAndFunctions,
     StepResidualsAndJacobians,
     TrackingFeedback,
-    allocate_linearization,
     allocate_rollout,
+    allocate_step_linearizations,
     attach_status_to_rollout,
     out_of_memory_error,
 )
@@ -217,7 +217,7 @@ class CompiledKernel:
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepResidualsAndJacobians:
         """Evaluate the step residuals along any trajectory in C. Without `derivatives`, the Jacobians are empty."""
-        out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
+        out = allocate_step_linearizations(self._model.sizes, len(torque), len(names), derivatives)
         # in the order of the struct
         matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
         matrices += [out.p1_by_input, out.residual_by_theta, out.p1_by_theta]

@@ -27,8 +27,8 @@ import platformdirs
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
-from yid_ocp.integrator.codegen import casadi_c_source, nonzero_indices
-from yid_ocp.integrator.interpreted import bound_function
+from yid_ocp.integrator.codegen import casadi_c_source, nonzero_rows_and_columns
+from yid_ocp.integrator.interpreted import function_bound_to_arrays
 from yid_ocp.integrator.step_model import NewtonStatusCode, out_of_memory_error
 from yid_ocp.parallel import CasadiLockedCache
 
@@ -154,7 +154,7 @@ def compile_and_load_library(
         return None
 
 
-def compiled_casadi_function(function: ca.Function) -> ca.Function:
+def compile_casadi_function(function: ca.Function) -> ca.Function:
     """Compile a CasADi function to C, without optimisation. Returns the function unchanged if no compiler works.
 
     This suits large functions whose calls take seconds in all. The compiled function cannot be differentiated.
@@ -309,7 +309,7 @@ int yid_map(int count, const double **in, double **out) {{
             if code != NewtonStatusCode.OK:
                 raise RuntimeError(f"CasADi could not evaluate {self.function}")
         elif count:
-            bound_function(self._mapped(count), arrays, values)()
+            function_bound_to_arrays(self._mapped(count), arrays, values)()
         dense = []
         for o, value in enumerate(values):
             sparsity = self.function.sparsity_out(o)
@@ -317,7 +317,7 @@ int yid_map(int count, const double **in, double **out) {{
                 dense.append(value.reshape(count, sparsity.size2(), sparsity.size1()).transpose(0, 2, 1))
                 continue
             full = np.zeros((count, *sparsity.shape))
-            row, column = nonzero_indices(sparsity)
+            row, column = nonzero_rows_and_columns(sparsity)
             full[:, row, column] = value
             dense.append(full)
         return dense

@@ -27,8 +27,8 @@ from yid_ocp.integrator.step_model import (
     StepEquationsAndFunctions,
     StepResidualsAndJacobians,
     TrackingFeedback,
-    allocate_linearization,
     allocate_rollout,
+    allocate_step_linearizations,
     attach_status_to_rollout,
 )
 from yid_ocp.parallel import CasadiLockedCache
@@ -284,7 +284,7 @@ class InterpretedKernel:
     ) -> StepResidualsAndJacobians:
         """Evaluate the step residuals along any trajectory. Without `derivatives`, the Jacobians are empty."""
         (value, _, slopes), at = self._evaluators(), self._at
-        out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
+        out = allocate_step_linearizations(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
         columns = {"new": new, "old": old, "input": at["u"], "theta": self._columns(names)}
         for k, u in enumerate(torque):
@@ -303,7 +303,7 @@ def dense_function_evaluator(function: Any, kept: bool = True) -> Callable[[Arra
     """Create a fast one-thread evaluator of a CasADi function of a vector. A call overwrites outputs unless `kept`."""
     point = np.zeros(function.numel_in(0))
     results = [np.zeros(function.size_out(i)[::-1]) for i in range(function.n_out())]
-    run, views = bound_function(function, [point], results), [result.T for result in results]
+    run, views = function_bound_to_arrays(function, [point], results), [result.T for result in results]
 
     def evaluate(values: Array) -> list[Array]:
         point[:] = values
@@ -313,7 +313,7 @@ def dense_function_evaluator(function: Any, kept: bool = True) -> Callable[[Arra
     return evaluate
 
 
-def bound_function(function: Any, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
+def function_bound_to_arrays(function: Any, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
     """Return a function that evaluates a CasADi function from and into contiguous arrays (of nonzeros by column)."""
     buffer, run = function.buffer()
     for bind, arrays in ((buffer.set_arg, inputs), (buffer.set_res, outputs)):

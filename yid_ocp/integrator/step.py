@@ -303,7 +303,7 @@ def checked_rollout_inputs(
     return RolloutInputs(check("theta", theta, (sizes["ntheta"],)), begin, inputs, course, feedback, directions)
 
 
-def input_or_servo_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
+def driven_joint_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
     """Return the torque on the driven joints in every step, (N, nu) [N m]: the input, or the torque of the servos."""
     system, h = step.system, step.clock_scaled_time_step(np.asarray(theta, float))
     if not system.servos:

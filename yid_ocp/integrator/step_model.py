@@ -254,7 +254,7 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
     return Rollout(**values, status=RolloutConvergenceInfo(NewtonStatusCode.OK, 0, 0.0, 0, 0))
 
 
-def allocate_linearization(
+def allocate_step_linearizations(
     sizes: dict[str, int], count: int, width: int, derivatives: bool
 ) -> StepResidualsAndJacobians:
     """Allocate zero-filled linearizations of `count` steps and `width` parameters, with Jacobians if `derivatives`."""

@@ -225,7 +225,7 @@ class EffectMomentumCalculator:
         `recorded` is the recorded motion. `true` is the motion corrected for effects; only its derivatives are used.
         The first of the d directions are the parameters `names`.
         """
-        steps, plain_theta = len(true.torque), self.parameter_values_without_effects(theta)
+        steps, plain_theta = len(true.torque), self.parameter_values_with_neutral_effects(theta)
         still = np.zeros((steps, len(self._kept)))
         plain, *_ = self._maps(False)(
             *recorded._before_and_after, still, still, _one_before(recorded.torque), plain_theta, self._time_step
@@ -265,13 +265,13 @@ class EffectMomentumCalculator:
             total[:, memory.rows] = memory.slopes(motion, z[:, memory.rows], rows, theta, wanted, width)
         return z, total if np.any(total) else None
 
-    def parameter_values_without_effects(self, theta: Array) -> Array:
+    def parameter_values_with_neutral_effects(self, theta: Array) -> Array:
         """Return a copy of theta with neutral effects and the arm as described, which defines the reference."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
         return plain
 
-    def is_active(self, theta: Array, names: Sequence[str]) -> bool:
+    def changes_momentum(self, theta: Array, names: Sequence[str]) -> bool:
         """Check whether effects can change the momentum, given the parameter names `names` and the values `theta`."""
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 

@@ -213,7 +213,7 @@ def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravi
     parts.layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
 
 
-def edge_to_edge_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
+def edge_to_edge_rotations_from_vertices(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
     """Return how each edge of a polyline is rotated from the previous edge, without twist, as k - 1 matrices (3, 3).
 
     They are a segment's `rest_rotation` and `link_rest_rotations`. `vertices` (k, 3) are the undeformed centre line

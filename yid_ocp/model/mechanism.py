@@ -295,7 +295,7 @@ def _fraction(name: str, said: str) -> float:
     return value / 100.0
 
 
-def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
+def merge_inertias(bodies: Iterable[Inertia]) -> Inertia | None:
     """Combine rigidly connected bodies into one body. Returns None if there are no bodies or their mass is zero."""
     entries = list(bodies)
     if not entries:

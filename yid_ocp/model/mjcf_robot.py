@@ -23,7 +23,7 @@ _JOINT_TYPE_NAMES = {2: "prismatic", 3: "revolute"}
 _JOINT_EQUALITY, _WELD_EQUALITY, _SITE_OBJECT, _FREE_JOINT, _WORLD = 2, 1, 6, 0, "world"
 
 
-def mjcf_robot_description(file: Path) -> SimpleNamespace:
+def read_mjcf_robot_description(file: Path) -> SimpleNamespace:
     """Read the name, links and joints of an MJCF file, in the form that `read_urdf` uses. Omitted elements are logged.
 
     Each body becomes a link, and each site a frame. The inertia of a body is its `inertial` element or, without this
@@ -53,7 +53,7 @@ def mjcf_joint_constants(file: Path) -> dict[str, dict[str, float]]:
     """Read the constants of the joints that an MJCF file states, by joint and name. Empty for other file formats.
 
     Names are `armature` [kg m^2], `damping` [N m s/rad] and `frictionloss` [N m]. A position actuator gives
-    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `mjcf_robot_description`.
+    `servo_gain` [N m/rad] and `servo_damping` [N m s/rad]. Errors are as in `read_mjcf_robot_description`.
     """
     if file.suffix.lower() == ".urdf" or b"<mujoco" not in check_input_file(file).read_bytes():
         return {}
@@ -118,7 +118,7 @@ def _body(
             what, allowed = f"joint '{label}' has the type free or ball", "hinge and slide joints"
             raise ModelError(what, where=where, allowed=allowed, hint="delete a free joint; replace a ball by hinges")
         place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
-        origin = at @ _shift(place - last) @ joint_motion_pose(axis, -ref, kind)
+        origin = at @ _shift(place - last) @ joint_displacement_transform(axis, -ref, kind)
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
         if carried != name:
             links.append(SimpleNamespace(name=carried, inertial=None))
@@ -224,7 +224,7 @@ def _shift(translation: Array) -> Array:
     return homogeneous_transform(np.eye(3), translation)
 
 
-def joint_motion_pose(axis: Array, amount: float, kind: str) -> Array:
+def joint_displacement_transform(axis: Array, amount: float, kind: str) -> Array:
     """Compute the pose (4, 4) of a prismatic or revolute joint with unit axis (3,) at position `amount` [m or rad]."""
     if kind == "prismatic":
         return _shift(amount * axis)

@@ -300,7 +300,7 @@ class System(ReprMixin):
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in options.get("springs", {}).items():
-            stiffness, rest = servos_and_springs.stiffness_and_rest_parameters(tree, joint, spring)
+            stiffness, rest = servos_and_springs.joint_spring_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         moved, own = ({}, []) if servos is None else servos_and_springs.build_joint_servos(tree, driven, servos)
@@ -386,7 +386,7 @@ class System(ReprMixin):
         mapped: System = map_expressions(replace(self, effects=()), change)
         return replace(mapped, effects=self.effects)
 
-    def numeric_mechanism(self, values: Mapping[str, float] | None = None) -> Mechanism:
+    def mechanism_with_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """Return the mechanism with a number for each parameter: its entry in `values`, or else its nominal value."""
         key = tuple(self.parameters.vector(values).tolist())
         found = self._last_numeric_mechanism.get(key)

@@ -28,12 +28,12 @@ from yid_ocp.model.mechanism import (
     Joint,
     Mechanism,
     Placement,
-    merge_bodies,
+    merge_inertias,
     rpy_from_rotation,
     snap_near_integer_entries,
     transform_from_xyz_rpy,
 )
-from yid_ocp.model.mjcf_robot import joint_motion_pose, mjcf_joint_constants, mjcf_robot_description
+from yid_ocp.model.mjcf_robot import joint_displacement_transform, mjcf_joint_constants, read_mjcf_robot_description
 from yid_ocp.model.parameters import Parameter, Parameters
 
 _UNLIMITED_VALUE = 1e9  # represents "no limit" where URDF requires a number
@@ -165,7 +165,7 @@ def read_urdf(
     for entry in order:
         carrier, at, source = placed[entry]
         own = {link: bodies[link] for link, (at_joint, *_) in frames.items() if at_joint == entry and link in bodies}
-        carried = merge_bodies(own.values())
+        carried = merge_inertias(own.values())
         if carried is not None:
             mass = float(carried.mass)
             parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
@@ -198,7 +198,7 @@ def _parsed(file: Path) -> SimpleNamespace:
     try:
         robot = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot()
         if robot.tag == "mujoco":
-            return mjcf_robot_description(file)
+            return read_mjcf_robot_description(file)
         _check_numbers(robot, str(file))
         links = [
             SimpleNamespace(name=link.attrib["name"], inertial=_read_inertial(link.find("inertial")))
@@ -214,7 +214,7 @@ def _parsed(file: Path) -> SimpleNamespace:
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 
 
-def urdf_joint_dynamics(robot: str | Path) -> tuple[dict[str, float], dict[str, float]]:
+def joint_damping_and_friction(robot: str | Path) -> tuple[dict[str, float], dict[str, float]]:
     """Return the damping [N m s/rad] of a URDF or MJCF file and the friction [N m] of a URDF, by joint, if above 0."""
     file = urdf_path_from_robot_name(robot)
     root = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot()
@@ -408,7 +408,7 @@ def _walk(
             else:
                 motion = np.eye(4)
                 if joint.type != "fixed":
-                    motion = joint_motion_pose(_unit_axis(joint), _locked_value(joint, locked), joint.type)
+                    motion = joint_displacement_transform(_unit_axis(joint), _locked_value(joint, locked), joint.type)
                 stack.append((joint.child, carrier, at @ joint.origin @ motion, link))
     loose = sorted(set(links) - set(frames) - dropped)
     if loose:
@@ -475,7 +475,7 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
     links = [link_name("world", -1)] + [link_name(f"{joint.name}_link", i) for i, joint in enumerate(mechanism.joints)]
     ElementTree.SubElement(robot, "link", name=links[0])
     for i, joint in enumerate(mechanism.joints):
-        link, body = ElementTree.SubElement(robot, "link", name=links[i + 1]), merge_bodies(joint.bodies)
+        link, body = ElementTree.SubElement(robot, "link", name=links[i + 1]), merge_inertias(joint.bodies)
         if body is not None:
             inertial, tensor = ElementTree.SubElement(link, "inertial"), np.array(ca.DM(body.inertia_about_com))
             com = _digits(np.array(ca.DM(body.center_of_mass)).ravel())

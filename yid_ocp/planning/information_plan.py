@@ -103,7 +103,7 @@ def plan_informative_motion(
     search = InformativeMotionSearch(experiment, limits, criterion)
     _check_room(search, limits)
     seeds = range(options.seed, options.seed + options.n_random_starts)
-    begins = [_smooth(experiment, search.shrink_to_limits(_random(experiment, seed))) for seed in seeds]
+    begins = [_smooth(experiment, search.shrink_coefficients_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
         what, allowed = "none of the random initial motions keeps the limits", "limits within which the arms can move"
         raise ConfigError(what, where="plan.limits", allowed=allowed, hint="widen plan.limits")
@@ -171,7 +171,7 @@ def _criterion(
     for effect in rivals:
         own = tuple(columns.index(name) for name in effect.amplitude_parameter_names)
         places.append(own)
-        sizes.append(_size(effect) / experiment.estimated_unknown_scales[list(own)][:, None])
+        sizes.append(_size(effect) / experiment.scales_of_estimated_unknowns[list(own)][:, None])
     return EffectDiscriminationCriterion(tuple(places), tuple(sizes), parameters)
 
 
@@ -194,7 +194,7 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
             allowed = "start positions within the position limits of the joints"
             hint = "set plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
-    values, _ = limits.limited_values_and_jacobian(mover.simulate_path(still), still)
+    values, _ = limits.constraints_and_jacobian(mover.simulate_path(still), still)
     broken = limits.worst_value_and_bound_by_violated_limit(values)
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
@@ -313,7 +313,7 @@ def _plan(
 
 def _judged(experiment: SplineMotionExperiment, criterion: MotionSearchCriterion, found: MotionSearchResult) -> float:
     try:
-        rows = experiment.planned_sensitivities_to_unknowns(found.w)
+        rows = experiment.planned_recording_sensitivities(found.w)
     except SolverError:
         return -math.inf
     return criterion.value_and_gradient_wrt_sensitivities(rows, False)[0]
@@ -323,7 +323,7 @@ def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str,
     """Parameter precisions from the recordings, the plan and both, and the directions left unidentifiable."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
-    planned = experiment.planned_estimation_problem(w)
+    planned = experiment.problem_with_planned_recording_only(w)
     after = identifiability(planned.with_free_parameters_without_recompiling(problem.free))
     shared = [name for name in problem.free if name not in problem.options.local_parameters]
     at = [[entry.parameter_names.index(name) for name in shared] for entry in (before, after)]
@@ -342,7 +342,7 @@ def _distances(
     experiment: SplineMotionExperiment, criterion: MotionSearchCriterion, rivals: Sequence[EffectBase], w: Array
 ) -> dict[tuple[str, str], tuple[float, float]]:
     assert isinstance(criterion, EffectDiscriminationCriterion)
-    recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_sensitivities_to_unknowns(w)
+    recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_recording_sensitivities(w)
     before, after = criterion.distances_from_best_imitation(recorded), criterion.distances_from_best_imitation(planned)
     labels = [effect.label for effect in rivals]
     pairs = itertools.permutations(range(len(labels)), 2)
@@ -357,7 +357,7 @@ def _active(
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
-    values = limits.limited_values_and_jacobian(mover.simulate_path(w), w)[0]
+    values = limits.constraints_and_jacobian(mover.simulate_path(w), w)[0]
     for rows, own in limits.split_values_by_limit_kind(values):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)

@@ -232,7 +232,7 @@ class PathSimulator:
             if slopes:
                 by_path[:, :, len(names) :] = np.einsum("tk,ji->tjki", self._basis, np.eye(nc)).reshape(nodes, nc, size)
             if names:
-                known, guess = self.moved_joint_start_positions, self.start_system_configuration
+                known, guess = self.moved_joint_start_positions, self.system_start_configuration
                 rest = EquilibriumSolver(self.step).solve(known, self.theta, guess=guess, names=names)
                 start[:, : len(names)] = rest.state_by_theta
             directions = SensitivityDirections(tuple(names), start, None, by_path)
@@ -245,7 +245,7 @@ class PathSimulator:
         return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
 
     @property
-    def start_system_configuration(self) -> Array:
+    def system_start_configuration(self) -> Array:
         """The configuration q of the system at the start, shape (n,)."""
         return np.asarray(self.start_equilibrium.state[: self.step.system.n_coordinates])
 

@@ -189,7 +189,7 @@ def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBefo
 
 def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
     """The simulator with another step or other parameters, and the start equilibrium that belongs to them."""
-    rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.start_system_configuration)
+    rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.system_start_configuration)
     return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
 
@@ -253,7 +253,7 @@ def _outcome(
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
     course = rows.desired_point_trajectory
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
-    broken = rows.worst_value_and_bound_by_violated_limit(rows.limited_values_and_jacobian(rollout, shot.w)[0])
+    broken = rows.worst_value_and_bound_by_violated_limit(rows.constraints_and_jacobian(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
         message += f"; {name} exceeds its limit: {what} reaches {value:.4g}, the limit is {bound:.4g}"

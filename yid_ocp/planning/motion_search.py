@@ -71,7 +71,7 @@ class PlanResidualAndLimitFunctions:
         """The reference position of the point at every node, (N + 1, 3) [m]. None if only the end position counts."""
         if self.options.goal != "path":
             return None
-        begin = self.simulator.start_system_configuration[None]
+        begin = self.simulator.system_start_configuration[None]
         first = self.point.positions_and_jacobian(begin, self.simulator.theta)[0][0, :3]
         vias = (first + np.asarray(offset) for offset in self.options.point_waypoint_offsets_from_start)
         places = np.vstack([first, *vias, self.target])
@@ -104,7 +104,7 @@ class PlanResidualAndLimitFunctions:
             parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
         return parts
 
-    def limited_values_and_jacobian(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
+    def constraints_and_jacobian(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
         """Return the values (rows,) of the limited quantities along a motion, in the order and units of `limit_rows`.
 
         Also returns their Jacobian (rows, K nc) with respect to the spline coefficients, K for each of nc prescribed
@@ -214,7 +214,7 @@ class MotionToTargetSearch:
         pairs = zip(self._cases, rollouts, strict=True)
         parts = [rows for case, rollout in pairs for rows in case._goal_residual(rollout, w)]
         value, slope = (np.concatenate(rows) / np.sqrt(len(self._cases)) for rows in zip(*parts, strict=True))
-        limited, by_w = self._cases[0].limited_values_and_jacobian(rollouts[0], w)
+        limited, by_w = self._cases[0].constraints_and_jacobian(rollouts[0], w)
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
@@ -378,12 +378,12 @@ class InformativeMotionSearch:
 
     def _limited_values(self, w: Array) -> tuple[Array, bool]:
         """Limited quantities of a motion over their limits, and whether its rollout succeeds and satisfies them."""
-        value = self.limits.limited_values_and_jacobian(self.experiment.simulator.simulate_path(w), w)[0] / self._unit
+        value = self.limits.constraints_and_jacobian(self.experiment.simulator.simulate_path(w), w)[0] / self._unit
         flat = w.ravel()
         within = np.all((value <= self._high) & (value >= self._low))  # False for values that are not finite
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
-    def shrink_to_limits(self, w: Array) -> Array:
+    def shrink_coefficients_to_limits(self, w: Array) -> Array:
         """Scale spline coefficients (K, nc) down until the motion satisfies its limits. Zero if it never does."""
         for _ in range(60):
             if self._limited_values(w)[1]:
@@ -404,7 +404,7 @@ class InformativeMotionSearch:
         while rows is not None and done < rounds and not finished:
             done += 1
             slopes = self.experiment.sensitivity_derivatives_by_coefficients(w, rows)
-            limited, by_w = self.limits.limited_values_and_jacobian(self.experiment.simulator.simulate_path(w, True), w)
+            limited, by_w = self.limits.constraints_and_jacobian(self.experiment.simulator.simulate_path(w, True), w)
             if slopes is None or by_w is None:
                 break
             bounded = limited / self._unit, by_w / self._unit[:, None]

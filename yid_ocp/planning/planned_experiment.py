@@ -20,7 +20,7 @@ from yid_ocp.analysis.experiment_design import ASSUMED_TORQUE_NOISE_STD
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, failed_rollout_error
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_without_weak_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_merged_calls
@@ -162,7 +162,7 @@ class SplineMotionExperiment:
         """The zero spline coefficients (K, nc), with which the arms stay at their start."""
         return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.moved_joint_indices)))
 
-    def planned_estimation_problem(self, w: Array) -> EstimationProblem:
+    def problem_with_planned_recording_only(self, w: Array) -> EstimationProblem:
         """Return the configured problem with the planned recording of coefficients `w` as its only recording."""
         return self._problem(self.configured_problem.step, self._noise_free_recording(w), self._options())
 
@@ -172,9 +172,9 @@ class SplineMotionExperiment:
         problem = EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra)
         return problem.with_free_parameters_without_recompiling(self.free_parameters)
 
-    def planned_sensitivities_to_unknowns(self, w: Array) -> Array:
+    def planned_recording_sensitivities(self, w: Array) -> Array:
         """Return derivatives (nr, nx) of whitened residuals of motion `w` per change of an unknown by its size."""
-        return self._weighted(self.planned_estimation_problem(w))
+        return self._weighted(self.problem_with_planned_recording_only(w))
 
     @property
     def existing_recording_sensitivities(self) -> Array:
@@ -191,7 +191,7 @@ class SplineMotionExperiment:
 
     def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
         """Sensitivities to relative changes, without the prior information on parameters."""
-        jacobian = residual_and_jacobian_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
+        jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)[1] * _sizes(problem)
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
         jacobian[problem.residual_rows.stated_priors] *= ~own
         return jacobian
@@ -216,7 +216,7 @@ class SplineMotionExperiment:
         return self._problem(self.simulator.step, replace(recording, joints=joints), options)
 
     @cached_property
-    def estimated_unknown_scales(self) -> Array:
+    def scales_of_estimated_unknowns(self) -> Array:
         """The sizes of the unknowns, in column order. Sensitivities are per change of an unknown by its size."""
         return _sizes(self._known)
 
@@ -237,7 +237,7 @@ class SplineMotionExperiment:
     def _offsets(self) -> Array:
         """Sensitivities (nr + no, no) to constant errors in units of their stds; the last rows are priors."""
         problem, std = self._known, self._offset_std
-        found = np.zeros((problem.residual_rows.slice_without_weak_priors.stop, len(std)))
+        found = np.zeros((problem.residual_rows.slice_of_data_and_stated_priors.stop, len(std)))
         for samples, rows in zip(problem.episodes[0].measurements, problem.residual_rows.measurements[0], strict=True):
             if not samples.sensor.effort_joints:
                 continue
@@ -265,7 +265,7 @@ class SplineMotionExperiment:
         """The problem with the joints on a path (N + 1, nc), and its evaluation."""
         problem = self._known
         moved = problem.with_episodes([replace(problem.episodes[0], prescribed_path=path)], ())
-        return moved, moved.evaluate(moved.initial_unknowns, derivatives, (self.simulator.start_system_configuration,))
+        return moved, moved.evaluate(moved.initial_unknowns, derivatives, (self.simulator.system_start_configuration,))
 
     @cached_property
     def _blur(self) -> tuple[Array, Array]:
@@ -315,7 +315,7 @@ def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Raise `ConfigError` if the motion is too short for the low-pass filter of its efforts."""
     joints, low_pass = problem.episodes[0].recording.joints, zero_phase_effort_filter(problem.options.path_cutoff)
     step = problem.step.time_step
-    least = 2.0 * low_pass.end_distortion_duration + low_pass.decorrelation_stride(step) * step
+    least = 2.0 * low_pass.end_distortion_duration + low_pass.decorrelation_stride_for_step(step) * step
     if joints is not None and joints.effort is not None and duration <= least:
         what = f"a motion of {duration:g} s is too short for efforts low-pass filtered at {low_pass.cutoff:g} Hz"
         allowed = f"plan.duration + plan.hold_duration above {least:.2g} s"

@@ -30,7 +30,7 @@ from yid_ocp.problem.model_functions import (
     second_difference_acceleration_adjoint,
 )
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.recorded_inputs import mean_step_input_delay_derivative, mean_step_inputs
+from yid_ocp.problem.recorded_inputs import step_mean_input_delay_derivative, step_mean_inputs
 from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
@@ -71,7 +71,7 @@ class EpisodePredictor:
         return self.model_functions.step.system
 
     @property
-    def estimated_initial_state_entries(self) -> tuple[int, ...]:
+    def estimated_initial_state_indices(self) -> tuple[int, ...]:
         """The indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
         hidden, begin = list(self.system.effect_internal_coordinate_symbols), {"q": 0, "p": n, "z": 2 * n}
@@ -119,7 +119,7 @@ class EpisodePredictor:
         known.
         """
         names = self.unknowns.free_parameter_names if names is None else names
-        nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_entries)
+        nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0
         rest: Equilibrium | None = None
@@ -148,7 +148,7 @@ class EpisodePredictor:
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
         recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
-        if self._follows_momenta and self.model_functions.reference_momentum_correction.is_active(theta, wanted):
+        if self._follows_momenta and self.model_functions.effect_momentum_calculator.changes_momentum(theta, wanted):
             return False
         slopes += self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
@@ -180,7 +180,7 @@ class EpisodePredictor:
         rows = slice(2 * self.system.n_coordinates, None)
         recorded = JointMotionAndTorqueWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
-        shift, measured = self.model_functions.reference_momentum_correction, episode.measured_driven_angles
+        shift, measured = self.model_functions.effect_momentum_calculator, episode.measured_driven_angles
         return inputs.with_effect_momentum_in_reference(shift, recorded, measured, theta, names, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> CorrectedInputs:
@@ -195,8 +195,8 @@ class EpisodePredictor:
             joints, (delay, by_delay) = episode.recording.joints, late
             assert joints is not None
             where = (joints, self.system.driven, episode.grid, episode.name)
-            torque = mean_step_inputs(*where, delay, self.system.servos)
-            by_recorded = mean_step_input_delay_derivative(*where, delay, self.system.servos)[:, :, None] * by_delay
+            torque = step_mean_inputs(*where, delay, self.system.servos)
+            by_recorded = step_mean_input_delay_derivative(*where, delay, self.system.servos)[:, :, None] * by_delay
         if errors is not None:
             # otherwise effects that multiply or lag a reading would treat noise as torque and shrink to avoid it
             torque, first = torque - errors.recorded_torque_noise, first - errors.recorded_torque_noise[0]
@@ -238,7 +238,7 @@ class EpisodePredictor:
             pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 
-        width = len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_entries)
+        width = len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices)
         bytes_per_node = 8 * self.integrator_step.sizes["nx"] * (derivatives * width + 1)
         each = [(episode.grid.steps + 1) * bytes_per_node for episode, *_ in queries]
         found: list[EpisodePrediction | str] = []
@@ -357,7 +357,7 @@ class EpisodePredictor:
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
-        nodes = [self.delay_corrected_measurements(samples, theta).evaluation_nodes for samples in compared]
+        nodes = [self.delay_corrected_measurements(samples, theta).evaluation_node_indices for samples in compared]
         smooth, grid = ZeroPhaseLowPassFilter(self.options.path_cutoff), episode.grid
         return smooth.node_smoother(np.unique(np.concatenate(nodes)), grid.steps, self.integrator_step.time_step)
 
@@ -383,7 +383,7 @@ class EpisodePredictor:
         self, samples: SensorMeasurements, along: _Trajectory, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
         """Readings (nodes, k) at the samples' nodes, and their derivatives (nodes, k, d) in d directions."""
-        n, nodes = self.system.n_coordinates, samples.evaluation_nodes
+        n, nodes = self.system.n_coordinates, samples.evaluation_node_indices
         function = self.model_functions.compiled_sensor_function(samples.sensor, wanted)
         read = function(along.values.select_nodes(nodes), theta)
         if along.by_state is None:
@@ -456,7 +456,7 @@ class EpisodePredictor:
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
             samples = samples.shifted_earlier_by_delays(late[0])
-        at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_nodes
+        at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_node_indices
         read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(values.select_nodes(nodes), theta)
         direct = np.einsum("mk,mkq->q", at_nodes, read.by_theta)
         if late is not None:

@@ -31,10 +31,10 @@ from yid_ocp.problem.measurements import (
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.problem.recorded_inputs import (
-    mean_step_inputs,
     prescribed_coordinates_at_nodes,
     smoothed_joint_angles_at_nodes,
     smoothed_joint_efforts,
+    step_mean_inputs,
 )
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
@@ -59,7 +59,7 @@ class EpisodePrediction:
     torque_correction_sensitivity: Array | None = None  # (N, nu, d)
 
     @property
-    def feedback_torque_and_sensitivity(self) -> Array | None:
+    def stacked_feedback_torque_and_sensitivity(self) -> Array | None:
         """The array (N, nu, 1 + d) of `torque_correction` and then its d derivatives, if known. None without it."""
         if self.torque_correction is None:
             return None
@@ -226,13 +226,13 @@ def prepare_episode(
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
         read = (recording.joints, system.driven, grid, recording.name)
-        torque = mean_step_inputs(*read, servos=system.servos)
+        torque = step_mean_inputs(*read, servos=system.servos)
         arm = smoothed_joint_angles_at_nodes(*read, ZeroPhaseLowPassFilter(math.inf))
         smooth = smoothed_joint_angles_at_nodes(*read, low_pass) if options.arm_tracking_feedback == "lqr" else arm
     uncertain = options.has_uncertain_point_clocks and any("damping" in name for name in free)
     effects = [own for own in system.effects if isinstance(own, EffectBase)]
     estimated = [own for own in effects if not {*free}.isdisjoint(own.amplitude_parameter_names)]
-    sticking = {own.location: own.sticking_speed for own in estimated if own.sticking_speed}
+    sticking = {own.location: own.max_sticking_speed for own in estimated if own.max_sticking_speed}
     samples = _samples(step, recording, options, theta, grid, uncertain, sticking)
     load = np.zeros((grid.steps + 1, len(system.driven) + len(system.prescribed)))
     if functions.input_corrections.angles_depend_on_effort:
@@ -258,7 +258,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if options.arm_tracking_feedback == "proportional":
         loop = proportional_tracking_feedback(step, episode.measured_driven_angles, options.arm_proportional_gains)
     else:
-        plain = functions.reference_momentum_correction.parameter_values_without_effects(theta)
+        plain = functions.effect_momentum_calculator.parameter_values_with_neutral_effects(theta)
         known = episode.smoothed_driven_angles, episode.torque, plain
         loop = lqr_tracking_feedback(step, *known, functions.arms_only_integrator_step)
     return replace(episode, tracking_feedback=loop)
@@ -346,7 +346,7 @@ def _samples(
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
 
 
-def episode_with_effort_noise_at(step: Step, episode: Episode, options: ProblemOptions, theta: Array) -> Episode:
+def episode_with_encoder_effort_noise(step: Step, episode: Episode, options: ProblemOptions, theta: Array) -> Episode:
     """Return an episode whose encoder noise is converted to noise of compared efforts at the parameters `theta`."""
     again = _samples(step, episode.recording, options, theta, episode.grid, False, {})
     found = {samples.sensor.group_name: samples for samples in again if samples.sensor.effort_joints}

@@ -36,12 +36,12 @@ from yid_ocp.problem.evaluation import (
     check_no_known_value_of_free_parameters,
     check_unique_recording_names,
     estimated_initial_state_names,
-    initial_unknowns_and_bounds,
+    initial_unknown_vector_and_bounds,
     max_abs_initial_internal_state_offsets,
     positive_unknowns_mask,
     stated_prior_stds_of_unknowns,
     stated_rms_noise_of_data_residuals,
-    whitened_prediction_residual,
+    whitened_residual_and_jacobian,
 )
 from yid_ocp.problem.measurements import huber_loss_and_sqrt_weights
 from yid_ocp.problem.model_functions import ModelFunctions
@@ -159,7 +159,7 @@ class EstimationProblem(ReprMixin):
         self.unknowns = UnknownVectorLayout(self.shared_parameters, self.local_parameters, starts, tuple(names))
         self.unknown_names = self.unknowns.unknown_names
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
-        start, low, high = initial_unknowns_and_bounds(self.unknowns, self.system, theta)
+        start, low, high = initial_unknown_vector_and_bounds(self.unknowns, self.system, theta)
         inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
         stds = stated_prior_stds_of_unknowns(self.unknowns, options, self.system, inertia)
         range_or_prior = np.where(np.isfinite(stds), stds, 0.1 * np.where(np.isfinite(high - low), high - low, 10.0))
@@ -195,7 +195,7 @@ class EstimationProblem(ReprMixin):
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""
         return self.unknowns.unpack_episode_unknowns(x, episode, self.theta, self.system)
 
-    def unknown_vector(self, values: Mapping[str, float]) -> Array:
+    def pack_unknowns(self, values: Mapping[str, float]) -> Array:
         """Return a copy (nx,) of the initial unknown vector with the named `values`, clipped to the bounds."""
         start = zip(self.unknown_names, self.initial_unknowns, strict=True)
         return np.clip([values.get(name, value) for name, value in start], *self.bounds)
@@ -219,7 +219,7 @@ class EstimationProblem(ReprMixin):
         cost, residuals, jacobians = 0.0, [], []
         threshold = self.options.huber_threshold
         for i, result in enumerate(done):
-            part = whitened_prediction_residual(self.episodes[i], self.whitening_filters[i], result, threshold)
+            part = whitened_residual_and_jacobian(self.episodes[i], self.whitening_filters[i], result, threshold)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
@@ -266,14 +266,14 @@ class EstimationProblem(ReprMixin):
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
     def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[PredictedEpisodeOrFailure]:
-        """Predict the held-out recordings from the inputs of `held_out_prediction_inputs`.
+        """Predict the held-out recordings from the inputs of `held_out_prediction_arguments`.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
         prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free
         parameters (at a fixed initial state) and to an offset of the initial state.
         """
         predict = self.predictor.predict_episode
-        return [(asked[0], predict(*asked, derivatives)) for asked in held_out_prediction_inputs(self, x)]
+        return [(asked[0], predict(*asked, derivatives)) for asked in held_out_prediction_arguments(self, x)]
 
     def simulate_synthetic_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
@@ -349,7 +349,7 @@ class EstimationProblem(ReprMixin):
         return self._changed(options=replace(self.options, multivariate_prior=prior))
 
 
-def held_out_prediction_inputs(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
+def held_out_prediction_arguments(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
     """Return the inputs of each held-out prediction: episode, parameter vector theta and initial state offset."""
     x, predictor, found = np.asarray(x, float), problem.predictor, []
     for held in problem.held_out:

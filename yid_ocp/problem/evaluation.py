@@ -57,7 +57,7 @@ class ResidualVectorLayout:
     weak_priors: slice
 
     @property
-    def slice_without_weak_priors(self) -> slice:
+    def slice_of_data_and_stated_priors(self) -> slice:
         """The slice of the residual vector that holds data and stated priors."""
         return slice(0, self.stated_priors.stop)
 
@@ -117,7 +117,7 @@ def _sensor_whitened_residual(
     )
 
 
-def whitened_prediction_residual(
+def whitened_residual_and_jacobian(
     episode: Episode, whitening: ProcessNoiseWhitener | None, result: EpisodePrediction, threshold: float = np.inf
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
@@ -132,7 +132,7 @@ def whitened_prediction_residual(
     if plain.jacobian is not None:
         columns = np.hstack([columns, plain.jacobian])
     if whitening is not None:
-        kept, push = columns.shape[1], result.feedback_torque_and_sensitivity
+        kept, push = columns.shape[1], result.stacked_feedback_torque_and_sensitivity
         # constant sensor errors do not drive the motion
         push = None if push is None else np.pad(push, ((0, 0), (0, 0), (0, by_constants.shape[1])))
         innovations, _ = whitening.whiten_residuals_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
@@ -153,7 +153,7 @@ def stated_rms_noise_of_data_residuals(episodes: Sequence[Episode], options: Pro
 
 
 INITIAL_STATE_UNKNOWN_PREFIX = "start."
-SOFT_LOGARITHM_MIN_RATIO = 1e-3
+WEAK_PRIOR_LOG_MIN_RATIO = 1e-3
 """Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
 
 
@@ -209,7 +209,7 @@ class UnknownVectorLayout:
         return dict(zip(self.unknown_names, map(float, x), strict=True))
 
 
-def initial_unknowns_and_bounds(
+def initial_unknown_vector_and_bounds(
     unknowns: UnknownVectorLayout, system: System, theta: Array
 ) -> tuple[Array, Array, Array]:
     """Return the initial unknown vector and its lower and upper bounds, (nx,) each. Initial states have offset zero."""
@@ -375,9 +375,9 @@ def check_initial_values_and_bounds(system: System, free: Sequence[str], theta: 
 
 
 def _soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
-    """Return the logarithm of a ratio and its derivative, continued by a parabola below `SOFT_LOGARITHM_MIN_RATIO`."""
-    below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
+    """Return the logarithm of a ratio and its derivative, continued by a parabola below `WEAK_PRIOR_LOG_MIN_RATIO`."""
+    below = (ratio - WEAK_PRIOR_LOG_MIN_RATIO) / WEAK_PRIOR_LOG_MIN_RATIO
     small = below < 0
-    kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)
+    kept = np.where(small, WEAK_PRIOR_LOG_MIN_RATIO, ratio)
     value = np.log(kept) + np.where(small, below - below**2 / 2, 0.0)
-    return value, np.where(small, (1 - below) / SOFT_LOGARITHM_MIN_RATIO, 1 / kept)
+    return value, np.where(small, (1 - below) / WEAK_PRIOR_LOG_MIN_RATIO, 1 / kept)

@@ -36,7 +36,7 @@ class TimeGrid:
         """The times of all nodes, shape (steps + 1,) [s]."""
         return np.asarray(self.start_time + self.time_step * np.arange(self.steps + 1), dtype=float)
 
-    def node_and_fraction(self, t: ArrayLike) -> tuple[IntArray, Array]:
+    def preceding_node_and_fraction(self, t: ArrayLike) -> tuple[IntArray, Array]:
         """Find the node before each time, and the time since it as a fraction of a step (rounded within 1e-6 steps)."""
         position = (np.asarray(t, float) - self.start_time) / self.time_step
         near = np.rint(position)
@@ -112,7 +112,7 @@ class SensorMeasurements:
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @cached_property
-    def evaluation_nodes(self) -> IntArray:
+    def evaluation_node_indices(self) -> IntArray:
         """The sorted indices of the nodes at which the sensor is predicted, for interpolation to the samples."""
         if self.node.ndim > 1:
             # including the neighbours needed for derivatives
@@ -132,7 +132,7 @@ class SensorMeasurements:
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
-    def output_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
+    def residual_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
         """The matrix R^(-1/2) (nr, nr) that decorrelates the nr normalised residuals. None if outputs are independent.
 
         R is the correlation matrix of the noise; only outputs of one sample are correlated. The whitening is zero-phase
@@ -150,20 +150,20 @@ class SensorMeasurements:
 
     def decorrelate_residual_rows(self, rows: Any) -> Any:
         """Decorrelate rows (nr,) or (nr, d), dense or sparse, that are in units of their standard deviations."""
-        return rows if self.output_decorrelation_matrix is None else self.output_decorrelation_matrix @ rows
+        return rows if self.residual_decorrelation_matrix is None else self.residual_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
         """Compute the whitened residual (M, k), prediction minus measurement. It is zero where nothing was measured."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
-        if self.output_decorrelation_matrix is not None:
-            plain[self.positive_weight_mask] = self.output_decorrelation_matrix @ plain[self.positive_weight_mask]
+        if self.residual_decorrelation_matrix is not None:
+            plain[self.positive_weight_mask] = self.residual_decorrelation_matrix @ plain[self.positive_weight_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
         """Convert a cost's gradient with respect to the residual to one with respect to the prediction, both (M, k)."""
-        if self.output_decorrelation_matrix is not None:
+        if self.residual_decorrelation_matrix is not None:
             pull = pull.copy()
-            pull[self.positive_weight_mask] = self.output_decorrelation_matrix.T @ pull[self.positive_weight_mask]
+            pull[self.positive_weight_mask] = self.residual_decorrelation_matrix.T @ pull[self.positive_weight_mask]
         return np.asarray(pull * self.weight)
 
     def residual_and_jacobian(
@@ -191,9 +191,9 @@ class SensorMeasurements:
         """Return the change of a prediction during one time step at each delayed sample, (M, k).
 
         For a sample at a node, it is the mean of the adjacent steps. `at_nodes` (len(nodes), k) is the prediction at
-        `evaluation_nodes`. `unmoved` are the measurements before their shift by `steps` (k,).
+        `evaluation_node_indices`. `unmoved` are the measurements before their shift by `steps` (k,).
         """
-        nodes, column = self.evaluation_nodes, np.arange(at_nodes.shape[1])
+        nodes, column = self.evaluation_node_indices, np.arange(at_nodes.shape[1])
         if not len(nodes):  # a short part may hold no sample of a slow sensor
             return np.zeros((0, at_nodes.shape[1]))
         place = self.node - nodes[0]
@@ -208,8 +208,8 @@ class SensorMeasurements:
         return np.where((position < first - 1e-9) | (position > last + 1e-9), 0.0, rate)
 
     def interpolate_to_samples(self, at_nodes: Array) -> Array:
-        """Interpolate values (len(nodes), ...) linearly from `evaluation_nodes` to the samples, (M, ...)."""
-        nodes = self.evaluation_nodes
+        """Interpolate values (len(nodes), ...) linearly from `evaluation_node_indices` to the samples, (M, ...)."""
+        nodes = self.evaluation_node_indices
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
         before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
         after = at_nodes[(np.minimum(np.searchsorted(nodes, self.node + 1), len(nodes) - 1), *column)]
@@ -218,7 +218,7 @@ class SensorMeasurements:
 
     def interpolation_adjoint(self, at_samples: Array) -> Array:
         """Apply the transpose of `interpolate_to_samples` to values (M, ...). The result is (len(nodes), ...)."""
-        nodes = self.evaluation_nodes
+        nodes = self.evaluation_node_indices
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
         between = self.fraction > 0
@@ -241,7 +241,7 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
         place, hint = f"recording '{where}': {data.sensor.group_name}", f"set sensors.{data.sensor.group_name}.std"
         raise DataError(what, where=place, allowed=allowed, hint=hint)
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
-    node, fraction = grid.node_and_fraction(data.t)
+    node, fraction = grid.preceding_node_and_fraction(data.t)
     std = np.where(seen, data.std, np.nan)
     bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
     span = data.predictable_nodes or (0, grid.steps)

@@ -81,7 +81,7 @@ class CorrectedInputs:
         """
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
-        if read and not any(np.any(x) for x in slopes) and not shift.is_active(theta, names):
+        if read and not any(np.any(x) for x in slopes) and not shift.changes_momentum(theta, names):
             return self
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
@@ -348,7 +348,7 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def reference_momentum_correction(self) -> EffectMomentumCalculator:
+    def effect_momentum_calculator(self) -> EffectMomentumCalculator:
         """The calculator of the momentum that the model's effects add to the tracking feedback's reference."""
         return self._momentum(None)
 

@@ -10,7 +10,7 @@ import scipy.interpolate
 import scipy.special
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.channel_checks import median_sample_period, seen_noise_std
+from yid_ocp.data.channel_checks import median_sample_period, noise_or_quantization_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, unknown_name_error_arguments
@@ -19,8 +19,8 @@ from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_S
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
-from yid_ocp.sensors import CHANNEL_KINDS, measuring_camera_pose, recorded_joint_column_indices
-from yid_ocp.sensors.base import channel_kinds_of_sensor_group
+from yid_ocp.sensors import CHANNEL_KINDS, camera_pose_of_point_group, recorded_joint_column_indices
+from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
@@ -38,7 +38,7 @@ def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -
     most = min((_MAX_CUTOFF_OVER_RATE / median_sample_period(group.t) for group in groups), default=math.inf)
     cutoff, most = min(_MIN_PATH_CUTOFF, most), float(f"{most:.3g}")
     channels = [(g.t, g.position[:, [g.names.index(name)]]) for g in groups for name in joints if name in g.names]
-    sizes = [seen_noise_std(t, angle[:, 0]) for t, angle in channels]
+    sizes = [noise_or_quantization_std(t, angle[:, 0]) for t, angle in channels]
     while cutoff < most and min(sizes, default=0.0) > 0:
         higher, p_values = ZeroPhaseLowPassFilter(min(2 * cutoff, most)), []
         for (t, angle), std in zip(channels, sizes, strict=True):
@@ -52,7 +52,7 @@ def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -
     return cutoff
 
 
-def mean_step_inputs(
+def step_mean_inputs(
     joints: JointGroup,
     driven: tuple[str, ...],
     grid: TimeGrid,
@@ -78,7 +78,7 @@ def mean_step_inputs(
     return mean
 
 
-def mean_step_input_delay_derivative(
+def step_mean_input_delay_derivative(
     joints: JointGroup,
     driven: tuple[str, ...],
     grid: TimeGrid,
@@ -86,7 +86,7 @@ def mean_step_input_delay_derivative(
     delay: Array,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Return the derivative (steps, nu) of `mean_step_inputs` by each joint's delay. At jumps: mean of both sides."""
+    """Return the derivative (steps, nu) of `step_mean_inputs` by each joint's delay. At jumps: mean of both sides."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
@@ -217,7 +217,7 @@ def smoothed_joint_efforts(
     return np.stack([np.interp(grid.node_times, joints.t + late, column) for column in effort.T], axis=1)
 
 
-def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
+def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     """Return the kinds of signals in the recordings that effects can require, such as `joints.effort`.
 
     Each sensor mounted on a frame is a kind, such as `wrist:FRAME`. In recordings with joints, each point group that
@@ -232,21 +232,21 @@ def signal_kinds_for_effects(recordings: Sequence[Recording]) -> frozenset[str]:
             if any(channel.matches_group_name(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
         for group in recording.channel_groups:
-            of_vectors = [c.group for c in channel_kinds_of_sensor_group(group.name) if c.components]
+            of_vectors = [c.group for c in channel_specs_for_group_name(group.name) if c.components]
             mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
-        if any(measuring_camera_pose(group) is not None for group in recording.points):
+        if any(camera_pose_of_point_group(group) is not None for group in recording.points):
             found.add("camera")
         for points in recording.points if recording.joints is not None else ():
-            if measuring_camera_pose(points) is None and not is_point_group_measured_by_arm(points):
+            if camera_pose_of_point_group(points) is None and not is_point_group_measured_by_arm(points):
                 mounted.add(f"points:{points.name}")
         if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")
     return frozenset(found & signal_kinds_required_by_any_effect() | mounted)
 
 
-def effect_kinds_without_recorded_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
+def effect_kinds_by_missing_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
     """Map missing signals, such as 'camera and joints.effort', to the kinds of effects that cannot be candidates."""
-    present, found = signal_kinds_for_effects(recordings), dict[str, list[str]]()
+    present, found = recorded_signal_kinds(recordings), dict[str, list[str]]()
     for kind in EFFECTS:
         if missing := sorted(EFFECTS[kind].required_sensors - present):
             found.setdefault(" and ".join(missing), []).append(kind)

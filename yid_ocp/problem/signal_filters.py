@@ -41,7 +41,7 @@ class ZeroPhaseLowPassFilter:
             smooth = _filtered_both_ways(sections, smooth, pad)
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
-    def decorrelation_stride(self, step: float) -> int:
+    def decorrelation_stride_for_step(self, step: float) -> int:
         """Return the number of samples, `step` [s] apart, after which filtered white noise is nearly uncorrelated."""
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 

@@ -109,7 +109,7 @@ def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[l
     with contextlib.suppress(OSError, YidError, SyntaxError):  # the last of a damaged URDF
         if robot is None or "<visual" not in read_input_text(urdf_path_from_robot_name(robot)):
             return {}
-        mechanism = system.numeric_mechanism()
+        mechanism = system.mechanism_with_values()
         told = (file_sha256(Path(__file__)), mesh_sources_sha256(robot, mechanism), system.mechanism.joint_names)
         file: Path | None = None
         with contextlib.suppress(YidError):  # a page has its meshes without a cache, too

@@ -19,10 +19,10 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
+    copyable_estimates_blocks,
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
-    numbers_to_use_blocks,
     p_value_text,
     register_summary,
     scale_and_unit_with_metres_as_mm,
@@ -94,7 +94,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["next_plan"] is not None:
         yield "to separate these effects, plan a motion:"
         yield CodeBlock(_planning_command(result["next_plan"]))
-    yield from numbers_to_use_blocks(result)
+    yield from copyable_estimates_blocks(result)
     yield f"verdict: {verdict} ({sum(result['seconds'].values()):.1f} s)"
 
 
@@ -138,7 +138,7 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
-def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
+def blind_validation_markdown_lines(result: Mapping[str, Any]) -> list[str]:
     """Return the tables of a `yid-blind/1` result as lines of Markdown, separated by empty lines."""
     lines: list[str] = []
     for head, *rows in (table.rows for table in _blind_tables(result)):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> list[Path]:
+def draw_blind_validation_figures(folder: Path, result: Mapping[str, Any]) -> list[Path]:
     """Draw `detection.png`, `confusion.png` and `calibration.png` from a `yid-blind/1` result, and return their paths.
 
     The figures show the detection rate over the effect size with binomial 95 % intervals, the first answer against the

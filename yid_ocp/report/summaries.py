@@ -24,11 +24,11 @@ from yid_ocp.report.terminal import (
     SummaryTable,
     TableRows,
     bound_range_text,
+    copyable_estimates_blocks,
     discretisation_shift_sentences,
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
-    numbers_to_use_blocks,
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
@@ -79,7 +79,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from (SummaryStatement(text, "verdict") for text in _found_and_lost(free))
         if result["fit"]["explains"]:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
-    yield from numbers_to_use_blocks(result)
+    yield from copyable_estimates_blocks(result)
     yield result.get("safeguard", "")
     ended = f"{result['status']}: {result['message']}; {result['iterations']} iterations, {result['seconds']:.1f} s"
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
@@ -271,7 +271,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(text, "conclusion")
     if not result["to_use"]:
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
-    yield from numbers_to_use_blocks(result)
+    yield from copyable_estimates_blocks(result)
 
 
 @register_summary("yid-plan/1")

@@ -18,7 +18,7 @@ from yid_ocp.inference.uncertainty import (
     goodness_of_fit_message,
     value_and_uncertainty_text,
 )
-from yid_ocp.sensors.base import channel_kinds_of_sensor_group
+from yid_ocp.sensors.base import channel_specs_for_group_name
 
 if TYPE_CHECKING:
     from yid_ocp.data.readers import FilePreview
@@ -124,7 +124,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
         yield SummaryStatement("no value counts as found, because a recording has a severe issue", "verdict")
 
 
-def numbers_to_use_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the found values of a result in the formats of other programs, to copy. Nothing if none is found."""
     if use := result.get("to_use"):
         left_out = " and ".join(use["uncounted_errors"])
@@ -234,7 +234,7 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
         return [f"{name} [{JOINT_CHANNEL_UNITS[name]}]" for name in group.values_by_channel]
     if isinstance(group, PointGroup):
         return ["position [m]"]
-    kinds = {kind.quantity: kind.unit for kind in channel_kinds_of_sensor_group(group.name)}
+    kinds = {kind.quantity: kind.unit for kind in channel_specs_for_group_name(group.name)}
     return [f"{name} [{kinds[name]}]" for name in group.values_by_quantity]
 
 

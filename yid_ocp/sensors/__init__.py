@@ -15,7 +15,7 @@ from yid_ocp.sensors.base import sensor_function_with_jacobians as sensor_functi
 from yid_ocp.sensors.joints import PositionSensor as PositionSensor
 from yid_ocp.sensors.joints import PrescribedJointEffortSensor as PrescribedJointEffortSensor
 from yid_ocp.sensors.points import PointSensor as PointSensor
-from yid_ocp.sensors.points import measuring_camera_pose as measuring_camera_pose
+from yid_ocp.sensors.points import camera_pose_of_point_group as camera_pose_of_point_group
 
 # every file of this folder registers its sensors when it is imported
 for _module in iter_modules(__path__):

@@ -105,7 +105,7 @@ CHANNEL_KINDS: Registry[RecordedChannelSpec] = Registry("recorded channel")
 """Kinds of recorded channels. Those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def channel_kinds_of_sensor_group(group: str) -> tuple[RecordedChannelSpec, ...]:
+def channel_specs_for_group_name(group: str) -> tuple[RecordedChannelSpec, ...]:
     """Return the channel kinds that a recorded group of this name may contain. Empty for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
@@ -120,7 +120,7 @@ class _RecordedGroup(Protocol):
     def t(self) -> Array: ...
 
 
-class RecordedPointGroup(_RecordedGroup, Protocol):
+class RecordedPointsInterface(_RecordedGroup, Protocol):
     """The interface of a recorded point group, with times and positions. `data.recording.PointGroup` implements it."""
 
     @property
@@ -154,7 +154,7 @@ class RecordedJointsInterface(_RecordedGroup, Protocol):
     def position_resolution(self) -> float | Array | None: ...
 
 
-class RecordedExtraSensor(_RecordedGroup, Protocol):
+class RecordedExtraSensorInterface(_RecordedGroup, Protocol):
     """The interface of an additional sensor's recorded channels. `data.recording.SensorChannelGroup` implements it."""
 
     @property
@@ -171,9 +171,9 @@ class _RecordingData(Protocol):
     @property
     def joints(self) -> RecordedJointsInterface | None: ...
     @property
-    def points(self) -> Sequence[RecordedPointGroup]: ...
+    def points(self) -> Sequence[RecordedPointsInterface]: ...
     @property
-    def channel_groups(self) -> Sequence[RecordedExtraSensor]: ...
+    def channel_groups(self) -> Sequence[RecordedExtraSensorInterface]: ...
 
 
 def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> DataError:
@@ -242,7 +242,7 @@ class Sensor(ABC):
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
-    def measurement_frame_names(self) -> tuple[str, ...]:
+    def frame_name_per_output(self) -> tuple[str, ...]:
         """The name of the frame at which each output is measured; empty for joints."""
         frames = self.frame_names or ("",) * len(self.channel_names)
         return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))
@@ -267,7 +267,7 @@ class Sensor(ABC):
         """The pose of the camera in the world. None if the sensor is not a camera."""
         return None
 
-    def bias_location(self, frame: str) -> str | None:
+    def bias_location_name_for_frame(self, frame: str) -> str | None:
         """Return the location of a constant error of readings at a frame; None: a grasp at the frame, or the group."""
         return None if self.camera_pose is None else "camera"
 
@@ -319,7 +319,7 @@ class SmoothingFilter(Protocol):
     def end_distortion_duration(self) -> float: ...
 
     def __call__(self, t: Array, values: Array) -> Array: ...
-    def decorrelation_stride(self, step: float) -> int: ...
+    def decorrelation_stride_for_step(self, step: float) -> int: ...
     def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]: ...
 
 

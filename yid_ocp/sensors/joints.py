@@ -19,7 +19,7 @@ from yid_ocp.sensors.base import (
     SENSOR_READERS,
     RecordedChannelSpec,
     RecordedJointsInterface,
-    RecordedPointGroup,
+    RecordedPointsInterface,
     Sensor,
     SensorData,
     SensorDataInputs,
@@ -87,7 +87,7 @@ class PrescribedJointEffortSensor(JointSensor):
         return self.select_sensor_joint_entries(state.load, state)
 
 
-def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
+def is_point_group_measured_by_arm(group: RecordedPointsInterface) -> bool:
     """Check whether the arm measured a point group, usually by its encoders and forward kinematics."""
     return "arm" in (group.sensor_name, group.name.rpartition("_")[2])
 
@@ -142,7 +142,7 @@ def filtered_effort_measurements(
     time. Raises `DataError` if the recording is too short for the filter.
     """
     # the mean of an interval belongs to its centre
-    kept, measured = filter_and_thin_to_nodes(inputs, t, values, "efforts", at_centres=not is_sample)
+    kept, measured = filtered_node_indices_and_values(inputs, t, values, "efforts", at_centres=not is_sample)
     measured[_may_stick(inputs, sensor.joint_names, inputs.node_times[kept])] = np.nan
     times, last = inputs.node_times[kept], len(inputs.node_times) - 1
     unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
@@ -153,7 +153,7 @@ def filtered_effort_measurements(
     return SensorData(sensor, times, measured, *more, smoothing_filter=inputs.effort_filter)
 
 
-def filter_and_thin_to_nodes(
+def filtered_node_indices_and_values(
     inputs: SensorDataInputs, t: Array, values: Array, noun: str, *, at_centres: bool = False, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
@@ -170,7 +170,7 @@ def filter_and_thin_to_nodes(
     period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     apart = max(1, round(period / step))
     ends = apart * math.ceil(max(1, math.ceil(distorted / step)) / apart)
-    kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride(step) / apart))
+    kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride_for_step(step) / apart))
     kept = kept[(times[kept] > t[0] + distorted - step) & (times[kept] < t[-1] - distorted + step) & (len(t) > 1)]
     if not len(kept):
         length, allowed = min(steps * step, float(t[-1] - t[0])), f"more than {2 * ends * step:.3g} s"
@@ -264,7 +264,7 @@ def _may_stick(inputs: SensorDataInputs, names: tuple[str, ...], times: Array) -
         return np.zeros((len(times), len(names)), bool)
     position = joints.position[:, recorded_joint_column_indices(joints, names, inputs.recording.name)]
     speed = np.gradient(inputs.path_filter(joints.t, position), joints.t, axis=0)
-    reach = inputs.effort_filter.decorrelation_stride(inputs.time_step) * inputs.time_step
+    reach = inputs.effort_filter.decorrelation_stride_for_step(inputs.time_step) * inputs.time_step
     first, last = np.searchsorted(joints.t, times - reach), np.searchsorted(joints.t, times + reach)
     windows = [speed[i : max(j, i + 1)] for i, j in zip(first, last, strict=True)]
     # the filter hides a short standstill at a reversal, so that only the sign of the speed shows it

@@ -15,7 +15,7 @@ from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
 from yid_ocp.sensors.joints import (
     JOINT_POSITION_GROUP_NAME,
-    filter_and_thin_to_nodes,
+    filtered_node_indices_and_values,
     is_noise_std_stated,
     joint_angle_noise_std,
 )
@@ -38,7 +38,7 @@ class MountedSensor(base.Sensor):
     def channel_names(self) -> tuple[str, ...]:
         return tuple(f"{self.group_name}.{name}" for name in self.names)
 
-    def bias_location(self, frame: str) -> str:
+    def bias_location_name_for_frame(self, frame: str) -> str:
         return f"{self.channel.group}:{frame}"
 
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
@@ -66,7 +66,7 @@ def _read_sensors(around: base.SensorDataInputs, kind: type[MountedSensor]) -> l
 
 
 def _measured(
-    around: base.SensorDataInputs, kind: type[MountedSensor], group: base.RecordedExtraSensor, key: str
+    around: base.SensorDataInputs, kind: type[MountedSensor], group: base.RecordedExtraSensorInterface, key: str
 ) -> base.SensorData:
     choice, tree = around.sensor_usage(key), around.system.mechanism
     where, channel, names = f"{around.recording.name}: {group.name}", kind.channel, group.names
@@ -99,7 +99,7 @@ def _measured(
         kept = (group.t >= last[0] - 1e-9) & (group.t <= last[1] + 1e-9)
         own = np.broadcast_to(by_output[0], values[kept].shape)
         return base.SensorData(sensor, group.t[kept], values[kept], own, inner, by_output[1])
-    nodes, measured = filter_and_thin_to_nodes(around, group.t, values, key, like_path=True)
+    nodes, measured = filtered_node_indices_and_values(around, group.t, values, key, like_path=True)
     times, period = around.node_times[nodes], float(np.median(np.diff(group.t)))
     own = by_output[0] * around.path_filter.noise_gains_of_value_and_rates(period)[0]
     total, correlation = _with_encoder_noise(around, sensor, own, times)

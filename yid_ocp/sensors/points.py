@@ -47,7 +47,7 @@ def _read_point_groups(around: base.SensorDataInputs) -> list[base.SensorData]:
 
 
 def _points(
-    around: base.SensorDataInputs, group: base.RecordedPointGroup, choice: base.SensorOptions
+    around: base.SensorDataInputs, group: base.RecordedPointsInterface, choice: base.SensorOptions
 ) -> base.SensorData:
     where = f"recording '{around.recording.name}': {group.name}"
     wanted = choice.used_points if choice.used_points is not None else group.names
@@ -82,13 +82,13 @@ def _points(
         std = group.std[inside][:, columns].reshape(value.shape)
     else:
         raise base.missing_noise_level_error(f"group '{group.name}'", where, group.name, "m")
-    sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), measuring_camera_pose(group))
+    sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), camera_pose_of_point_group(group))
     change = _clock_offset_std(around, sensor, group, choice) * _rates(group.t[inside], value)
     return base.SensorData(sensor, group.t[inside], value, std, change_by_clock=change if np.any(change) else None)
 
 
 def _clock_offset_std(
-    around: base.SensorDataInputs, sensor: PointSensor, group: base.RecordedPointGroup, choice: base.SensorOptions
+    around: base.SensorDataInputs, sensor: PointSensor, group: base.RecordedPointsInterface, choice: base.SensorOptions
 ) -> float:
     """Standard deviation [s] of the clock's offset: stated, recorded, else half a sample or (clock not free) zero."""
     stated = group.clock_offset_std if choice.clock_offset_std is None else choice.clock_offset_std
@@ -111,7 +111,7 @@ def _rates(t: Array, values: Array) -> Array:
     return rates
 
 
-def measuring_camera_pose(group: base.RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
+def camera_pose_of_point_group(group: base.RecordedPointsInterface) -> tuple[tuple[float, ...], ...] | None:
     """Return the pose (4, 4) of the camera that measured a point group. None if no camera measured it.
 
     A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Without a pose, the camera is

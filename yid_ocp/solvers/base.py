@@ -39,7 +39,7 @@ from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
-from yid_ocp.solvers.initial_guess import starts_toward_other_minima, unknowns_with_neutral_effects_activated
+from yid_ocp.solvers.initial_guess import start_vectors_toward_other_minima, unknowns_with_neutral_effects_activated
 
 if TYPE_CHECKING:
     import pandas
@@ -365,7 +365,7 @@ class _MultiStartSearch:
             if not best.evaluation.ok or assess_goodness_of_fit(best.weighted, best.evaluation, limits).explains:
                 break
             self._try(self._multiple(best.result.x, factor), f"best fit x {factor:g}", most)
-        minima = starts_toward_other_minima(self._best.weighted, self._best.evaluation, self._best.result.x)
+        minima = start_vectors_toward_other_minima(self._best.weighted, self._best.evaluation, self._best.result.x)
         most = self._n_starts + len(minima)
         for near in minima:
             self._try(near, "another local minimum", most)
@@ -537,7 +537,7 @@ class _RelinearizingSearch:
             if now.jacobian is None:
                 return ended(Status.FAILED, now.message)
             (lower, upper), size = problem.bounds, np.maximum(np.abs(x), problem.unknown_scales)
-            slope = linearized_residual.projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
+            slope = linearized_residual.max_abs_projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
             recorder.record_iterate(now.cost, x, slope, f"weights {number + 2} of at most {_MAX_LINEARIZATIONS + 1}")
             step = linearized_residual.size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
             length = linearized_residual.step_norm_in_stds(now, step)

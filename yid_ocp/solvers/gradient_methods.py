@@ -16,8 +16,8 @@ from yid_ocp.inference.linearized_residual import (
     achievable_cost_reduction,
     bounded_levenberg_marquardt_step,
     is_stationary_point,
+    max_abs_projected_gradient,
     predicted_cost_reduction_by_step,
-    projected_gradient_norm,
 )
 from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, unknowns_covariance_and_reduced_chi2
 from yid_ocp.options import OptionInfo
@@ -96,7 +96,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
             assert jacobian is not None
             size = np.maximum(np.abs(x), scale)
             if not rejected:
-                slope = projected_gradient_norm(x, jacobian.T @ residual, lower, upper, size)
+                slope = max_abs_projected_gradient(x, jacobian.T @ residual, lower, upper, size)
                 recorder.record_iterate(now.cost, x, slope)
                 saved = _saved(problem, recorder.history, now)
                 if saved is not None:
@@ -125,7 +125,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 x, now, rejected = np.clip(x + step, lower, upper), trial, False
                 mu = max(mu * (0.2 if gain > 0.5 else 1.0 if gain > 0.2 else 3.0), 1e-12)
                 if moved < self.step_tolerance and now.jacobian is not None and is_stationary_point(problem, x, now):
-                    slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
+                    slope = max_abs_projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
                     recorder.record_iterate(now.cost, x, slope)
                     return ended(base.Status.CONVERGED, "the step is below its tolerance")
                 continue
@@ -211,7 +211,7 @@ class SingleShooting(base.SolverWithCheckedSettings):
         def accepted(intermediate_result: scipy.optimize.OptimizeResult) -> None:
             x = intermediate_result.x * scale
             cost, gradient = seen.get(x.tobytes(), (np.nan, np.zeros_like(x)))
-            recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, scale))
+            recorder.record_iterate(cost, x, max_abs_projected_gradient(x, gradient, lower, upper, scale))
 
         accepted(scipy.optimize.OptimizeResult(x=start / scale))
         options = {"maxiter": self.max_iterations, "ftol": self.cost_tolerance, "gtol": 1e-9, "maxls": 40, "maxcor": 20}
@@ -275,7 +275,7 @@ class SteepestDescent(base.SolverWithCheckedSettings):
         length = 0.1 * float(np.linalg.norm(problem.unknown_scales)) / max(float(np.linalg.norm(gradient)), 1e-300)
         for _ in range(self.max_iterations):
             size = np.maximum(np.abs(x), problem.unknown_scales)
-            slope = projected_gradient_norm(x, gradient, lower, upper, size)
+            slope = max_abs_projected_gradient(x, gradient, lower, upper, size)
             recorder.record_iterate(cost, x, slope)
             reference = max(entry.cost for entry in recorder.history[-self.nonmonotone_memory :])
             if slope <= self.gradient_tolerance * max(cost, 1e-300):
@@ -296,6 +296,6 @@ class SteepestDescent(base.SolverWithCheckedSettings):
             if self.first_trial_step_rule == "spectral" and float(moved @ turned) > 0:
                 length = float(moved @ moved) / float(moved @ turned)
         size = np.maximum(np.abs(x), problem.unknown_scales)
-        recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, size))
+        recorder.record_iterate(cost, x, max_abs_projected_gradient(x, gradient, lower, upper, size))
         message = f"no convergence in {self.max_iterations} iterations, as is usual for this method; try gauss_newton"
         return ended(base.Status.ITERATION_LIMIT, message)

@@ -219,7 +219,7 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
     return step[amplitudes] * size[amplitudes], predicted_cost_reduction_by_step(scaled, found.residual, step)
 
 
-def starts_toward_other_minima(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
+def start_vectors_toward_other_minima(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
     """Return start vectors that may lead to another minimum than `x` (evaluation: `finish`), by increasing cost."""
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []

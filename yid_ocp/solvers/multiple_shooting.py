@@ -15,8 +15,8 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import (
     bounded_levenberg_marquardt_step,
+    max_abs_projected_gradient,
     predicted_cost_reduction_by_step,
-    projected_gradient_norm,
 )
 from yid_ocp.integrator.step import simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
@@ -192,7 +192,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         for _ in range(self.max_iterations):
             size = np.maximum(np.abs(x), problem.unknown_scales)
             gradient = now.jacobian.T @ now.residual
-            recorder.record_iterate(now.cost, x, projected_gradient_norm(x, gradient, *problem.bounds, size))
+            recorder.record_iterate(now.cost, x, max_abs_projected_gradient(x, gradient, *problem.bounds, size))
             closed = now.residual + now.by_defect
             # the linear model holds for changes by a factor, not to a bound
             (low, high), positive = problem.bounds, problem.positive_unknowns_mask

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import SolverError, unknown_name_error_arguments
-from yid_ocp.integrator.compiler import compiled_casadi_function
+from yid_ocp.integrator.compiler import compile_casadi_function
 from yid_ocp.parallel import CASADI_LOCK
 
 HessianKind = Literal["gauss_newton", "exact"]
@@ -66,7 +66,7 @@ class LocalVariableFunction:
         self.jacobian = self._compiled(ca.Function(f"{name}_slope", self._inputs, ca.cse([ca.sparsify(slopes)])))
 
     def _compiled(self, function: ca.Function) -> ca.Function:
-        return compiled_casadi_function(function) if self._use_compiler else function
+        return compile_casadi_function(function) if self._use_compiler else function
 
     @_ThreadSafeCachedProperty
     def _weighted_hessian_function(self) -> ca.Function | None:

@@ -27,12 +27,12 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.discrete import NlpStepConstraints, one_step_nlp_constraints
-from yid_ocp.integrator.statics import measured_joint_angle_hold_stiffness
+from yid_ocp.integrator.statics import joint_hold_spring_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episode_prediction import sensor_not_predictable_at_nodes_error
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.evaluation import SOFT_LOGARITHM_MIN_RATIO
+from yid_ocp.problem.evaluation import WEAK_PRIOR_LOG_MIN_RATIO
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 from yid_ocp.solvers.initial_guess import (
@@ -109,7 +109,7 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
     shared, own = len(problem.shared_parameters), len(problem.local_parameters)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
     predictor, n = problem.predictor, problem.step.sizes["n"]
-    rows = list(predictor.estimated_initial_state_entries)
+    rows = list(predictor.estimated_initial_state_indices)
     for i, episode in enumerate(problem.episodes):
         columns = problem.unknowns.unknown_indices_affecting_recording(i)[shared:]
         if own:
@@ -319,7 +319,7 @@ class _Maker:
         """The stage with the inputs of a recording."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
-            feedback, shift = episode.tracking_feedback, self._problem.model_functions.reference_momentum_correction
+            feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_calculator
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
             self._stages[key] = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
@@ -355,7 +355,7 @@ class _Maker:
     def _begun(self, episode: Episode, places: _Places) -> tuple[MappedFunctionTerm, list[ResidualTerm]]:
         """Constraints of the first state, and the prior of its free part."""
         problem, name, nx = self._problem, episode.name, self._sizes["nx"]
-        loose = list(problem.predictor.estimated_initial_state_entries)
+        loose = list(problem.predictor.estimated_initial_state_indices)
         fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_coordinate_indices, *loose}]
         joints = problem.system.mechanism.joint_names
         rows = [
@@ -372,7 +372,7 @@ class _Maker:
             statics = problem.model_functions.equilibrium_solver
             rest = statics.symbolic_equations
             sought, held = rest.inputs[0], rest.inputs[2]
-            stiffness = measured_joint_angle_hold_stiffness(problem.system, bool(problem.system.driven))
+            stiffness = joint_hold_spring_stiffness(problem.system, bool(problem.system.driven))
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()
@@ -403,7 +403,7 @@ class _Maker:
 
     def _sampled(self, episode: Episode, samples: SensorMeasurements, places: _Places) -> ResidualTerm:
         """Samples of one sensor, predicted by linear interpolation between the two adjacent nodes."""
-        sensor, nodes, n = samples.sensor, samples.evaluation_nodes, self._sizes["n"]
+        sensor, nodes, n = samples.sensor, samples.evaluation_node_indices, self._sizes["n"]
         (read, loaded), smooth = self._reading(sensor, episode), None
         if sensor.effort_joints:
             smooth = self._problem.predictor.predicted_effort_smoother(episode, self._problem.theta)
@@ -478,9 +478,9 @@ class _Maker:
         _, slopes = problem.priors.residual_and_jacobian(problem.initial_unknowns)
         v, about = ca.SX.sym("v"), ca.SX.sym("about")
         ratio = v / about
-        below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
-        bent = ca.if_else(ratio < SOFT_LOGARITHM_MIN_RATIO, below - below**2 / 2, 0)
-        soft = ca.log(ca.fmax(ratio, SOFT_LOGARITHM_MIN_RATIO)) + bent
+        below = (ratio - WEAK_PRIOR_LOG_MIN_RATIO) / WEAK_PRIOR_LOG_MIN_RATIO
+        bent = ca.if_else(ratio < WEAK_PRIOR_LOG_MIN_RATIO, below - below**2 / 2, 0)
+        soft = ca.log(ca.fmax(ratio, WEAK_PRIOR_LOG_MIN_RATIO)) + bent
         stated = problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start
         found = []
         kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))

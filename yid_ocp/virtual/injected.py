@@ -493,7 +493,7 @@ class InjectedEffect:
         return f"{self.kind}@{self.location}"
 
 
-def run_experiment_with_effects(
+def run_experiment_with_injected_effects(
     system: System,
     values: Mapping[str, float],
     effects: Sequence[InjectedEffect],

@@ -113,7 +113,7 @@ def random_multisine_motion(
     motion = MultisineMotion(system.driven, amplitude, frequency, phase, chosen.ramp_time)
     times = np.linspace(0.0, chosen.duration, 251)
     start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
-    tree = system.numeric_mechanism(values)
+    tree = system.mechanism_with_values(values)
     q0 = np.zeros(system.n_coordinates)
     q0[[tree.joint_index(name) for name in start]] = list(start.values())
     holders = [tree.frame(grasp.holder_frame) for grasp in system.grasps]
@@ -206,7 +206,7 @@ def grasping_joint_angles(
         Position of each gripper relative to the grasped point of the undeformed object, in the world [m]. Two arms that
         hold the undeformed Y are fully stretched, a singular posture. Offsets that bring the grippers closer avoid it.
     """
-    tree = system.numeric_mechanism(values)
+    tree = system.mechanism_with_values(values)
     value = ExpressionEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
     elastic = {spring.joint_name for spring in system.elastic_joints}

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, ModelError, import_optional
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_inertias
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, MidpointStateSymbols, System
 
@@ -43,7 +43,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
 @functools.cache
-def format_elements_by_model_aspect() -> Mapping[str, Mapping[str, str]]:
+def file_format_elements_by_aspect() -> Mapping[str, Mapping[str, str]]:
     """Return, for each model aspect that an engine may lack, its description (`is`) and elements by file format."""
     return dict(YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml")))
 
@@ -91,7 +91,7 @@ class ExpressionEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Find the model aspects (keys of `format_elements_by_model_aspect`) whose expressions depend on `symbols`."""
+    """Find the model aspects (keys of `file_format_elements_by_aspect`) whose expressions depend on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -270,7 +270,7 @@ def mujoco_xml(
     """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml: time_step", allowed="a number above 0 [s]")
-    tree, weights = _weighed(system.numeric_mechanism(values))
+    tree, weights = _weighed(system.mechanism_with_values(values))
     value = ExpressionEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
 
@@ -334,7 +334,7 @@ def _bodies(
             hint = "give a mass to one of the links between them"
             allowed = "up to six joints in series, with a mass on the link of the last one"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
-        body = merge_bodies(joint.bodies)
+        body = merge_inertias(joint.bodies)
         if body is not None:
             if joint.name in weights:
                 elements[j].set("gravcomp", format_xml_numbers([1 - weights[joint.name]]))
@@ -439,14 +439,14 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
 
 
 def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: bool) -> None:
-    native = format_elements_by_model_aspect().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
+    native = file_format_elements_by_aspect().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
     able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
     for effect in system.effects:
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
         if aspects:
-            changed = format_elements_by_model_aspect()[min(aspects)]["is"]
+            changed = file_format_elements_by_aspect()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            allowed = ", ".join(own["is"] for name, own in format_elements_by_model_aspect().items() if name in able)
+            allowed = ", ".join(own["is"] for name, own in file_format_elements_by_aspect().items() if name in able)
             where, hint = f"effect '{effect.kind}@{effect.location}'", "remove the effect"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:
@@ -471,7 +471,7 @@ def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: b
 def _shares_body(tree: Mechanism, j: int) -> bool:
     """Whether joint j shares a body with its parent joint: same location, and a massless link without other joints."""
     joint = tree.joints[j]
-    if joint.parent_index < 0 or merge_bodies(tree.joints[joint.parent_index].bodies) is not None:
+    if joint.parent_index < 0 or merge_inertias(tree.joints[joint.parent_index].bodies) is not None:
         return False
     alone = sum(other.parent_index == joint.parent_index for other in tree.joints) == 1
     return alone and bool(np.array_equal(np.array(ca.DM(joint.placement.homogeneous_matrix())), np.eye(4)))

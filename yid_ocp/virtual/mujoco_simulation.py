@@ -267,7 +267,7 @@ class TrackingController:
         zero = np.zeros(len(scene.moved_joint_ids))
         self._load = balance - self._arm_torque(self._rest[scene.moved_joint_ids], zero, zero)
 
-    def apply_and_return_input(self, t: float) -> Array:
+    def apply_and_return_control_input(self, t: float) -> Array:
         """Compute the torques (nu,) [N m] at time t [s] from the scene's present state, apply and return them."""
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
@@ -293,7 +293,7 @@ class _ServoCommander:
         self._scene, self._motion = scene, motion
         self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
 
-    def apply_and_return_input(self, t: float) -> Array:
+    def apply_and_return_control_input(self, t: float) -> Array:
         commands = np.asarray(self.initial_command + self._motion.offset_and_derivatives(t)[0])
         self._scene.data.ctrl[:] = commands
         return commands
@@ -364,7 +364,7 @@ def _play(
     for tick, done in enumerate(ticks.tolist()):
         end = done if tick == len(ticks) - 1 else int(ticks[tick + 1])
         mujoco.mj_kinematics(model, data)
-        torques.append(controller.apply_and_return_input(done / steps_per_second))
+        torques.append(controller.apply_and_return_control_input(done / steps_per_second))
         if tick % periods == 0:
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])
@@ -454,7 +454,7 @@ def replay_mismatch_by_channel(
         return _errors(system, recording, joints, columns, _driven(scene, path, t, effort))
     controller = TrackingController(scene, path, balance)
     scene.data.qvel[scene.moved_joint_ids] = path.offset_and_derivatives(0.0)[1]  # a recording may begin in motion
-    played = _played(scene, t[-1], lambda k, now: controller.apply_and_return_input(now))
+    played = _played(scene, t[-1], lambda k, now: controller.apply_and_return_control_input(now))
     return _errors(system, recording, joints, columns, played)
 
 

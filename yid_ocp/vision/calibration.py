@@ -27,13 +27,13 @@ from yid_ocp.vision.camera_registration import (
     MIN_ARM_POINTS_PER_FRAME,
     ROTATION_SLICE,
     TRANSLATION_SLICE,
-    ArmSurface,
     CameraState,
+    MovingArmSurface,
     RobustCostDerivatives,
     StampedCloud,
     SurfaceObservationFractions,
-    candidate_calibration_states,
-    robust_gradient_and_hessian,
+    candidate_camera_states,
+    robust_cost_derivatives,
     seen_occluded_and_seen_through_surface_fractions,
 )
 from yid_ocp.vision.point_cloud import MAD_TO_STD, weighted_median
@@ -85,7 +85,7 @@ class _StampDelay(NamedTuple):
 
 
 def stamp_delay_beyond_clock_offset(
-    arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
+    arm: MovingArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Estimate the delay [s] of a frame's time stamp beyond the common clock offset. None if the arm is not in view.
 
@@ -110,7 +110,7 @@ def stamp_delay_beyond_clock_offset(
     return trial
 
 
-def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: float) -> _StampDelay:
+def _nearby(arm: MovingArmSurface, origin: Array, t: float, points: Array, start: float) -> _StampDelay:
     """The delay near the delay `start` [s], by Gauss-Newton steps that match points within a decreasing distance."""
     x = np.array([start, 0.0, 0.0, 0.0])
     hessian, sigma = np.zeros((4, 4)), _OFF_ARM_DISTANCE
@@ -192,7 +192,7 @@ class CameraCalibration:
     camera_state: CameraState  # pose, depth and clock that the tracking uses
     prior_state: CameraState  # specified pose, depth and clock
     usual_square_distance: float | None  # misfit of single frames [m^2]; None if no clock was compared
-    # (10, 10), of `camera_state`, in the order of `CameraState.difference_from`; zero if nothing was estimated
+    # (10, 10), of `camera_state`, in the order of `CameraState.state_increment_from`; zero if nothing was estimated
     state_covariance: Array
     estimate_minus_used: Array  # (10,), estimate minus used state, if the pose is fixed
     arm_visibility: SurfaceObservationFractions | None  # visibility of the arm at the calibrated state
@@ -231,7 +231,7 @@ def calibration_without_estimation(pose: Array, options: CameraClockOptions, rea
 
 
 def calibrate_camera(
-    arm: ArmSurface,
+    arm: MovingArmSurface,
     frames: Sequence[StampedCloud],
     pose: Array,
     rng: np.random.Generator,
@@ -267,7 +267,7 @@ class _UntoldError(Exception):
 class _Calibrator:
     """Data of one call of `calibrate_camera`."""
 
-    arm: ArmSurface
+    arm: MovingArmSurface
     told: CameraState
     rng: np.random.Generator
     options: ArmBasedCameraCalibrationOptions
@@ -315,7 +315,7 @@ class _Calibrator:
         used_state = state
         if self.options.fix_pose:
             used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
-        beside = state.difference_from(used_state)
+        beside = state.state_increment_from(used_state)
         words = self._message(state, covariance, chosen[len(chosen) // 2].stamp)
         words += f"; from {len(chosen)} frames, with {100 * presence.there:.0f} % of the arm's surface in the clouds"
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
@@ -337,7 +337,7 @@ class _Calibrator:
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
             few.append(StampedCloud(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)))
-        tried = candidate_calibration_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
+        tried = candidate_camera_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
         if not tried:
             raise _UntoldError("the arm is hardly in view", "turn the camera so that it sees more of the arm")
         best, most = tried[0], -1.0
@@ -370,11 +370,11 @@ class _Calibrator:
 
         def cost(state: CameraState) -> RobustCostDerivatives:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
-            return robust_gradient_and_hessian(rows, reach)
+            return robust_cost_derivatives(rows, reach)
 
         for _ in range(rounds):
-            hessian, gradient, _ = cost(state).corrected_hessian_gradient_and_factor(self.precision)
-            pull = gradient + self.precision @ state.difference_from(self.told)
+            hessian, gradient, _ = cost(state).reweighted_hessian_gradient_and_weight(self.precision)
+            pull = gradient + self.precision @ state.state_increment_from(self.told)
             step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
             state = state.with_state_increment(step)
             if np.abs(step).max() < _STEP_TOLERANCE:
@@ -390,7 +390,7 @@ class _Calibrator:
             words.append(f"clock drift {1e3 * state.clock_drift:.2f} ± {1e3 * drift:.2f} ms per second")
         points = self.arm.visible_surface_points_and_parts(state, stamp)[0].mean(axis=0, keepdims=True)
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
-        change = state.difference_from(self.told)
+        change = state.state_increment_from(self.told)
         if away > _MIN_REPORTED_DISPLACEMENT and self.options.fix_pose:
             slopes = state.world_point_jacobian_by_pose_and_depth(points)[0]
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T

@@ -113,7 +113,7 @@ class CameraState:
         clocks = self.clock_offset + clock, self.clock_drift + drift, self.clock_reference_stamp
         return CameraState(pose, *depth, *clocks)
 
-    def difference_from(self, other: CameraState) -> Array:
+    def state_increment_from(self, other: CameraState) -> Array:
         """Return this state minus another one, (10,): the increment that leads from the other state to this one."""
         turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
         moved, scale = self.pose[:3, 3] - other.pose[:3, 3], math.log(self.depth_scale / other.depth_scale)
@@ -142,7 +142,7 @@ class _CalibrationEquations(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ArmSurface:
+class MovingArmSurface:
     """The surface of the robot along its recorded motion."""
 
     robot_surfaces: ArticulatedSurfaces
@@ -237,7 +237,7 @@ class RobustCostDerivatives:
     # (counted twice), and at least the last sum (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
 
-    def corrected_hessian_gradient_and_factor(self, precision: Array) -> tuple[Array, Array, float]:
+    def reweighted_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
         """Return weighted Hessian and gradient, and this weight of the data. `precision`: inverse prior covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
@@ -247,12 +247,12 @@ class RobustCostDerivatives:
 
     def state_covariance(self, precision: Array) -> Array:
         """Compute the covariance (10, 10) of the state that minimises the cost of data and prior."""
-        hessian, _, weight = self.corrected_hessian_gradient_and_factor(precision)
+        hessian, _, weight = self.reweighted_hessian_gradient_and_weight(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
 
-def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostDerivatives:
+def robust_cost_derivatives(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostDerivatives:
     """Return the derivatives of the robust cost of all frames' points. The median error sets the scale of the cost."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     sigma = max(MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
@@ -282,8 +282,8 @@ def _at_least(least: Array, matrix: Array) -> Array:
     return np.asarray(back.T @ (np.maximum(values, 1.0)[:, None] * back))
 
 
-def candidate_calibration_states(
-    arm: ArmSurface, frames: Sequence[StampedCloud], specified: CameraState, search: float, count: int
+def candidate_camera_states(
+    arm: MovingArmSurface, frames: Sequence[StampedCloud], specified: CameraState, search: float, count: int
 ) -> list[CameraState]:
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
@@ -305,7 +305,7 @@ def candidate_calibration_states(
         change[TRANSLATION_SLICE] = -specified.pose[:3, :3] @ (_GRID_CELL_SIZE * cells[cell])
         change[CLOCK_OFFSET_INDEX] = delays[delay]
         trial = specified.with_state_increment(change)
-        between = [trial.difference_from(other) for other in result]
+        between = [trial.state_increment_from(other) for other in result]
         apart = [np.linalg.norm(d[TRANSLATION_SLICE]) + 0.5 * abs(d[CLOCK_OFFSET_INDEX]) for d in between]
         if min(apart, default=math.inf) >= _MIN_START_SEPARATION:
             result.append(trial)
@@ -315,7 +315,7 @@ def candidate_calibration_states(
 
 
 def _add_costs(
-    total: Array, arm: ArmSurface, told: CameraState, glimpse: StampedCloud, delays: Array, cells: IntArray
+    total: Array, arm: MovingArmSurface, told: CameraState, glimpse: StampedCloud, delays: Array, cells: IntArray
 ) -> None:
     """Add a frame's costs to `total` (delays, cells), with the arm `delays` [s] earlier and shifted by the cells."""
     from scipy.ndimage import distance_transform_edt  # slow to import; only needed to search for the camera's pose
@@ -368,7 +368,7 @@ class SurfaceObservationFractions:
 
 
 def seen_occluded_and_seen_through_surface_fractions(
-    arm: ArmSurface, frames: Sequence[StampedCloud], state: CameraState, within: float
+    arm: MovingArmSurface, frames: Sequence[StampedCloud], state: CameraState, within: float
 ) -> SurfaceObservationFractions:
     """Return the fractions of the arm's visible surface with points on it (`within` [m]), in front of or behind it."""
     counts = np.zeros(4)

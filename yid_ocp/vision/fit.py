@@ -30,8 +30,8 @@ from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision import shape_evidence
 from yid_ocp.vision.shape_evidence import (
     FrameShapeFit,
-    FrameTubeDimensionCost,
     ProcessedFrameCloud,
+    QuadraticTubeDimensionCost,
     ShapeFitQuality,
     ShapeFitQualityAndPointClasses,
     TubeLinks,
@@ -304,7 +304,7 @@ class ShapeFitter:
             every = self._tasks(sight, none, ~evidence.is_foreign)[1][-1]
             moved = (jacobian @ self._quadratic(q, every).damped_step(0.0)).reshape(-1, 3)
         for rival in rivals:
-            moved = np.maximum(np.abs(moved), np.abs(self.point_frame_positions(rival) - places))
+            moved = np.maximum(np.abs(moved), np.abs(self.point_positions_at_configuration(rival) - places))
         corners = self._links_at(q)
         touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING_DISTANCE
         # the spread across the links about each point
@@ -315,7 +315,7 @@ class ShapeFitter:
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if abs(offset) > _END_OFFSET_STDS * noise:
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING_DISTANCE
-                off_end[at_end] = offset * shape_evidence.link_axes(corners)[k]
+                off_end[at_end] = offset * shape_evidence.unit_link_axes(corners)[k]
         # a point counts as seen if a link that starts or ends there is seen and its tube is not misplaced
         sure = evidence.covered_fraction >= _MIN_LINK_COVERAGE
         sure &= ~self._links_of(self._failed(evidence))
@@ -370,12 +370,12 @@ class ShapeFitter:
     def make_shape_guess_finder(self) -> ShapeGuessFinder:
         """Make a finder of initial shapes for a system with a free root (`shape_guesses.system_with_free_root`)."""
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
-        tree = self.system.numeric_mechanism(self._values)
+        tree = self.system.mechanism_with_values(self._values)
         return ShapeGuessFinder(self.system, tree, self.rest_configuration, self.bend_joints, lengths)
 
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
-    ) -> FrameTubeDimensionCost:
+    ) -> QuadraticTubeDimensionCost:
         """Cost of tube lengths and radii in a frame, from the points of the pass `task` at the fitted shape `q`."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
@@ -403,7 +403,7 @@ class ShapeFitter:
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if np.isfinite(offset):
                 rows = np.zeros((1, total))
-                rows[0, : free + many] = -shape_evidence.link_axes(corners)[k] @ chain[6 * k + 3 : 6 * k + 6]
+                rows[0, : free + many] = -shape_evidence.unit_link_axes(corners)[k] @ chain[6 * k + 3 : 6 * k + 6]
                 noise = max(self.options.surface_noise_std, evidence.noise_std)
                 add(rows, np.array([offset]), np.array([1.0 / noise**2]))
         held, by_held = self._held(q)
@@ -416,7 +416,7 @@ class ShapeFitter:
         left = both[free:] - hessian[free:, :free] @ follow
         moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
         moved = moved - self._seen(q)[1] @ follow[:, 1:]
-        return FrameTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
+        return QuadraticTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
     def tube_links_at_configuration(self, q: Array) -> TubeLinks:
         """Return the links of the object as tubes in the world at the configuration `q`."""
@@ -426,7 +426,7 @@ class ShapeFitter:
         """Return the positions (grasps, 3) [m] of the grippers' frames at a configuration."""
         return self._holders(np.asarray(q, float))[0].reshape(-1, 3)
 
-    def point_frame_positions(self, q: ArrayLike) -> Array:
+    def point_positions_at_configuration(self, q: ArrayLike) -> Array:
         """Return the positions (np, 3) [m] of the system's points at a configuration."""
         return self._seen(np.asarray(q, float))[0].reshape(-1, 3)
 

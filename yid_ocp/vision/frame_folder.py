@@ -51,7 +51,7 @@ def _read_npz(path: Path) -> _Cloud:
     allowed += " to 255 if wanted"
     try:
         with zipfile.ZipFile(path) as packed:
-            files.check_max_input_numbers(sum(entry.file_size for entry in packed.infolist()), str(path))
+            files.check_input_number_count(sum(entry.file_size for entry in packed.infolist()), str(path))
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
@@ -88,7 +88,7 @@ def _read_pcd(path: Path) -> _Cloud:
         raise _damaged(path, f"it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes")
     # Open3D prints errors to standard output and returns an empty cloud
     try:
-        with files.process_memory_limit(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        with files.limit_process_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
     except (MemoryError, RuntimeError) as error:
         raise _damaged(path, "it declares more points than fit into memory") from error
@@ -101,7 +101,7 @@ def _read_depth_image(path: Path) -> Array:
     o3d = frames.import_open3d()
     with files.check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
         head = file.read(24)  # the last eight bytes are a PNG's width and height
-    files.check_max_input_numbers(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
+    files.check_input_number_count(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:

@@ -59,7 +59,7 @@ def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str |
 
 def _frames(bag: OpenBag, topic: str) -> tuple[list[BagMessage], Array]:
     frames: list[BagMessage] = []
-    with bag.read_errors_as_data_errors():
+    with bag.raise_read_errors_as_data_errors():
         for connection, logged, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
             before = sum(1 for frame in frames[-8:] if frame.logged == logged)
             frames.append(BagMessage(topic, logged, _stamp(bag, data), (connection, before)))
@@ -78,7 +78,7 @@ def _stamp(bag: OpenBag, data: bytes) -> int:
 
 def _decoded(bag: OpenBag, message: BagMessage) -> Any:
     connection, before = message.content
-    with bag.read_errors_as_data_errors():
+    with bag.raise_read_errors_as_data_errors():
         found = bag.reader.messages([connection], start=message.logged, stop=message.logged + 1)
         for number, (_, _, data) in enumerate(found):
             if number == before:
@@ -88,7 +88,7 @@ def _decoded(bag: OpenBag, message: BagMessage) -> Any:
 
 
 def _first(bag: OpenBag, topic: str) -> Any:
-    with bag.read_errors_as_data_errors():
+    with bag.raise_read_errors_as_data_errors():
         for connection, _, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
             return bag.reader.deserialize(data, connection.msgtype)
     raise _empty_topic(bag, topic)

@@ -242,7 +242,7 @@ class OcclusionMap:
     expected_points: Array | None = None
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
-    def hidden_mask(self, places: Array, radius: Array, margin: float) -> BoolArray:
+    def occluded_position_mask(self, places: Array, radius: Array, margin: float) -> BoolArray:
         """Return the mask (S,) of world positions (S, 3) that are hidden or shadowed by a surface, or out of the image.
 
         A surface occludes a position if it is nearer to the camera by more than `radius` (S,) plus `margin` [m].

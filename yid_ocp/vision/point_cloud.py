@@ -103,7 +103,7 @@ class ReachableObjectRegion:
         *,
         anywhere: bool = False,
     ) -> None:
-        tree, sizes = system.numeric_mechanism(values), model_link_lengths_and_radius_by_segment(system, values)
+        tree, sizes = system.mechanism_with_values(values), model_link_lengths_and_radius_by_segment(system, values)
         reach = {"": 0.0}
         for segment in system.segment_layouts:
             reach[segment.name] = float(sizes[segment.name][0].sum()) + reach[segment.parent_segment or ""]
@@ -130,7 +130,7 @@ class ReachableObjectRegion:
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
         self._base = np.mean(bases, axis=0) if bases else None
 
-    def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
+    def membership_mask_function_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
         """Return a function from world points (N, 3) to the mask (N,) of those in the region. `camera`: position."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0

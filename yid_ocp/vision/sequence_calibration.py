@@ -1,7 +1,7 @@
 """The estimates that all frames of a sequence share: camera, background, foreign objects and dimensions.
 
 x are the logarithms of tube lengths and radii relative to the model. The minimum over the bends of the cost of frame f
-is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). With a wide prior P, frames refitted at every x, and sums g and S:
+is g_f'x + x'S_f x/2 (`QuadraticTubeDimensionCost`). With a wide prior P, frames refitted at every x, and sums g and S:
 
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 
@@ -236,12 +236,12 @@ class TubeDimensionEstimates:
         spread = np.einsum("ijk,kl,ijl->ij", chosen, self.covariance[np.ix_(used, used)], chosen)
         return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
 
-    def values_with_estimated_dimensions(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
+    def parameters_with_fitted_dimensions(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
         """Return the parameter values, with estimated dimensions in place of the model's dimensions."""
         return _changed(system, given, np.where(self.estimated_dimension_mask, self.log_ratio, 0.0))
 
 
-def estimate_and_check_dimensions(
+def estimate_and_check_tube_dimensions(
     system: System,
     given: Mapping[str, float] | None,
     estimate: Sequence[TubeDimensionKind],

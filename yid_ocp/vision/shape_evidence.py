@@ -67,7 +67,7 @@ def tube_link_projections(
     return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
 
-def link_axes(link_ends: Array) -> Array:
+def unit_link_axes(link_ends: Array) -> Array:
     """Return unit vectors (K, 3) along the links with the ends `link_ends` (K, 2, 3)."""
     edge = link_ends[:, 1] - link_ends[:, 0]
     return np.asarray(edge / np.linalg.norm(edge, axis=1)[:, None])
@@ -148,7 +148,7 @@ class ProcessedFrameCloud:
         """Mask (S,) of the positions (S, 3) that are hidden from the camera or in a region that the filters remove."""
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
-            hidden |= self.occlusion_map.hidden_mask(places, radius, margin)
+            hidden |= self.occlusion_map.occluded_position_mask(places, radius, margin)
         return hidden if self.is_filtered_out is None else hidden | self.is_filtered_out(places)
 
 
@@ -183,7 +183,7 @@ def fit_quality_and_point_classes(
         contested = (on_shape | beyond) & (touching.query(seen.points)[0] < 2 * (tubes.radius[link] + gate))
         for i, k in enumerate(tubes.free_end_links):
             # points at the end are contested, so its position is unknown
-            end = tubes.link_ends[k, 1] + ends[i] * link_axes(tubes.link_ends)[k]
+            end = tubes.link_ends[k, 1] + ends[i] * unit_link_axes(tubes.link_ends)[k]
             if np.isfinite(ends[i]) and touching.query(end)[0] < 2 * (tubes.radius[k] + gate):
                 ends[i] = np.nan
     own = on_shape & ~contested
@@ -285,7 +285,7 @@ def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link
 
 def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: float) -> tuple[float, BoolArray]:
     """Offset [m] of a tube's last point beyond its tip (NaN if unseen), and the mask of the points between them."""
-    (start, tip), radius, axis = tubes.link_ends[link], float(tubes.radius[link]), link_axes(tubes.link_ends)[link]
+    (start, tip), radius, axis = tubes.link_ends[link], float(tubes.radius[link]), unit_link_axes(tubes.link_ends)[link]
     thick = max(radius, 2 * seen._point_spacing)
     behind = max(3, int(float(np.linalg.norm(tip - start)) / thick))
     edges = thick * np.arange(-behind, max(3, int(_MAX_SHORT_FRACTION * tubes.tube_lengths[link] / thick)) + 1.0)
@@ -344,7 +344,7 @@ def surface_distances_along_sight(corners: Array, radius: Array, points: Array, 
     small by several times noise^2/r. Points near the rim, where depth is not informative, are omitted.
     """
     link, along, normal, distance = tube_link_projections(corners, radius, points)
-    axis = link_axes(corners)[link]
+    axis = unit_link_axes(corners)[link]
     sight = camera - points
     front = sight - np.einsum("ij,ij->i", sight, axis)[:, None] * axis
     front /= np.maximum(np.linalg.norm(front, axis=1), 1e-12)[:, None]
@@ -361,7 +361,7 @@ def surface_distances_along_sight(corners: Array, radius: Array, points: Array, 
 
 
 @dataclass(frozen=True, eq=False)
-class FrameTubeDimensionCost:
+class QuadraticTubeDimensionCost:
     """The cost g'x + x'Sx/2 of tube dimensions x in one frame, minimised over the joint angles.
 
     x (2 s,) holds the logarithms of the lengths of all s segments, then of all radii, relative to the fit's dimensions.
@@ -383,7 +383,7 @@ class FrameShapeFit(ShapeFitQuality):
     is_point_seen: BoolArray  # (np,), whether a gripper holds the point or a link beside it has enough own points
     grasp_gaps: Array  # (grasps, 3), vector between the held frame and the gripper of each grasp [m]
     contested_fraction: float  # fraction of the points on the shape that a touching foreign object makes unusable
-    dimension_equations: FrameTubeDimensionCost  # cost of lengths and radii in this frame
+    dimension_equations: QuadraticTubeDimensionCost  # cost of lengths and radii in this frame
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 
     @property

@@ -540,7 +540,7 @@ def render_virtual_frames(
     taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, np.asarray(q, float), axis=0)
     configuration = np.asarray(course(taken))
-    tree = scene.system.numeric_mechanism(scene.parameter_values)
+    tree = scene.system.mechanism_with_values(scene.parameter_values)
     meshes = _tube_meshes_by_joint(scene.system, scene.parameter_values)
     robot = load_robot_meshes_by_joint(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
     around = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in _FLOOR_AND_WALL]

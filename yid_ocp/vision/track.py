@@ -27,7 +27,7 @@ from yid_ocp.vision.calibration import (
     calibration_without_estimation,
     stamp_delay_beyond_clock_offset,
 )
-from yid_ocp.vision.camera_registration import ArmSurface, StampedCloud
+from yid_ocp.vision.camera_registration import MovingArmSurface, StampedCloud
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
@@ -129,7 +129,7 @@ class FrameTracker:
         # a root to be found needs no recorded joints
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
-        tree = system.numeric_mechanism(values)
+        tree = system.mechanism_with_values(values)
         meshes = surface_meshes.extra_meshes_by_joint_index(scene.surfaces_missing_from_urdf, tree)
         if scene.robot_urdf is not None:
             robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
@@ -140,11 +140,11 @@ class FrameTracker:
             meshes |= {joint: [mesh, *meshes.get(joint, ())] for joint, mesh in robot.items()}
         whole = {joint: TriangleMesh.concatenate(parts) for joint, parts in meshes.items()}
         self.robot_surfaces = ArticulatedSurfaces(tree, whole) if whole else None
-        self.arm_surface: ArmSurface | None = None
+        self.arm_surface: MovingArmSurface | None = None
         self._widest = float(self.shape_fitter.link_radii.max())
         if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
             held = self.shape_fitter.gripper_positions_at_configuration, self._widest + _GRASP_MARGIN
-            self.arm_surface = ArmSurface(self.robot_surfaces, self._configuration_at_rest, *held)
+            self.arm_surface = MovingArmSurface(self.robot_surfaces, self._configuration_at_rest, *held)
         self.frame_order, self._reasons = _by_stamp(sequence.stamps)
         usable = [i for i in self.frame_order if i not in self._reasons]
         self._check_clock(usable)
@@ -182,10 +182,10 @@ class FrameTracker:
 
         shared = 0.0
         if looks:
-            places = self.shape_fitter.point_frame_positions(looks[0].q)
+            places = self.shape_fitter.point_positions_at_configuration(looks[0].q)
             shared = float(calibration.point_std_from_calibration(places, 0 * places, np.zeros(len(places))).max())
         of = self.system, self.parameter_values, self.options.estimated_dimensions
-        sizes = sequence_calibration.estimate_and_check_dimensions(*of, (noise, shared), fitted)
+        sizes = sequence_calibration.estimate_and_check_tube_dimensions(*of, (noise, shared), fitted)
         if self.options.background_estimation == "frames":
             good = (pair for pair in last if not frame_selection.frame_rejection_reason(pair[1], pair[0], self.options))
             shapes = [shape.tube_links_at_configuration(fit.q) for shape, fit in good]
@@ -230,7 +230,7 @@ class FrameTracker:
         used = sizes.estimated_dimension_mask
         key = tuple(np.where(used, sizes.log_ratio, 0.0).tolist()) if any(used) else ()
         if key not in self._shapes:
-            values = sizes.values_with_estimated_dimensions(self.system, self.parameter_values)
+            values = sizes.parameters_with_fitted_dimensions(self.system, self.parameter_values)
             self._shapes[key] = self.shape_fitter.with_parameter_values(values)
         return self._shapes[key]
 
@@ -238,7 +238,7 @@ class FrameTracker:
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
     ) -> Callable[[Array], BoolArray]:
         """Function that returns the mask of the positions (S, 3) that the filters remove, for the robot at `q`."""
-        is_inside = self.object_region.membership_test_at(q, calibration.camera_position)
+        is_inside = self.object_region.membership_mask_function_at(q, calibration.camera_position)
         within = self.options.filters.robot_padding + self._widest
 
         def removed(places: Array) -> BoolArray:
@@ -269,7 +269,7 @@ class FrameTracker:
         state, filters = calibration.camera_state, self.options.filters
         points = state.measured_to_world_points(found)
         q = self._configuration_at_rest(float(state.stamps_to_joint_clock(self.sequence.stamps[index])))
-        inside = self.object_region.membership_test_at(q, calibration.camera_position)(points)
+        inside = self.object_region.membership_mask_function_at(q, calibration.camera_position)(points)
         if not inside.any():
             raise DataError("no point lies in the region that the object can reach: check track.camera_pose")
         if filters.object_colours and self.sequence.load_colours is not None:
@@ -319,7 +319,7 @@ class FrameTracker:
 
     def align_root_ends_and_mark_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Choose one root end for all frames, and mark outlying frames as dropped. Returns frames and a root note."""
-        rooted, note = frame_selection.align_root_ends(frames, self.options)
+        rooted, note = frame_selection.align_object_root_of_frames(frames, self.options)
         return frame_selection.mark_outlying_frames_as_dropped(rooted), note
 
     def track_result_from_frame_reports(
@@ -329,8 +329,8 @@ class FrameTracker:
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.find_foreign_objects(frames)
         of = common, things, self.options, self.sequence.source
-        measured = frame_selection.good_frame_configurations_and_points(frames, columns, *of)
-        place = self._shape(common.dimensions).point_frame_positions
+        measured = frame_selection.times_configurations_points_of_good_frames(frames, columns, *of)
+        place = self._shape(common.dimensions).point_positions_at_configuration
         return TrackResult(
             self.point_names,
             *measured,

@@ -115,7 +115,7 @@ def run_blind(
         progress.begin_stage(f"diagnosing {len(cases)} cases")
         answers = proof.done(_diagnose_case_from_recordings_task, cases, "answers")
         sealed = read_input_text(proof.folder / "sealed/labels.json")
-        labels = blind.open_sealed_labels(sealed, commitment["sha256"])
+        labels = blind.read_labels_checking_sha256(sealed, commitment["sha256"])
         progress.begin_stage("scoring")
         best = proof.best_closures(cases, labels, answers)
     except KeyboardInterrupt:
@@ -422,7 +422,7 @@ class _BlindExperiment:
         for attempt in range(blind.MAX_DRAWS_PER_CASE):
             rng = np.random.default_rng([self.seed, blind.BLIND_ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:
-                made = blind.record_random_motion(system, system, posture, values, values, (), rng, conditions)
+                made = blind.simulate_random_motion(system, system, posture, values, values, (), rng, conditions)
             except ModelError:
                 continue  # the motion throws the object about; draw another
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)

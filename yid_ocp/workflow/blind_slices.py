@@ -15,9 +15,9 @@ from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError
 from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
-from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
+from yid_ocp.report.diagnosis_summaries import blind_validation_markdown_lines
 from yid_ocp.report.html import write_report
-from yid_ocp.report.png_figures import draw_blind_results
+from yid_ocp.report.png_figures import draw_blind_validation_figures
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import package_source_hash
 from yid_ocp.workflow.command_runner import CommandOutcome
@@ -125,8 +125,8 @@ def score_whole_ensemble(
 def _write_result(folder: Path, result: Mapping[str, Any]) -> tuple[dict[str, Any], list[Path]]:
     written: dict[str, Any] = to_json_types(result)
     write_strict_json(folder / "result.json", written)
-    write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
-    return written, draw_blind_results(folder, written)
+    write_text(folder / "table.md", "\n".join(blind_validation_markdown_lines(written)) + "\n")
+    return written, draw_blind_validation_figures(folder, written)
 
 
 def rescore_blind(
@@ -139,7 +139,7 @@ def rescore_blind(
     """
     made, target = Path(folder), make_folder(out)
     commitment = read_input_json(made / "commitment.json")
-    opened = blind.open_sealed_labels(read_input_text(made / "sealed/labels.json"), commitment["sha256"])
+    opened = blind.read_labels_checking_sha256(read_input_text(made / "sealed/labels.json"), commitment["sha256"])
     labels = {label.case: label for label in opened}
     wanted = load_config(None, overrides, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME).diagnosis
     names = [text.partition("=")[0].removeprefix("diagnosis.") for text in overrides]

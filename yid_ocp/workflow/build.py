@@ -21,7 +21,7 @@ from yid_ocp.effects.bodies import system_with_link_mass_factors
 from yid_ocp.effects.friction import (
     EFFECT_KINDS_BY_FRICTION_LAW,
     TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED,
-    effect_as_sharp_as_nominal_friction,
+    effect_with_lowest_smoothing_speed,
     effect_with_sign_smoothing_speed,
 )
 from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
@@ -34,7 +34,7 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
-from yid_ocp.sensors.base import channel_kinds_of_sensor_group
+from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import (
     add_setting_location_to_errors,
@@ -66,13 +66,13 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     robot = None
     if model.robot is not None:
         with add_setting_location_to_errors(run, "model", "arms", "joints"):
-            robot = read_urdf(model.robot, **read_urdf_arguments(run))
+            robot = read_urdf(model.robot, **urdf_reader_arguments(run))
     joints = () if robot is None else robot.joint_names
     damping, of_object = _dampings(run, joints)
     item = model.object
     with add_setting_location_to_errors(run, "model", "object"):
         objects = [] if item is None else [(item.build(of_object, link_division), *item.parent_frame_and_root_pose)]
-    mode = "driven" if arms_are_estimated_states(run) else arms.mode
+    mode = "driven" if are_arm_states_estimated(run) else arms.mode
     require_setting_names(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
     moved = tuple(name for name in joints if name not in arms.passive_joints)
     for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
@@ -110,7 +110,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     return _completed(run, system, link_division)
 
 
-def read_urdf_arguments(run: RunSettings) -> dict[str, Any]:
+def urdf_reader_arguments(run: RunSettings) -> dict[str, Any]:
     """Return the arguments of `read_urdf` that select the joints and links of the robot that a run uses."""
     arms = run.model.arms
     return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}
@@ -136,7 +136,7 @@ def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
         return None if run.model.object is None else run.model.object.branch_vertices()
 
 
-def arms_are_estimated_states(run: RunSettings) -> bool:
+def are_arm_states_estimated(run: RunSettings) -> bool:
     """Return whether arms of `mode: prescribed` are simulated as driven by measured torques, with estimated states.
 
     This needs a grasp and recorded efforts. The encoders then correct the states. Arms with sensors on links remain
@@ -146,7 +146,7 @@ def arms_are_estimated_states(run: RunSettings) -> bool:
         return False
     recordings = read_recordings_of_role(run)
     for group in (group for recording in recordings for group in recording.channel_groups):
-        of_vectors = (kind.quantity for kind in channel_kinds_of_sensor_group(group.name) if kind.components)
+        of_vectors = (kind.quantity for kind in channel_specs_for_group_name(group.name) if kind.components)
         for quantity in (quantity for quantity in of_vectors if quantity in group.values_by_quantity):
             said = run.sensors.get(f"{group.name}.{quantity}")
             if said is None or said.use is not False:
@@ -209,7 +209,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     chosen, entries = settings_by_parameter_name(run, system.parameters), []
     for entry in system.parameters:
         if entry.name in chosen:
-            given, factor = chosen[entry.name], divided_joint_parameter_scale(run, entry.name, link_division)
+            given, factor = chosen[entry.name], link_division_parameter_scale(run, entry.name, link_division)
             lower, upper = (entry.lower, entry.upper) if given.bounds is None else (factor * b for b in given.bounds)
             value = entry.value if given.initial is None else factor * given.initial
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
@@ -230,7 +230,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
             allowed, hint = "`law_csv` and `depends_on` with kind: law", "leave them out, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         made = make_effect(said.kind, said.location, system, dict(said.values))
-        return effect_as_sharp_as_nominal_friction(made, system)
+        return effect_with_lowest_smoothing_speed(made, system)
     if said.law_csv is None or said.depends_on is None or said.values:
         what, hint = "the law lacks `law_csv` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
         allowed = "`law_csv` and `depends_on`, without `values`"
@@ -346,7 +346,7 @@ def free_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
     return [name for name, said in settings_by_parameter_name(run, parameters).items() if said.free]
 
 
-def divided_joint_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
+def link_division_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
     """Return the factor on a parameter that keeps the object's stiffness if each link becomes `link_division` links."""
     item = run.model.object
     return 1 if item is None else item.link_division_parameter_factor(name, link_division)

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.clock_checks import problem_with_fitted_point_clocks
+from yid_ocp.analysis.clock_checks import problem_with_fitted_clocks_and_issues
 from yid_ocp.analysis.discretisation import longest_accurate_time_step, min_gap_by_grasp_at_robot_posture
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
@@ -32,7 +32,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import DividedLinksModel, RefinementKind
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
-from yid_ocp.sensors.base import channel_kinds_of_sensor_group
+from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
@@ -55,7 +55,7 @@ _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia
 _MAX_QUOTED_ISSUES = 3  # issues that an error quotes
 
 
-def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
+def make_problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
     """Make the options of the estimation problem that a run's settings describe.
 
     Values that differ between recordings (edges of a cable, marker positions) come from `recordings`.
@@ -66,7 +66,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     require_setting_names(run, "parameter", wanted, parameters.names, *where)
     sensors = dict(run.sensors)
     groups = [group for recording in recordings for group in recording.points]
-    if build.arms_are_estimated_states(run):
+    if build.are_arm_states_estimated(run):
         # encoders determine the arms' motion, as for prescribed arms
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         for name in {group.name for group in groups if is_point_group_measured_by_arm(group)}:
@@ -83,7 +83,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         checked = "both" if item is not None and item.default_link_refinement else "time_step"
     divided: DividedLinksModel | None = None
     if item is not None and item.uniform_or_total_link_count is not None:
-        scales = {name: float(build.divided_joint_parameter_scale(run, name, 2)) for name in parameters.names}
+        scales = {name: float(build.link_division_parameter_scale(run, name, 2)) for name in parameters.names}
         divided = DividedLinksModel(partial(_divided_links_step, run), scales)
     kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
     if cable is not None and item is not None:
@@ -153,7 +153,7 @@ def build_problem(
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
     _check_sensors(run, [*estimate, *held_out])
     estimate, held_out, issues = _check_recordings(run, system, free, estimate, held_out)
-    said = replace(problem_options(run, system, [*estimate, *held_out, *reference_recordings]), data_issues=issues)
+    said = replace(make_problem_options(run, system, [*estimate, *held_out, *reference_recordings]), data_issues=issues)
     step = build_step(run, system) if step is None else step
     problem = EstimationProblem(step, estimate, free, said, None, held_out)
     if run.problem.time_step == "auto":
@@ -163,7 +163,7 @@ def build_problem(
     _check_grasps_close(run, problem)
     more = _object_point_issues(problem)
     _raise_for_issues(run, more)
-    as_stamped, (problem, clocks) = problem, problem_with_fitted_point_clocks(problem)
+    as_stamped, (problem, clocks) = problem, problem_with_fitted_clocks_and_issues(problem)
     if problem is not as_stamped:  # issues that only the uncertain clock caused are dropped
         corrected = ([episode.recording for episode in group] for group in (problem.episodes, problem.held_out))
         _raise_for_issues(run, clocks)
@@ -211,7 +211,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
             where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_SENSOR_KEY}"
             raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
-        constants = next((c.constants for c in channel_kinds_of_sensor_group(group) if c.quantity == quantity), {})
+        constants = next((c.constants for c in channel_specs_for_group_name(group) if c.quantity == quantity), {})
         for constant in said.constants:
             if constant not in constants:
                 details = unknown_name_error_arguments(constant, constants)
@@ -257,7 +257,7 @@ def _check_recordings(
     return *kept, tuple(issues)
 
 
-def all_issues_of_one_recording(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
+def data_quality_issues_of_recording(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
     """Find all data quality issues of one whole recording. Errors are as in `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
@@ -307,7 +307,7 @@ def _beside_the_model(
     if cable is not None:
         return list(point_checks.cable_point_geometry_issues(cable, recording, gravity))
     found: list[Issue] = []
-    if arm is not None and arm.has_all_angles_recorded(recording):
+    if arm is not None and arm.recording_has_all_joint_angles(recording):
         found += joint_checks.joint_limit_issues(arm, recording)
         if any(issue.severity == "refused" for issue in found):
             return found
@@ -330,7 +330,7 @@ def _excitation(
     found = list(joint_checks.joint_excitation_issues(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
     if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
         options = _choice(run)(JOINT_EFFORT_SENSOR_KEY)
-        whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
+        whole = [one for one in recordings if arm.recording_has_all_joint_angles(one)]
         weak = [list(joint_checks.slow_motion_excitation_issues(arm, one, options)) for one in whole]
         if all(weak):  # one informative recording is enough
             found += [issue for issues in weak for issue in issues]

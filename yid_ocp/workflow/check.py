@@ -24,7 +24,7 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
-from yid_ocp.workflow.build import build_step, build_system, divided_joint_parameter_scale, read_urdf_arguments
+from yid_ocp.workflow.build import build_step, build_system, link_division_parameter_scale, urdf_reader_arguments
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_grasp_gaps_at_start
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_command_function
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
@@ -91,7 +91,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
     path = input_files_by_name(run)[run.model.robot] if run.model.robot is not None else None
     if path is not None and b"<mujoco" not in check_input_file(path).read_bytes():
         # Pinocchio reads the URDF file itself, without changes by settings or effects
-        read, gravity = read_urdf_arguments(run), np.array(run.model.gravity, float)
+        read, gravity = urdf_reader_arguments(run), np.array(run.model.gravity, float)
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
@@ -182,7 +182,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters (too soft?): {at_x.message}")
         return {}
-    shifts, notes = discretisation.estimate_shifts_by_discretisation(
+    shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
     warnings += notes
@@ -223,7 +223,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     if count is not None:
         other = build_system(run, link_division=2)
         known = zip(system.parameters.names, theta, strict=True)
-        values = {own: x * divided_joint_parameter_scale(run, own, 2) for own, x in known if own in other.parameters}
+        values = {own: x * link_division_parameter_scale(run, own, 2) for own, x in known if own in other.parameters}
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         rows = [_row(count, own), _row(2 * count, finer)]
         _warn(warnings, "the links go", "", rows)

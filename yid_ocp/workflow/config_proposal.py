@@ -11,16 +11,16 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.channel_checks import mean_sample_rate, seen_noise_std
-from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_RECORDING_GROUP
+from yid_ocp.data.channel_checks import mean_sample_rate, noise_or_quantization_std
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf, urdf_joint_dynamics, urdf_path_from_robot_name
+from yid_ocp.model.urdf import joint_damping_and_friction, read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.sensors.base import RecordedChannelSpec, channel_kinds_of_sensor_group
+from yid_ocp.sensors.base import RecordedChannelSpec, channel_specs_for_group_name
 from yid_ocp.sensors.joints import is_noise_std_stated
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
@@ -186,7 +186,7 @@ def propose_config_choices(
         bool(branches),
         _torque_bias_std(tree, recorded, joints),
         recorded.effort is not None and recorded.effort_kind is None,
-        *({name: value for name, value in own.items() if name in joints} for own in urdf_joint_dynamics(robot)),
+        *({name: value for name, value in own.items() if name in joints} for own in joint_damping_and_friction(robot)),
     )
 
 
@@ -256,7 +256,7 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
 
 def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bool) -> tuple[str, str]:
     wrists = [group.name for group in recording.channel_groups if group.name.startswith("wrist")]
-    wrists = [name for name in wrists if name != ESTIMATED_WRENCH_RECORDING_GROUP]
+    wrists = [name for name in wrists if name != ESTIMATED_WRENCH_GROUP_NAME]
     seen = ", ".join([*(group.name for group in recording.points), *wrists])
     is_servo = joints.effort is None and _commanded(joints)
     if not has_object and not is_servo and joints.effort is None and not wrists:
@@ -441,7 +441,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
 
 def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, RecordedChannelSpec]]:
     for group in recording.channel_groups:
-        for kind in channel_kinds_of_sensor_group(group.name):
+        for kind in channel_specs_for_group_name(group.name):
             if kind.components and kind.quantity in group.values_by_quantity:
                 yield f"{group.name}.{kind.quantity}", group, kind
 
@@ -489,7 +489,7 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
 def _channel_noise(t: Array, values: Array, least: float, unit: str, is_stated: bool) -> _GroupNoise:
     if is_stated:
         return _GroupNoise(None, unit, _STATED_NOISE)
-    return _GroupNoise(max(least, *(seen_noise_std(t, column) for column in values.T)), unit, _SEEN_NOISE)
+    return _GroupNoise(max(least, *(noise_or_quantization_std(t, column) for column in values.T)), unit, _SEEN_NOISE)
 
 
 def _point_noise(group: PointGroup) -> _GroupNoise:
@@ -499,7 +499,7 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
     sizes: list[float] = []
     for i in range(len(group.names)):
         seen = np.isfinite(group.position[:, i]).all(axis=1)
-        sizes += [seen_noise_std(group.t[seen], column) for column in group.position[seen, i].T]
+        sizes += [noise_or_quantization_std(group.t[seen], column) for column in group.position[seen, i].T]
     if slow or not any(sizes):
         std = _CAMERA_STD if slow else _MARKER_STD
         return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")

@@ -18,7 +18,7 @@ from yid_ocp import files
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
-from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_earlier_runs
+from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
@@ -37,7 +37,7 @@ from yid_ocp.inference.uncertainty import (
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
+from yid_ocp.problem.recorded_inputs import effect_kinds_by_missing_signals
 from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, fit_problem
@@ -83,7 +83,7 @@ def run_diagnose(
             make_candidate_effects(problem.system, [e.recording for e in problem.episodes], run.diagnosis.candidates)
         run_history.require_recordings_not_in_baseline(run, problem, runs, without)
         earlier = EarlierRunsBaseline.from_run_estimates(runs, without)
-        problem, _ = problem_with_earlier_runs(problem, earlier)
+        problem, _ = problem_with_priors_and_baseline(problem, earlier)
         nominal: Solution | None = None
         try:
             if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
@@ -119,7 +119,7 @@ def run_diagnose(
             "issues": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.torque_offsets_by_recording(last.problem, x),
             "to_use": _texts_of_final_model(finding, os.path.relpath(folder.final_path)) if is_found else {},
-            "not_candidates": effect_kinds_without_recorded_signals(recordings),
+            "not_candidates": effect_kinds_by_missing_signals(recordings),
             "unused_efforts": _has_unused_efforts(problem),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }

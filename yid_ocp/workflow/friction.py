@@ -57,7 +57,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             what, hint = "no friction law could be fitted", "run `yid-ocp check` with this configuration"
             where = run.setting_location("recordings")
             raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
-        best = friction_law_comparison.simplest_fit_within_std_error(fits, kinds)
+        best = friction_law_comparison.simplest_fit_within_one_std_error(fits, kinds)
         settings, problem, solution = solved[best.law]
         names = friction_parameter_names(settings, problem.system.parameters)
         clouds = friction_law_comparison.measured_and_predicted_friction_torques(problem, solution, names)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from yid_ocp.analysis import identifiability as fisher
 from yid_ocp.analysis import what_if
-from yid_ocp.analysis.estimation import problem_without_cable_memory
+from yid_ocp.analysis.estimation import problem_without_shape_memory
 from yid_ocp.analysis.experiment_design import UnchangedExperiment
 from yid_ocp.analysis.identifiability import (
     GRASP_OFFSET_PRIOR_STD,
@@ -35,7 +35,7 @@ from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
-from yid_ocp.workflow.solve import solve_and_decide_cable_memory
+from yid_ocp.workflow.solve import solve_and_choose_cable_shape_memory
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def run_identifiability(
         limits = run.diagnosis.fit_excess_residual_criteria
         solution = None
         if asked.evaluation_point == "solution":
-            safe = solve_and_decide_cable_memory(run, problem, folder, progress)
+            safe = solve_and_choose_cable_shape_memory(run, problem, folder, progress)
             problem, solution = safe.problem, safe.solution
         tasks = None
         if workers is not None:
@@ -151,7 +151,7 @@ def _identifiability_result(
     solution: Solution | None,
     information: IdentifiabilityResult | None,
     unknown: IdentifiabilityResult | None,
-    ranking: what_if.ExperimentChangesByIdentifiableCount | None,
+    ranking: what_if.ExperimentChangesRankedByIdentifiability | None,
     asked: IdentifiabilityOptions,
 ) -> dict[str, Any]:
     result: dict[str, Any] = {
@@ -261,4 +261,4 @@ def _change_set_outcomes(
 def _problem(common: Mapping[str, Any]) -> tuple[RunSettings, EstimationProblem]:
     run = load_config(common["config"])
     problem = build_problem(run, build_step(run, system_with_grasp_offset_effects(build_system(run))))
-    return run, problem if common["remembers"] else problem_without_cable_memory(problem)
+    return run, problem if common["remembers"] else problem_without_shape_memory(problem)

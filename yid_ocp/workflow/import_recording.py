@@ -19,14 +19,14 @@ from yid_ocp.data.readers.csv import column_pattern
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.files import attributes_to_dict
-from yid_ocp.options import mapping_value_type, options_by_key
+from yid_ocp.options import class_options_by_key, mapping_value_type
 from yid_ocp.report.terminal import importable_file_summary_lines, recording_summary_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
 _LISTS = ("joint_topics", "joints")
-_KINDS = {name: mapping_value_type(entry.type_hint) for name, entry in options_by_key(ImportSettings).items()}
+_KINDS = {name: mapping_value_type(entry.type_hint) for name, entry in class_options_by_key(ImportSettings).items()}
 _MAPPINGS = {name: kind for name, kind in _KINDS.items() if kind is not None and name != "units"}
 _SINGLE = [name for name, kind in _KINDS.items() if kind is None and name not in _LISTS]
 _FLAGS = {

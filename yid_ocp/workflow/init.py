@@ -16,15 +16,15 @@ from typing import Any, cast
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema, option_info_from_annotation
 from yid_ocp.data import Recording, read_recording, write_recording
-from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_RECORDING_GROUP
+from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.errors import ConfigError, DataError, OutputError, nearest_name_question, require_known_names
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitialObjectSettings, init_object_templates, parse_comma_separated_numbers
+from yid_ocp.model.objects.base import InitialObjectSettings, object_factories_for_init, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.options import options_by_key
-from yid_ocp.problem.recorded_inputs import effect_kinds_without_recorded_signals
+from yid_ocp.options import class_options_by_key
+from yid_ocp.problem.recorded_inputs import effect_kinds_by_missing_signals
 from yid_ocp.report.animation import recording_animation
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
@@ -77,7 +77,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 
 def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettings | None:
     """Return the object that the options describe, None without --object. Raises `ConfigError` for invalid numbers."""
-    templates, word = init_object_templates(), arguments.object
+    templates, word = object_factories_for_init(), arguments.object
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
             if getattr(arguments, name):
@@ -195,7 +195,7 @@ def _summary_lines(
     for group, places in proposal.point_placements.items():
         lines += [f"{group}: {points} at {frame}, {reason}" for points, frame, reason in _merged_places(places)]
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
-    for signals, kinds in effect_kinds_without_recorded_signals(recordings).items():
+    for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
         lines.append(f"diagnose does not try {', '.join(kinds)}: nothing was recorded of {signals}")
     quoted = shlex.quote(str(out))
     lines += [*picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
@@ -312,7 +312,7 @@ def _of_object(item: InitialObjectSettings, proposal: ProposedConfigChoices) -> 
 
 def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
     """Yield YAML lines of the settings that differ from their defaults (and of a few others), with descriptions."""
-    for key, option in options_by_key(cast(Any, type(settings))).items():
+    for key, option in class_options_by_key(cast(Any, type(settings))).items():
         value = getattr(settings, option.field_name)
         if key == "mount" or (value == option.default_value and key not in _ALWAYS_WRITTEN_SETTINGS):
             continue
@@ -356,7 +356,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
             why = "torques with noise move the arms: set mode: prescribed to use it"
             entries = ["use: false", *entries]
             said = why if proposal.arm_mode == "driven" else "its frame is not known"
-        elif group.startswith(ESTIMATED_WRENCH_RECORDING_GROUP):
+        elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
             entries = ["use: false", *entries]
             said = "an estimate from joint torques, less the loads that the driver knows: in place of efforts only"
         yield group, entries, said, places

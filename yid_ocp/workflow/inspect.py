@@ -63,7 +63,7 @@ def _run_inspect(
         named = [text for text in map(str.strip, entries) if text and not set(text) & set("[,")]
         for name in named:
             parameters.index(name)
-        chosen = [symbols.equation_or_derivative(text) for text in entries if text.strip() not in named]
+        chosen = [symbols.equation_or_derivative_by_name(text) for text in entries if text.strip() not in named]
         free = free_parameter_names(run, parameters)
         progress.begin_stage("linearising")
         problem = build_problem(run, step) if run.recordings.estimate and free else None
@@ -184,10 +184,10 @@ def _dependence(
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepResidualsAndJacobians,
-) -> tuple[step_diagnostics.ParameterEquationsAndResponses, ...]:
+) -> tuple[step_diagnostics.ParameterEquationsAndSensors, ...]:
     """Return the equations and sensors that depend on each parameter; for free ones also over whole recordings."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
-    found = step_diagnostics.parameter_equations_and_responses(step, symbols, episode, point.state, point.theta, rows)
+    found = step_diagnostics.equations_and_sensors_per_parameter(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found
@@ -208,7 +208,7 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
 
 def _entry_result(entry: EquationOrDerivativeFormula, symbols: NamedStepEquations, at: Array) -> dict[str, Any]:
     names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
-    value = entry.numeric_value(symbols.all_variable_symbols, at)
+    value = entry.evaluate_numerically(symbols.all_variable_symbols, at)
     return attributes_to_dict(entry, names) | {"operations": entry.formula.n_operations, "value": value}
 
 

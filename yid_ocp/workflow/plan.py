@@ -30,7 +30,7 @@ from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, fr
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_file
+from yid_ocp.workflow.run_history import ESTIMATE_FORMAT_BY_COMMAND, read_result_file
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role
 
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated noise in the recording of a plan, for later estimation [N m], [m]
@@ -177,7 +177,7 @@ def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict
         what = f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}"
         allowed = "a run folder with result.json and trajectories.h5"
         raise run.config_error(what, *where, allowed=allowed, hint="give the run folder that the command printed")
-    result, formats = read_result_file(file), [ESTIMATE_RESULT_FORMATS[command] for command in commands]
+    result, formats = read_result_file(file), [ESTIMATE_FORMAT_BY_COMMAND[command] for command in commands]
     if result.get("format") not in formats:
         what = f"{folder} has a result of another command (format {result.get('format')})"
         hint = f"give a run folder of {' or '.join(commands)}"

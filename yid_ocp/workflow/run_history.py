@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from yid_ocp.analysis.run_estimates import (
-    DriftAndOutlierTests,
+    DriftAndOutlierTestResults,
     RunEstimates,
     assess_drift_and_outlier_runs,
     pool_estimates_and_chi2,
@@ -35,11 +35,11 @@ from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_prin
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
 from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_default_recording, uniquely_named_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_recording_path, uniquely_named_recordings
 
 log = logging.getLogger(__name__)
 
-ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
+ESTIMATE_FORMAT_BY_COMMAND = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
 _OLD_FORMATS = ("yid-diagnosis/1",)  # formats of earlier versions, with other keys
 _COMPARED_MODEL_SECTIONS = ("robot", "arms", "object", "grasp", "joint_springs", "gravity")
@@ -99,10 +99,10 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
     """Read result.json of a successful `solve` or `diagnose`. Errors are as in `read_estimates`."""
     file = Path(folder) / "result.json"
     result = read_result_file(file)
-    if result.get("format") not in ESTIMATE_RESULT_FORMATS.values():
+    if result.get("format") not in ESTIMATE_FORMAT_BY_COMMAND.values():
         what = f"the run folder has a result of another command (format {result.get('format')})"
         hint = "give a run folder of `solve` or `diagnose`"
-        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
+        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_FORMAT_BY_COMMAND.values()), hint=hint)
     if result.get("status") == "failed":
         what, hint = f"the run failed: {result.get('message')}", "give the folder of a successful run"
         raise DataError(what, where=str(file), allowed="a successful run", hint=hint)
@@ -121,7 +121,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
     if result.get("format") in _OLD_FORMATS or "doubts" in result:  # an old key
         what = f"an earlier version wrote this result ({result.get('format')}), with other names of keys"
         what, hint = f"{what}; {RENAMED_NAMES_HINT}", "run the command again with this version"
-        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
+        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_FORMAT_BY_COMMAND.values()), hint=hint)
     return result
 
 
@@ -183,7 +183,7 @@ def _difference(run: RunSettings, there: RunSettings | None) -> str:
         if key == "robot" and here is not None and other is not None:
             here, other = Path(here).name, Path(other).name  # a folder may have been moved
         if isinstance(here, ObjectBuilder) and isinstance(other, ObjectBuilder):
-            here, other = here.with_file_names_only(), other.with_file_names_only()
+            here, other = here.with_file_names_instead_of_paths(), other.with_file_names_instead_of_paths()
         if here != other:
             return key
     return ""
@@ -211,7 +211,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
     """Return recordings without the sought effect (of settings or baseline), and the reason if they are unreadable."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):
-        file = resolve_default_recording(path)
+        file = resolve_recording_path(path)
         if not is_file(file):
             where = ("recordings", "without_effect", i)
             what, allowed = f"there is no such recording: {file}", "the path of an existing file"
@@ -221,7 +221,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
-                found.append(read_recording(resolve_default_recording(path)))
+                found.append(read_recording(resolve_recording_path(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
     named = (replace(recording, name=f"{recording.name} (without)") for recording in found)
@@ -274,7 +274,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     return CommandOutcome(folder.path, written, None)
 
 
-def run_drift_and_outliers_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
+def run_drift_and_outliers_to_dict(found: DriftAndOutlierTestResults) -> dict[str, Any]:
     """Convert drift and outlier tests of several runs to a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drift_tests:

@@ -156,7 +156,7 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
         files[name] = _existing(run, Path(name), "file", "model", "object", key)
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
-            files[path] = _existing(run, resolve_default_recording(path), "recording", "recordings", which, i)
+            files[path] = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
     return files
 
 
@@ -169,7 +169,7 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 
-def resolve_default_recording(path: str) -> Path:
+def resolve_recording_path(path: str) -> Path:
     """Return the path of a recording. `default:NAME` becomes a file of the package; other paths are unchanged."""
     if not path.startswith("default:"):
         return Path(path)
@@ -181,10 +181,10 @@ def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: in
 
     Names are unique among the recordings of both lists. Errors are as in `read_recording`, with the setting.
     """
-    others = () if which == "estimate" else map(resolve_default_recording, run.recordings.estimate)
+    others = () if which == "estimate" else map(resolve_recording_path, run.recordings.estimate)
     found: list[Recording] = []
     for i, path in enumerate(getattr(run.recordings, which)[:count]):
-        file = _existing(run, resolve_default_recording(path), "recording", "recordings", which, i)
+        file = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
         with add_setting_location_to_errors(run, "recordings", which, i):
             found.append(read_recording(file))
     return uniquely_named_recordings(found, [path.stem for path in others])

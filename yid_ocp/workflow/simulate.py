@@ -17,7 +17,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
 from yid_ocp.workflow.build import build_step, build_system
-from yid_ocp.workflow.build_problem import problem_options
+from yid_ocp.workflow.build_problem import make_problem_options
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -86,7 +86,7 @@ def _predicted(run: RunSettings, system: System, progress: Progress, seed: int |
     progress.begin_stage("building the model and its compiled step")
     step = build_step(run, system)
     recordings = read_recordings_of_role(run, count=1)
-    options = replace(problem_options(run, step.system, recordings), local_parameters=(), prior_stds={})
+    options = replace(make_problem_options(run, step.system, recordings), local_parameters=(), prior_stds={})
     problem = EstimationProblem(step, recordings, (), options)
     episode, theta = problem.episodes[0], problem.theta
     progress.begin_stage(f"simulating {episode.grid.steps} steps")

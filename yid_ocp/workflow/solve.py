@@ -13,7 +13,7 @@ import numpy as np
 from yid_ocp.analysis import estimation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByLinksAndTimeStep, covariance_to_dict
+from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByDiscretisation, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.solvers import Iterate, Solution, Status
@@ -68,14 +68,14 @@ def run_solve(
 run_and_return_exit_code = make_command_function(run_solve, "live")
 
 
-def solve_and_decide_cable_memory(
+def solve_and_choose_cable_shape_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
-) -> estimation.CableMemoryChoice:
+) -> estimation.FitWithOrWithoutShapeMemory:
     """Fit the problem with the run's solver, for a cable with or without its shape memory, and return the choice."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.fit_problem(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
-    return estimation.choose_cable_memory_fit(problem, run.solver, found, limits)
+    return estimation.choose_fit_with_or_without_shape_memory(problem, run.solver, found, limits)
 
 
 def _iterate_logger(
@@ -147,7 +147,7 @@ def solution_to_result_dict(
 
 
 def discretisation_shifts_to_dict(
-    shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
+    shifts: Mapping[str, EstimateShiftByDiscretisation], std: Mapping[str, float]
 ) -> dict[str, Any]:
     """Return the shifts of estimates by finite links and time steps as dictionaries, with their `std` from noise."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}

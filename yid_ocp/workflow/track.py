@@ -35,10 +35,10 @@ from yid_ocp.vision.surface_meshes import SceneDescription, VirtualFramesWithTru
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import all_issues_of_one_recording, issues_to_plain_data
+from yid_ocp.workflow.build_problem import data_quality_issues_of_recording, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, require_setting_names, resolve_default_recording
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, require_setting_names, resolve_recording_path
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
@@ -61,7 +61,7 @@ def _run_track(
         try:
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.work_folder / _CONFIG_FILE), _read_joints(tasks.settings)
-                issues = [] if recording is None else all_issues_of_one_recording(run, system, recording)
+                issues = [] if recording is None else data_quality_issues_of_recording(run, system, recording)
                 progress.begin_stage("calibrating the sequence")
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("tracking")
@@ -87,7 +87,7 @@ def _run_track(
             write_recording(tracked, folder.path / "recording.h5")
             # tracked points can be out of the object's reach if the model defines its position
             if settings.options.root_placement == "model":
-                own = all_issues_of_one_recording(run, system, tracked)
+                own = data_quality_issues_of_recording(run, system, tracked)
                 issues += [issue for issue in own if issue.cause.startswith("point_")]
             theta = system.parameters.vector()
             shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
@@ -174,7 +174,7 @@ def _truth_errors(
 ) -> Mapping[str, Mapping[str, float]]:
     shape = ShapeFitter(system)
     columns = [system.point_frames.index(name) for name in found.point_names]
-    truth = np.array([shape.point_frame_positions(made.true_configuration_at(t))[columns] for t in found.t])
+    truth = np.array([shape.point_positions_at_configuration(made.true_configuration_at(t))[columns] for t in found.t])
     apart = np.linalg.norm(found.position - truth, axis=2)
     return {
         name: {"median": float(np.nanmedian(apart[:, i])), "largest": float(np.nanmax(apart[:, i]))}
@@ -229,7 +229,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
     if not run.recordings.estimate:
         return None
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = resolve_default_recording(run.recordings.estimate[0])
+        path = resolve_recording_path(run.recordings.estimate[0])
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
@@ -300,7 +300,7 @@ def _frame_tasks(
 ) -> tuple[_FrameTasks, VirtualFramesWithTruth | None]:
     """Return the tracking tasks, and the true motion if a virtual camera renders the frames (which are written)."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
-    joints = resolve_default_recording(run.recordings.estimate[0]) if run.recordings.estimate else None
+    joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.background_frames_path is not None:
         _read_frames(run, "background_frames_path")
     if said.frames_path is not None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.foreign_formats import (
-    ESTIMATED_WRENCH_RECORDING_GROUP,
+    ESTIMATED_WRENCH_GROUP_NAME,
     OTHER_JOINT_MESSAGE_TYPES,
     joint_values_from_message_fields,
     joint_values_of_message,
@@ -25,7 +25,7 @@ from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError, import_optional, nearest_name_question, unknown_name_error_arguments
-from yid_ocp.files import check_input_file, file_sha256, process_memory_limit
+from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
 JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"
@@ -73,7 +73,7 @@ class OpenBag:
             if not file.is_dir():
                 check_input_file(file, _MAX_METADATA_BYTES if file.suffix == ".yaml" else None)
         counted: Counter[tuple[str, str]] = Counter()
-        with self.read_errors_as_data_errors():
+        with self.raise_read_errors_as_data_errors():
             # older ROS 2 bags do not contain message definitions, which have not changed since
             store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
             self.reader: Any = highlevel.AnyReader([path], default_typestore=store)
@@ -83,10 +83,10 @@ class OpenBag:
         self.topics = tuple(_BagTopic(*key, count) for key, count in sorted(counted.items()))
 
     @contextmanager
-    def read_errors_as_data_errors(self) -> Iterator[None]:
+    def raise_read_errors_as_data_errors(self) -> Iterator[None]:
         """Turn every error during reading of the bag into a `DataError` (context manager)."""
         try:
-            with process_memory_limit():  # compressed data may state no size or a wrong one
+            with limit_process_memory():  # compressed data may state no size or a wrong one
                 yield
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
             tool = "rosbag" if self.path.suffix == ".bag" else "ros2 bag"
@@ -208,9 +208,9 @@ def _read_bag(
         points.append(PointGroup(name, *position, None, options.point_sensor_name, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     channels = tuple(_mounted_sensors(bag, groups, seconds))
-    if channels and channels[-1].name == ESTIMATED_WRENCH_RECORDING_GROUP:
+    if channels and channels[-1].name == ESTIMATED_WRENCH_GROUP_NAME:
         said = "the driver's estimate from joint torques, without the loads that it knows"
-        more = (*more, f"{ESTIMATED_WRENCH_RECORDING_GROUP} is {said}: use it in place of efforts, not with them")
+        more = (*more, f"{ESTIMATED_WRENCH_GROUP_NAME} is {said}: use it in place of efforts, not with them")
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and distance is None:
@@ -259,7 +259,7 @@ def _contents(
     refused: DataError | None = None
     lists = {**dict.fromkeys(_JOINT_TYPES, states), **dict.fromkeys(_GROUP_BY_MESSAGE_TYPE, mounted)}
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
-    with bag.read_errors_as_data_errors(), closing(bag.reader) as reader:
+    with bag.raise_read_errors_as_data_errors(), closing(bag.reader) as reader:
         wanted = [c for c in reader.connections if c.topic == own_topic or c.msgtype in wanted_kinds]
         # without definitions, as in older ROS 2 bags, only common types can be read
         wanted = [c for c in wanted if c.topic == own_topic or c.msgtype in reader.typestore.fielddefs]
@@ -366,7 +366,7 @@ def _mounted_sensors(
             messages = [message for message in bag.mounted if message.source == topic]
             yield from _sensor_group(group if len(topics) == 1 else f"{group}_{name}", name, messages, seconds)
     told = ([replace(m, content=w) for m in e.messages if (w := getattr(m.content, "wrench", None))] for e in groups)
-    yield from _sensor_group(ESTIMATED_WRENCH_RECORDING_GROUP, "", next(filter(None, told), []), seconds)
+    yield from _sensor_group(ESTIMATED_WRENCH_GROUP_NAME, "", next(filter(None, told), []), seconds)
 
 
 def _sensor_group(

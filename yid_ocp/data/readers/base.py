@@ -91,7 +91,7 @@ def _spaceless(unit: str) -> str:
     return unit.replace(" ", "")
 
 
-def si_factors(units: Mapping[str, str], where: str) -> dict[str, float]:
+def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, float]:
     """Return the factor from the file's unit to the SI unit for every quantity; to ampere for a motor current."""
     factors = dict.fromkeys(_QUANTITIES, 1.0)
     for quantity, unit in units.items():
@@ -141,7 +141,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
     Raises `DataError` for an unknown joint, point, quantity or unit, for a current without torque constants, or if
     `validated_recording` refuses the result.
     """
-    factors = si_factors(options.units or {}, where)
+    factors = factor_to_si_by_quantity(options.units or {}, where)
     group = raw.joints
     if group is not None:
         names = {name: name for name in group.names}

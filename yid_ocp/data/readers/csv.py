@@ -29,7 +29,7 @@ from yid_ocp.data.recording import (
     SensorChannelGroup,
 )
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
-from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_max_input_numbers, file_sha256, os_error_reason
+from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_input_number_count, file_sha256, os_error_reason
 from yid_ocp.sensors import CHANNEL_KINDS
 
 _VECTORS = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
@@ -253,7 +253,7 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
             for cells in lines:
                 count += len(cells) + _LINE_COST
                 if count > MAX_INPUT_NUMBERS:
-                    check_max_input_numbers(count, str(path))
+                    check_input_number_count(count, str(path))
                 if len(cells) > _MAX_COLUMNS:
                     what, hint = f"the table has {len(cells)} columns", "check the --delimiter: comma, semicolon or tab"
                     raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)
@@ -410,7 +410,7 @@ def _meanings(
     units: dict[str, str] = {}
     for quantity, unit in stated:
         both = units.setdefault(quantity, unit), unit
-        if len({base.si_factors({quantity: one}, where)[quantity] for one in both}) > 1:
+        if len({base.factor_to_si_by_quantity({quantity: one}, where)[quantity] for one in both}) > 1:
             what, allowed = f"columns of {quantity} are in {' and in '.join(both)}", "one unit for every quantity"
             raise DataError(what, where=where, allowed=allowed, hint="convert them to one unit in the file")
     for name, conventional in zip(header, by_name, strict=True):

@@ -18,7 +18,7 @@ from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo, options_by_key, split_annotated
+from yid_ocp.options import OptionInfo, class_options_by_key, split_annotated
 from yid_ocp.registry import Registry
 
 START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
@@ -149,7 +149,7 @@ class InitObjectFactory:
     has_branches: bool = False
 
 
-def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
+def require_numeric_object_values(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
     """Return the numbers that an object requires, in the order of `meanings`. Raises `ConfigError` if one is absent."""
     for name, meaning in meanings.items():
         if name not in numbers:
@@ -250,11 +250,11 @@ class ObjectBuilder:
         own: Any = type(self)
         return {
             key: getattr(self, option.field_name)
-            for key, option in options_by_key(own).items()
+            for key, option in class_options_by_key(own).items()
             if any(isinstance(m, OptionInfo) and m.is_path for m in split_annotated(option.type_hint)[1])
         }
 
-    def with_file_names_only(self) -> ObjectBuilder:
+    def with_file_names_instead_of_paths(self) -> ObjectBuilder:
         """Return a copy with file names in place of paths, so that the objects of different runs can be compared."""
         return replace(self, **{key: Path(file).name for key, file in self.input_file_paths().items()})
 
@@ -283,6 +283,6 @@ class MountedObjectBuilder(ObjectBuilder):
 OBJECT_KINDS: Registry[type[ObjectBuilder]] = Registry("kind")
 
 
-def init_object_templates() -> dict[str, InitObjectFactory]:
+def object_factories_for_init() -> dict[str, InitObjectFactory]:
     """Return the templates of flexible objects, by the value of `init --object` that selects each."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

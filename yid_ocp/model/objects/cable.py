@@ -36,7 +36,7 @@ from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, System, SystemBuildArguments, six_joint_floating_mechanism
 from yid_ocp.options import OptionInfo
 
-INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER = "start.speed_scale"
+SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
 # Parameters of a joint whose rest angle follows from the start: its angle [rad] and torque [N m] there.
@@ -167,7 +167,7 @@ def _with_memory(item: flexible.FlexibleObject, memory: float) -> flexible.Flexi
     text = "speed of the vertices at the recording's start"
     speed = Parameter(INITIAL_RMS_SPEED_PARAMETER, 0.0, "m/s", 0.0, np.inf, text)
     text = "start speed at which the memory counts half"
-    scale = Parameter(INITIAL_SPEED_HALVING_SHAPE_MEMORY_PARAMETER, 0.3, "m/s", 1e-3, np.inf, text)
+    scale = Parameter(SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
     for spring in item.elastic_joints:
@@ -217,7 +217,7 @@ def _segments(
     cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions
 ) -> list[flexible.FlexibleSegment]:
     parent = cable.main_branch_vertex_names
-    turns = flexible.edge_to_edge_transport_rotations(cable.undeformed_polyline(parent))
+    turns = flexible.edge_to_edge_rotations_from_vertices(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = list(accumulate(turns, operator.matmul))
     segments = []
@@ -227,7 +227,7 @@ def _segments(
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
             junction = parent.index(chain[0])
-            own = flexible.edge_to_edge_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1])
+            own = flexible.edge_to_edge_rotations_from_vertices(cable.undeformed_polyline(chain), carried[junction - 1])
             before = None
             at = junction - 2
         edges = [lengths[edge] for edge in pairwise(chain)]

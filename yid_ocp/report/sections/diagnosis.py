@@ -12,7 +12,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
 from yid_ocp.inference.null_test import channels_with_residual_indices
-from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, z_scores_of_smoothed_unknowns
+from yid_ocp.inference.smoother import SmoothedUnknownsResult, interval_edges_names_and_z_scores, smoothed_unknown_units
 from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
@@ -145,7 +145,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
-    _, _, values = z_scores_of_smoothed_unknowns(smoothed, i)
+    _, _, values = interval_edges_names_and_z_scores(smoothed, i)
     units = smoothed_unknown_units(finding.nominal_model.problem.system, trace)
     mean, std = trace.posterior_mean * trace.reference_std, trace.posterior_std * trace.reference_std
     axis = "value in its standard deviations"
@@ -179,7 +179,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
 
 def _events(finding: DiagnosisResult) -> _Chapter | None:
-    from yid_ocp.diagnosis.sentences import ignored_after_overspeed_messages  # other commands need none of it
+    from yid_ocp.diagnosis.sentences import overspeed_truncation_messages  # other commands need none of it
 
     events = finding.events
     if not events:
@@ -190,7 +190,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         "where possible."
         if events.force_estimates
         else "",
-        *ignored_after_overspeed_messages(events),
+        *overspeed_truncation_messages(events),
     ]
     by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_estimates:
