@@ -61,7 +61,7 @@ def with_prior(problem: EstimationProblem, law: TorqueLaw, precision: Array) -> 
     count, names = len(known.parameter_names), (*known.parameter_names, *law.parameters.names)
     covariance = np.zeros((len(names),) * 2)
     covariance[:count, :count], covariance[count:, count:] = known.covariance, np.linalg.inv(precision)
-    return problem.with_multivariate_prior(MultivariateGaussianPrior(names, covariance))
+    return problem.with_replaced_multivariate_prior(MultivariateGaussianPrior(names, covariance))
 
 
 def left_out_errors(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_recordings import holding_pendulum
 
-from yid_ocp.analysis.step_diagnostics import step_equation_jacobians_at_state, step_sparsity_patterns
+from yid_ocp.analysis.step_diagnostics import step_equation_jacobians_at_state, step_jacobian_sparsity_patterns
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -40,7 +40,7 @@ def test_patterns_of_a_step_hold_its_matrices(step):
     a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
     rows = step_equation_jacobians_at_state(step, state, torque, theta, path)
     kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), step.system.prescribed_coordinate_indices)
-    found = step_sparsity_patterns(symbols)
+    found = step_jacobian_sparsity_patterns(symbols)
     for name, matrix in (
         ("A", a),
         ("B_u", b_input),
@@ -62,7 +62,7 @@ def test_patterns_of_a_step_hold_its_matrices(step):
 def test_blocks_cover_rows_and_columns(step):
     symbols = NamedStepEquations.from_equations(step.equations)
     names = {"dR_dy": ("del", "q1"), "A": ("q1", "q0"), "B_u": ("q1", "u"), "B_theta": ("q1", "theta")}
-    for name, pattern in step_sparsity_patterns(symbols).items():
+    for name, pattern in step_jacobian_sparsity_patterns(symbols).items():
         for spans, labels, count in (
             (pattern.row_blocks, pattern.row_labels, pattern.nonzero_mask.shape[0]),
             (pattern.column_blocks, pattern.column_labels, pattern.nonzero_mask.shape[1]),
@@ -73,11 +73,11 @@ def test_blocks_cover_rows_and_columns(step):
         if name in names:
             assert (pattern.row_blocks[0].name, pattern.column_blocks[0].name) == names[name]
     free = [name for name in step.system.mechanism.joint_names if name not in step.system.prescribed]
-    assert step_sparsity_patterns(symbols)["dR_dy"].column_labels[: len(free)] == tuple(free)
+    assert step_jacobian_sparsity_patterns(symbols)["dR_dy"].column_labels[: len(free)] == tuple(free)
 
 
 def test_a_stiffness_enters_the_rows_of_its_joints_alone(step):
-    found = step_sparsity_patterns(NamedStepEquations.from_equations(step.equations))["dR_dtheta"]
+    found = step_jacobian_sparsity_patterns(NamedStepEquations.from_equations(step.equations))["dR_dtheta"]
     column = found.column_labels.index("T1.twist")
     rows = {found.row_labels[i] for i in np.flatnonzero(found.nonzero_mask[:, column])}
     relaxing = {name for name in step.system.effect_internal_coordinate_symbols if name.endswith("_z")}

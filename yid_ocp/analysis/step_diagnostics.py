@@ -224,7 +224,7 @@ def _blocks(symbols: NamedStepEquations, *wanted: str, kept: Sequence[int] | Non
     return found
 
 
-def step_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
+def step_jacobian_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, SparsityPattern]:
     """Compute the sparsity patterns of the Jacobians of one step, by name.
 
     `dR_dy` is the Jacobian of the step's residual with respect to its unknowns, `dR_dtheta` that of all rows with

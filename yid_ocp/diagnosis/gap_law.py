@@ -317,6 +317,6 @@ def _refitted(
     names = (*known.parameter_names, *family.law.parameters.names)
     covariance = scipy.linalg.block_diag(known.covariance, np.linalg.inv(family.precision))
     prior = MultivariateGaussianPrior(names, covariance)
-    with_prior = replace(composed, problem=composed.problem.with_multivariate_prior(prior))
+    with_prior = replace(composed, problem=composed.problem.with_replaced_multivariate_prior(prior))
     effects: tuple[EffectBase, ...] = (*before.effects, family.law)
     return refit_with_effects(with_prior, effects, {**before.values, **family.values}, limits=search.thresholds)

@@ -347,7 +347,7 @@ def nominal_bending_stiffness_by_joint(system: System, segment: str) -> dict[str
     return {s.joint_name: float(k) for s, k in zip(chosen, function.call([system.parameters.vector()]), strict=True)}
 
 
-def effort_limit_scaled_parameter_definition(
+def definition_scaled_by_effort_limits(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
     """Define a joint parameter that is neutral at 0. `effort_limit_ratio_to_baxter` scales `upper` and `expected`."""

@@ -271,7 +271,7 @@ class _RotorInertia(EffectBase):
     required_excitation = "how hard it accelerates"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.effort_limit_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "rotor inertia at the joint"),
+        base.definition_scaled_by_effort_limits("armature", "kg m^2", 5.0, 1.0, "rotor inertia at the joint"),
     )
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:

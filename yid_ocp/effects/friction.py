@@ -10,7 +10,7 @@ from typing import Literal
 import casadi as ca
 
 from yid_ocp.effects import base
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, effort_limit_scaled_parameter_definition
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, definition_scaled_by_effort_limits
 from yid_ocp.model.system import Effect, EffectStepTerms, MidpointStateSymbols, System
 
 SIGN_SMOOTHING_SPEED = 0.02
@@ -82,7 +82,7 @@ class _JointViscous(_JointFriction):
     """Viscous friction F = -b v of an arm joint, in addition to the model's damping."""
 
     equation = "F = -b v"
-    declared_parameters = (effort_limit_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
+    declared_parameters = (definition_scaled_by_effort_limits("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
 
     max_sticking_speed = 0.0
 
@@ -95,7 +95,7 @@ class _JointCoulomb(_JointFriction):
     """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    declared_parameters = (effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
+    declared_parameters = (definition_scaled_by_effort_limits("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["tau_c"] * self._sign(v)
@@ -107,9 +107,7 @@ class _JointStribeck(_JointFriction):
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
-        effort_limit_scaled_parameter_definition(
-            "tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"
-        ),
+        definition_scaled_by_effort_limits("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
         ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
     )
 
@@ -135,7 +133,7 @@ class _JointLoadFriction(_JointFriction):
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         system, index = state.system, state.system.mechanism.joint_index(self.location)
         if self.location in system.driven:
-            load = system.gear_torque_on_coordinate(state, index)
+            load = system.friction_load_of_gear(state, index)
         else:  # its motor is assumed to balance the external torque
             load = -2 * system.gravity_and_grasp_force_on_coordinate(state, index)
         size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
@@ -166,7 +164,7 @@ class _JointPresliding(EffectBase):
     required_excitation = "how fast it moves"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        effort_limit_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
+        definition_scaled_by_effort_limits("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
         ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
     )
 
@@ -211,7 +209,7 @@ class _JointSpring(EffectBase):
     required_excitation = "how far it bends"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        effort_limit_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
+        definition_scaled_by_effort_limits("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 

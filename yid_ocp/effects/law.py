@@ -145,7 +145,7 @@ def _quantity(quantity: str, state: MidpointStateSymbols, label: str, index: int
         u, servo = _servo_input(state, index), system.servos[system.mechanism.joints[index].name]
         drag = servo.damping * state.v[index] if servo.motor_kind == "dc" else 0
         return ca.if_else(u < MOTOR_OFF_COMMAND / 2, servo.torque(u, state.q[index], state.v[index]) + drag, 0)
-    return system.gear_torque_on_coordinate(state, index)
+    return system.friction_load_of_gear(state, index)
 
 
 def allowed_torque_law_quantity_names(system: System, location: str) -> tuple[str, ...]:

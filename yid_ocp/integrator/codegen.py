@@ -166,7 +166,7 @@ class StepSparsityTables:
     p1_new_columns: tuple[_Indices, ...]
 
 
-def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
+def step_elimination_tables(functions: StepFunctions) -> StepSparsityTables:
     """Compute the sparsity, elimination order and fill-in of a step's Jacobians."""
     e = functions.equations
     system = e.system

@@ -57,7 +57,7 @@ def build_step_model(
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
     limit = newton_coordinate_tolerance(time_step) if tolerance is None else tolerance
-    tables = codegen.step_sparsity_tables(functions)
+    tables = codegen.step_elimination_tables(functions)
     return StepEquationsAndFunctions(system, e, functions, tables, sizes, float(time_step), limit)
 
 

@@ -436,7 +436,7 @@ class System(ReprMixin):
             force -= ca.dot(ca.jacobian(self.constraint_residual(kinematics), state.q[index]), state.constraint_force)
         return force
 
-    def gear_torque_on_coordinate(self, state: MidpointStateSymbols, index: int) -> ca.SX:
+    def friction_load_of_gear(self, state: MidpointStateSymbols, index: int) -> ca.SX:
         """Return the torque [N m or N] through the gear of a driven joint: input minus forces of weight and grasps."""
         outside = self.gravity_and_grasp_force_on_coordinate(state, index)
         return self.input_force(state.u, state.q, state.v)[index] - outside

@@ -344,7 +344,7 @@ class EstimationProblem(ReprMixin):
         estimated, held_out = ([episode.recording for episode in group] for group in (self.episodes, self.held_out))
         return EstimationProblem(self.step, estimated, self.free, options, known, held_out)
 
-    def with_multivariate_prior(self, prior: MultivariateGaussianPrior) -> EstimationProblem:
+    def with_replaced_multivariate_prior(self, prior: MultivariateGaussianPrior) -> EstimationProblem:
         """Return a problem with another multivariate prior. Filters are kept."""
         return self._changed(options=replace(self.options, multivariate_prior=prior))
 

@@ -91,7 +91,7 @@ def guess_unknowns_and_node_states(
     return best[1]
 
 
-def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
+def mean_square_of_non_effort_residuals(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
     """Return the mean square whitened residual of recording `i` for a trajectory (N + 1, nx). Efforts are not used."""
     shared, _ = problem.unpack_episode_unknowns(x, i)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)

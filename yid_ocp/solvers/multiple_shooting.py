@@ -24,7 +24,7 @@ from yid_ocp.options import OptionInfo
 from yid_ocp.problem.episodes import InitialStateWithSensitivity
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.solvers import base, symbolic_transcription
-from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, mean_square_residual_without_efforts
+from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, mean_square_of_non_effort_residuals
 from yid_ocp.solvers.nonlinear_program import (
     QUIET_NLPSOL_OPTIONS,
     HessianKind,
@@ -375,7 +375,7 @@ class _ShootingIntervals:
         theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], shared)
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
-        return mean_square_residual_without_efforts(self.problem, i, trajectory, x)
+        return mean_square_of_non_effort_residuals(self.problem, i, trajectory, x)
 
     def moved(self, nodes: list[Array], now: _Linearization, step: Array, factor: float) -> list[Array]:
         """Node states after a fraction of a step, which also closes that fraction of the defects."""

@@ -38,7 +38,7 @@ from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 from yid_ocp.solvers.initial_guess import (
     UnknownsAndNodeStateGuess,
     guess_unknowns_and_node_states,
-    mean_square_residual_without_efforts,
+    mean_square_of_non_effort_residuals,
 )
 from yid_ocp.solvers.nonlinear_program import (
     GaussNewtonHessianRidge,
@@ -239,7 +239,7 @@ class _Maker:
         """The program, with an initial guess near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
         nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
-        error = partial(mean_square_residual_without_efforts, problem)
+        error = partial(mean_square_of_non_effort_residuals, problem)
         found = guess_unknowns_and_node_states(problem, nodes, x, error)
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.append_values(x[:shared], low[:shared], high[:shared])

@@ -173,7 +173,7 @@ def _patterns(
         "dR_dy": rows.residual_by_new[0][np.ix_(kept, kept)],
         "dR_dtheta": np.vstack([rows.residual_by_theta[0], rows.p1_by_theta[0]]),
     }
-    found = step_diagnostics.step_sparsity_patterns(symbols)
+    found = step_diagnostics.step_jacobian_sparsity_patterns(symbols)
     where = "the rest" if point.is_equilibrium else "this point"
     return {name: entry.with_numerical_nonzeros_marked(values[name], where) for name, entry in found.items()}
 
