@@ -146,7 +146,7 @@ def test_a_scheduler_that_is_not_there_is_said(address, monkeypatch):
 
 def test_dask_is_optional(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ParallelWorkError, match=r"pip install 'yid-ocp\[cluster\]'"):
+    with pytest.raises(ParallelWorkError, match=r"pip install '\.\[cluster\]'"):
         WorkerConfig(scheduler_address="localhost:8786").check_scheduler_available()
 
 

@@ -31,6 +31,8 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
+from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, fit_problem
 
@@ -454,6 +456,33 @@ def test_a_search_that_converged_at_an_unstable_time_step_has_stalled(light, lig
         entry = found.parameters["cable.bend"]
         assert abs(entry.value - 0.5) < 3 * entry.std
         assert judged.message == found.message
+
+
+@pytest.mark.parametrize(("noise", "moved"), [(0.0, False), (2e-4, True)])
+def test_noise_of_the_angles_that_move_an_object_widens_its_damping(urdf_folder, noise, moved):
+    """It makes the rod vibrate, which a fit damps away: by several standard deviations of the data."""
+    system = System.build(
+        read_urdf(urdf_folder / "double_pendulum.urdf"),
+        springs={"elbow": RobotJointSpring(60.0)},
+        damping={"shoulder": 0.0, "elbow": 0.02},
+        point_frames=["tip"],
+        prescribed=["shoulder"],
+    )
+    step, t = compile_step(system, 0.005, use_compiler=False), 0.005 * np.arange(801)
+    path = (0.25 * (np.tanh(8 * (t - 0.6)) + np.tanh(4.8)) + 0.3 * np.sin(2 * t) * np.minimum(1, t) ** 2)[:, None]
+    rollout = simulate(step, system.parameters.vector(), np.zeros(step.sizes["nx"]), 800, path=path)
+    rng = np.random.default_rng(1)
+    seen = places(system, ("tip",), rollout.state[:, :2])
+    seen = PointGroup("points", ("tip",), t, seen + 1e-3 * rng.standard_normal(seen.shape), 1e-3)
+    angles = path + noise * rng.standard_normal(path.shape)
+    recording = Recording(JointGroup(["shoulder"], t, angles, position_std=noise), (seen,), name="rod")
+    given = EstimationProblem(step, [recording], ("elbow.damping",), ProblemOptions(path_cutoff=40.0))
+    found = add_intervals_and_checks(given, fit_problem(given, GaussNewton()))
+    entry, data_std = found.parameters["elbow.damping"], found.checks.data_std["elbow.damping"]
+    shift = found.checks.discretisation_shifts["elbow.damping"].encoder_noise
+    assert (abs(entry.value - 0.02) > 5 * data_std) == moved
+    assert (abs(shift) > data_std) == moved
+    assert abs(entry.value - 0.02) < 2 * entry.std
 
 
 @pytest.mark.parametrize(

@@ -242,7 +242,7 @@ def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
 
 def test_the_page_lists_what_is_native(repository) -> None:
     text = (repository / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
-    rows = re.search(r"\| effect \| in MJCF \|\n(.*?)\n\n", text, re.DOTALL)
+    rows = re.search(r"\| effect \| meaning \| in MJCF \|\n(.*?)\n\n", text, re.DOTALL)
     listed = {kind for row in rows[1].splitlines()[1:] for kind in re.findall(r"`(\w+)`", row.split("|")[1])}
     native = {kind for kind, (*_, status) in OTHERS.items() if status == "native"} - {"junction_compliance"}
     assert listed == native | set(MECHANICAL) | OF_SERVOS

@@ -142,7 +142,9 @@ def find_gap_law(
         rival, closed = others[0].law, held_out_gap_closure(before.held_out_loss, others[0].loss)
         runner_up = (rival.location, "+".join(rival.quantities), closed.fraction)
     # the model without the law may move far beyond the recorded range: new knots for the visited range
-    if any(_is_much_narrower(best, quantity) for quantity in best.law.quantities):
+    visited = {quantity: _visited_range(best.fit, best.law.location, quantity) for quantity in best.law.quantities}
+    reached = {quantity: float(np.ptp(knots)) for quantity, knots in (best.law.knots or {}).items()}
+    if any(high - low < _MIN_VISITED_PART * reached[quantity] for quantity, (low, high) in visited.items()):
         finer = _neutral_law(best.fit, best.law.location, best.law.quantities, last.problem.system)
         again, better = _refitted_families(search, problem, last, [finer], events, best.law.quantities)
         if again is not None and better and better[0].loss.chi2_per_sample <= best.loss.chi2_per_sample:
@@ -206,12 +208,6 @@ def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw],
 
     fewest = min(len(own.law.quantities) for own in found if is_as_good(own))
     return is_as_good(entry) and len(entry.law.quantities) == fewest
-
-
-def _is_much_narrower(found: _RefittedLaw, quantity: str) -> bool:
-    """Return whether a fitted law's knots reach far beyond the values of the quantity in its model's motion."""
-    low, high = _visited_range(found.fit, found.law.location, quantity)
-    return high - low < _MIN_VISITED_PART * float(np.ptp((found.law.knots or {})[quantity]))
 
 
 def _neutral_law(model: RefittedModel, place: str, names: Sequence[str], system: System | None = None) -> TorqueLaw:

@@ -170,12 +170,6 @@ def _basis_and_coefficients(matrix: Array, columns: Array) -> tuple[Array, Array
     return basis, (vt[kept].T / singular[kept]) @ (basis.T @ columns) / scale[:, None]
 
 
-def _candidate_detectable_amplitudes(point: ProjectedCandidatesLinearization) -> tuple[CandidateDetectability, ...]:
-    """Smallest amplitudes of every candidate that are detectable at `DETECTABLE_AMPLITUDE_Z` stds."""
-    found = (map(_detectability, grid) for grid in point._grids)
-    return tuple(min(own, key=lambda e: (not e.is_detectable, min(e.detectable_amplitudes.values()))) for own in found)
-
-
 def _detectability(signature: _EffectSignature) -> CandidateDetectability:
     effect, names = signature.effect, signature.effect.amplitude_parameter_names
     information = signature.projected_sensitivity.T @ signature.projected_sensitivity
@@ -371,7 +365,9 @@ def screen_candidates(
 ) -> ScreeningResult:
     """Compute detectability, scores and confusability of all candidates that are not in `base`, at `values`."""
     point = linearize_candidates(problem, base, values)
-    visible = _candidate_detectable_amplitudes(point)
+    found = (map(_detectability, grid) for grid in point._grids)
+    # the smallest amplitude of each that is detectable at `DETECTABLE_AMPLITUDE_Z` stds
+    visible = tuple(min(e, key=lambda o: (not o.is_detectable, min(o.detectable_amplitudes.values()))) for e in found)
     ranked = _score_candidates(point, channels_with_residual_indices(problem.problem), visible)
     everything = _make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -188,7 +187,8 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             explained = _explained_fraction(nominal, last, limits)
             carried = _check_effect_amplitude_transfer(search, last)
             last = select.refit_with_model_error_in_stds(chosen[-1], limits)
-            last = _inflate_fit_stds_by_disagreement(last, carried)
+            least = {f"{e.effect_label}.{e.parameter}": e.disagreement_std_if_significant for e in carried}
+            last = replace(last, std={name: max(std, least.get(name, 0.0)) for name, std in last.std.items()})
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
         verdict, reason = _verdict(said, evidence.residual_exceeds_noise(limits), evidence.are_data_sufficient, limits)
@@ -254,11 +254,3 @@ def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics
         away.append(abs(entry.estimation_value - effect.neutral_values[name]) > least)
         found.append(entry)
     return [replace(entry, is_consistent=any(away)) for entry in found]
-
-
-def _inflate_fit_stds_by_disagreement(
-    fit: RefitStatistics, entries: Sequence[EffectAmplitudeTransferCheck]
-) -> RefitStatistics:
-    """The fit with stds of at least |difference|/sqrt(2) for amplitudes that disagree between recordings."""
-    least = {f"{e.effect_label}.{e.parameter}": e.disagreement_std_if_significant for e in entries}
-    return replace(fit, std={name: max(std, least.get(name, 0.0)) for name, std in fit.std.items()})

@@ -80,10 +80,11 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class EstimateShiftByDiscretisation:
-    """The change of an estimate if the number of links is doubled or the time step halved. None if not computed."""
+    """The change of an estimate by twice the links, half the time step or more encoder noise. None if not computed."""
 
     links: float | None = None
     time_step: float | None = None
+    encoder_noise: float | None = None  # by one more draw of the noise of angles that move an object
 
 
 def assess_goodness_of_fit(

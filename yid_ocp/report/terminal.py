@@ -167,7 +167,8 @@ def misfit_summary_blocks(
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
     said = []
-    for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
+    tries = (("links", "twice the links"), ("time_step", "half the time step"), ("encoder_noise", "more encoder noise"))
+    for key, words in tries:
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         changes = ", ".join(f"{n} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for n, own in moved.items())
