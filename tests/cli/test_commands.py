@@ -214,7 +214,7 @@ def test_check(carried_out, pendulum):
     assert result["format"] == "yid-check/1"
     assert result["model"]["n"] == 2
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
-    assert {"time_step", "links", "std"} == set(result["discretisation"]["shoulder.stiffness"])
+    assert {"time_step", "links", "encoder_noise", "std"} == set(result["discretisation"]["shoulder.stiffness"])
     assert "if the initial values were the estimates:" in done.out
     assert "100 Hz" in done.out
     assert "run folder: run" in done.out

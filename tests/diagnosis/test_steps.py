@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from factories import screened as screened_at
 from factories import signature as made_signature
 from made_series import series
 
+from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import ProjectedCandidatesLinearization, linearize_candidates, screen_candidates
@@ -102,3 +104,12 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     at = replace(at, signatures=tuple(replace(s, shape_values=own) for s, own in zip(at.signatures, grid, strict=True)))
     best = screened_at(at, [series(range(200))]).candidate_scores[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
+
+
+def test_readings_that_a_shorter_step_makes_worse_do_not_hide_others(monkeypatch):
+    """Such as efforts, in which the noise of accelerations depends on the step."""
+    problem = Mock(residual_rows=Mock(measurements=[[slice(0, 2), slice(2, 4)]]), step=Mock(time_step=0.01))
+    monkeypatch.setattr(diagnose, "problem_corrected_for_events", lambda *_: problem)
+    monkeypatch.setattr(diagnose, "predicted_refit_residual_at_finer_step", lambda *_: np.array([1.0, 1.0, 9.0, 9.0]))
+    fit = Mock(problem=problem, evaluation=Mock(residual=np.full(4, 2.0)))
+    assert diagnose._fall_at_half_time_step(Mock(), fit, None) == pytest.approx(8.0 - 2.0)

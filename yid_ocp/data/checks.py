@@ -62,7 +62,9 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
     kept = []
     for begin, end in edges:
         part = None if t[end] - t[begin] < _MIN_PART_DURATION else recording.time_slice(float(t[begin]), float(t[end]))
-        if part is not None and (begin == 0 or anywhere or _rests(part.joints)):
+        joints = None if part is None else part.joints
+        rests = joints and np.ptp(joints.position[joints.t <= joints.t[0] + 0.2], axis=0).max() < _MAX_ROTATION_AT_REST
+        if part is not None and (begin == 0 or anywhere or rests):
             kept.append(part)
     left = sum(part.duration for part in kept)
     parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
@@ -82,12 +84,6 @@ def _times(recording: Recording, driving: Sequence[str]) -> Array:
         if columns:
             return group.t[np.isfinite(group.position[:, columns]).all(axis=(1, 2))]
     return recording.points[0].t
-
-
-def _rests(joints: JointGroup | None) -> bool:
-    if joints is None:
-        return False
-    return bool(np.max(np.ptp(joints.position[joints.t <= joints.t[0] + 0.2], axis=0)) < _MAX_ROTATION_AT_REST)
 
 
 def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) -> Issue:

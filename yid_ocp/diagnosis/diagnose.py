@@ -219,7 +219,14 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
     fine = problem_corrected_for_events(composed.with_nominal_and_effects_free(fit.effects), events)
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
-    return -math.inf if left is None else _excess_of(fit.evaluation.residual) - _excess_of(left)
+    if left is None:
+        return -math.inf
+    # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
+    rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (fit.problem, fine))
+    before, after = (
+        [_excess_of(r[at]) for at in part] for r, part in zip((fit.evaluation.residual, left), rows, strict=True)
+    )
+    return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
 
 def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined | None:

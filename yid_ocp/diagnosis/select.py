@@ -234,7 +234,9 @@ def select_effects(
             break
         search.progress.begin_stage(f"scoring {rest}", 1.0, 12.0)
         seen = search.screen(base, better.values, f"beside {beside}")
-        if _promised_fraction(nominal, better, seen) < limits.min_explained_fraction:
+        # what the effects close together with what another one promises in the linear model
+        promised = 2 * (nominal.cost - better.cost) + seen.largest_predicted_chi2_decrease
+        if promised < limits.min_explained_fraction * max(2 * nominal.cost - nominal.residual_count, 1.0):
             break
         shortlist = _refit_shortlist(seen, limits)
         fits = refit_with_each_effect(search, base, shortlist, better.values)
@@ -248,12 +250,6 @@ def select_effects(
         # its last fit may differ from its first one
         first = [chosen.fit, *(fit for fit in first if fit.effects != chosen.fit.effects)]
     return tuple(first), _with_closures(search, nominal, chosen, first, later)
-
-
-def _promised_fraction(nominal: RefitStatistics, current: RefitStatistics, screened: ScreeningResult) -> float:
-    """Fraction of the gap of r'r that the effects close together with what another one promises in the linear model."""
-    promised = screened.largest_predicted_chi2_decrease
-    return (2 * (nominal.cost - current.cost) + promised) / max(2 * nominal.cost - nominal.residual_count, 1.0)
 
 
 def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:

@@ -169,7 +169,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     said = []
     tries = (("links", "twice the links"), ("time_step", "half the time step"), ("encoder_noise", "more encoder noise"))
     for key, words in tries:
-        tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
+        tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         changes = ", ".join(f"{n} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for n, own in moved.items())
         if moved:
