@@ -210,7 +210,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
-    assert "effects {kind: effort_offset, location: JOINT} estimate it" in text
+    assert "[{kind: effort_offset, location: JOINT}] and parameters" in text
     assert "#   {effort_sampling_kind: sample}: the recordings do not say" in text
     Path("friction.yaml").write_text(text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:"))
     assert "joint_coulomb@roll.tau_c" in build_system(load_config("friction.yaml")).parameters

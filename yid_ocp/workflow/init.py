@@ -347,7 +347,8 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
             if told_by_points:
                 entries = ["use: false", *entries]
                 said = "use: true looks for friction and payload of the arm; bias_std allows a constant error of each "
-                said += "torque (a guess: 1 % of its limit); effects {kind: effort_offset, location: JOINT} estimate it"
+                said += "torque (a guess: 1 % of its limit). To estimate it: bias_std: 0, model.effects "
+                said += "[{kind: effort_offset, location: JOINT}] and parameters {effort_offset@*: {free: true}}"
         is_mounted = places and "." in group
         if places and not (proposal.has_object or is_mounted or any(place.frame for place in places)):
             entries = ["use: false", *entries]
