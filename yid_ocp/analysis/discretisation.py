@@ -321,7 +321,8 @@ def _shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array, at_x: Ev
     doi:10.1080/01621459.1994.10476871). The scatter of draws counts half. Empty if no angles move an object.
     """
     rng, moves, system = np.random.default_rng(0), list[dict[str, float]](), problem.system
-    for _ in range(_N_NOISE_DRAWS if system.prescribed and system.unprescribed_coordinate_indices else 0):
+    has_encoders = system.prescribed and any(episode.recording.joints for episode in problem.episodes)
+    for _ in range(_N_NOISE_DRAWS if has_encoders and system.unprescribed_coordinate_indices else 0):
         noisy = _FinerDiscretisationProblem(problem.with_episodes(episodes_with_added_encoder_noise(problem, rng), ()))
         made = _gauss_newton_step_in_finer_model(noisy, problem, x, at_x)
         moves += [] if isinstance(made, str) else [made[0]]
