@@ -279,11 +279,11 @@ def parameter_shifts_at_finer_discretisation(
     *,
     model_difference_only: bool = False,
 ) -> tuple[dict[str, EstimateShiftByDiscretisation], list[str]]:
-    """Compute how much estimates change if every link is divided in two, and if the time step is halved.
+    """Compute how much estimates change with twice the links, half the time step, and more noise of encoders.
 
-    `kinds` selects `links` and `time_step`. `x` (nx,) is the estimate and `at_x` its evaluation with Jacobian. If `x`
-    is not a minimum of the cost, set `model_difference_only`. Returns the shifts by shared free parameter (empty if no
-    refinement succeeded), and a note on each refinement that failed, or that would remove a quarter of the misfit.
+    `kinds` selects `links` and `time_step`; with any, noise is added. `x` (nx,) is the estimate, `at_x` its evaluation
+    with Jacobian. `model_difference_only` is for an `x` that is no minimum of the cost; no noise is added then. Returns
+    the shifts by shared free parameter, and notes on refinements that failed or would remove a quarter of the misfit.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []

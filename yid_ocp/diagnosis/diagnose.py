@@ -214,7 +214,7 @@ def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examin
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
-    """How much half the time step lowers r'r - n of a fit; minus infinity if the motion cannot be predicted."""
+    """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 8.5)
     composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
     fine = problem_corrected_for_events(composed.with_nominal_and_effects_free(fit.effects), events)
