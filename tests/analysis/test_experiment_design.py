@@ -55,7 +55,7 @@ MARKER_DISTANCE = 0.03
 def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
-        (made.camera_point_group_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
+        (made.camera_times_and_median_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
         (made.arm_point_group_with_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
@@ -67,9 +67,9 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     std = np.full((3, 2, 3), 2e-3)
     std[0] = [9e-3, np.nan, 9e-3]
     made, episode = setting(group(std=std))
-    assert made.camera_point_group_times_and_std(episode)[2] == 2e-3
+    assert made.camera_times_and_median_std(episode)[2] == 2e-3
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
-    assert made.camera_point_group_times_and_std(episode)[2] == 3e-3
+    assert made.camera_times_and_median_std(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
     with pytest.raises(DataError, match="group 'points_camera' is neither recorded nor in the settings"):
         unknown.existing_point_observation_schedules(episode)

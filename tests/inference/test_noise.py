@@ -115,7 +115,7 @@ def test_a_step_without_a_measurement_adds_no_likelihood_and_lets_the_state_go_o
     covariance = np.array([[2.0, 0.3], [0.3, 1.0]])
     map_ = np.array([[0.9, 0.2]])
     transition = kalman.StateTransition(map_, np.array([0.5]))
-    step, after, log_determinant = kalman.kalman_gains_covariance_and_logdet(covariance, np.zeros((0, 2)), transition)
+    step, after, log_determinant = kalman.one_kalman_step(covariance, np.zeros((0, 2)), transition)
     assert log_determinant == 0.0
     whole = np.vstack([map_, [0.0, 0.5]])
     np.testing.assert_allclose(after, whole @ covariance @ whole.T)

@@ -23,7 +23,7 @@ from yid_ocp.report.animation import (
     ConfigurationTrajectory,
     animation_of_trajectories,
     animations_to_dict,
-    recording_animation,
+    measured_motion_animation,
 )
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
@@ -112,10 +112,10 @@ def test_a_recording_alone_is_a_scene_where_it_has_places(single_arm):
     t = np.array([0.0, 0.1, 0.2])
     points = PointGroup("camera", ("w_T1",), t, np.ones((3, 1, 3)))
     theta = single_arm.parameters.vector()
-    alone = recording_animation("a", single_arm, theta, Recording(None, (points,), name="a"))
+    alone = measured_motion_animation("a", single_arm, theta, Recording(None, (points,), name="a"))
     assert [motion.name for motion in alone.motions] == ["measured"]
     other = JointGroup(("elsewhere",), t, np.zeros((3, 1)))
-    assert recording_animation("a", single_arm, theta, Recording(other, (), name="a")) is None
+    assert measured_motion_animation("a", single_arm, theta, Recording(other, (), name="a")) is None
 
 
 @pytest.fixture(scope="module")

@@ -384,7 +384,7 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 
 @dataclass(frozen=True)
-class StepMapNaturalFrequencies:
+class UndampedStepMapFrequencies:
     """The natural frequencies of a system near an equilibrium, as the integrator reproduces them with a fixed robot.
 
     `n_unstable_modes` counts the modes that grow from step to step although damping is included: the equilibrium is
@@ -404,7 +404,7 @@ def step_map_natural_frequencies(
     force_split: ForceSplit = "symmetric",
     constraint_force_at: ConstraintForcePlacement = "midpoint",
     guess: Array | None = None,
-) -> StepMapNaturalFrequencies:
+) -> UndampedStepMapFrequencies:
     """Compute the natural frequencies that the integrator reproduces near an equilibrium of a system.
 
     The frequencies follow from the eigenvalues of the linearised step without damping. The driven and prescribed
@@ -415,18 +415,18 @@ def step_map_natural_frequencies(
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: if they are fixed, nothing can swing"
-        return StepMapNaturalFrequencies(np.zeros(0), message=held)
+        return UndampedStepMapFrequencies(np.zeros(0), message=held)
     step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
     known = np.array([configuration[name] for name in still.prescribed])
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
     if not rest.is_converged:
-        return StepMapNaturalFrequencies(np.zeros(0), message=rest.message)
+        return UndampedStepMapFrequencies(np.zeros(0), message=rest.message)
     damps = [name.rpartition(".")[2] in _DAMPING_PARAMETERS for name in system.parameters.names]
     undamped = np.where(damps, 0.0, theta)
     angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
     turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
     growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
-    return StepMapNaturalFrequencies(turning / (2 * math.pi * time_step), growing)
+    return UndampedStepMapFrequencies(turning / (2 * math.pi * time_step), growing)
 
 
 def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:

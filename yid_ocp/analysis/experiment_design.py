@@ -69,7 +69,7 @@ class UnchangedExperiment:
         theta, _ = self.problem.unpack_episode_unknowns(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
-    def camera_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def camera_times_and_median_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Return the points that a camera sees, with times [s] and median noise [m]. Without any: None and defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: camera_pose_of_point_group(g) is not None, times, _DEFAULT_CAMERA_STD)
@@ -300,7 +300,7 @@ class ExperimentVariantSensitivityBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Return the smallest noise standard deviation [m] of the points of each group in a recording."""
         finest = {}
-        samplings = self.setting.camera_point_group_times_and_std, self.setting.arm_point_group_with_times_and_std
+        samplings = self.setting.camera_times_and_median_std, self.setting.arm_point_group_with_times_and_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
@@ -421,7 +421,7 @@ class ExperimentVariantSensitivityBuilder:
         wanted: dict[str, dict[str, None]] = {}
         for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
-        camera = setting.camera_point_group_times_and_std(episode)[0]
+        camera = setting.camera_times_and_median_std(episode)[0]
         arm = setting.arm_point_group_with_times_and_std(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)

@@ -253,7 +253,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[HeldOutTruncation, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = {cut.recording: cut for cut in known}
-    for fraction in hypotheses.HELD_OUT_TRUNCATION_FRACTIONS:
+    for fraction in hypotheses.SHORTER_HELD_OUT_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)

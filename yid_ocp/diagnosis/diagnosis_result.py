@@ -8,7 +8,7 @@ from typing import Any
 
 from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors, ParameterShiftsSinceBaseline
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
-from yid_ocp.diagnosis.gap_law import GapLaw
+from yid_ocp.diagnosis.gap_law import NonparametricLaw
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import ScoreTestResult, bonferroni_corrected_min_candidate_p_value
@@ -56,7 +56,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     # [s]; they differ if the stated step's error was part of the gap
     stated_and_used_time_step: tuple[float, float] = (0.0, 0.0)
     is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links
-    law: GapLaw | None = None  # law of the gap, or of the gap that the effects leave
+    law: NonparametricLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprTexts:
         closed = total_gap_closure(self.accepted_selected_effects).text

@@ -12,7 +12,7 @@ import scipy.linalg
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
-from yid_ocp.diagnosis.hypotheses import HELD_OUT_TRUNCATION_FRACTIONS, AllCandidatesProblem
+from yid_ocp.diagnosis.hypotheses import SHORTER_HELD_OUT_FRACTIONS, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
 from yid_ocp.diagnosis.select import HeldOutGapClosure, held_out_chi2_decrease_and_std_error, held_out_gap_closure
 from yid_ocp.effects import EffectBase
@@ -43,7 +43,7 @@ _MIN_LEFTOVER_CLOSURE = 0.2  # fraction that a law must close of the gap that ac
 
 
 @dataclass(frozen=True)
-class GapLaw:
+class NonparametricLaw:
     """A torque law for the gap, or for the part of it that accepted effects leave, with its closure."""
 
     location: str
@@ -111,7 +111,7 @@ class _Family:
 
 def find_gap_law(
     search: RefitContext, problem: EstimationProblem, last: RefittedModel, places: Sequence[str], events: EventSet
-) -> GapLaw | None:
+) -> NonparametricLaw | None:
     """Estimate a torque law for the remaining gap. Returns None if no law is possible, or none closes enough of it.
 
     `problem` is that of the nominal model, without candidates. `last` is the fitted model with the accepted effects, or
@@ -154,12 +154,12 @@ def find_gap_law(
     if not (gained > error and closure.ci_low > least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
-    tables = []
+    curves = []
     for quantity, knots in (best.law.knots or {}).items():
         names = best.law.knot_parameter_names(quantity)
         torque, std = (np.array([own[name] for name in names]) for own in (best.fit.values, best.fit.std))
-        tables.append(TorqueLawTable(quantity, knots, torque, std))
-    return GapLaw(best.law.location, tuple(tables), ranges, closure, runner_up, best.fit, bool(last.effects))
+        curves.append(TorqueLawTable(quantity, knots, torque, std))
+    return NonparametricLaw(best.law.location, tuple(curves), ranges, closure, runner_up, best.fit, bool(last.effects))
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def _refitted_families(
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
-    composed, _ = composed.truncate_failing_held_out_recordings(start, HELD_OUT_TRUNCATION_FRACTIONS[0])
+    composed, _ = composed.truncate_failing_held_out_recordings(start, SHORTER_HELD_OUT_FRACTIONS[0])
     composed = composed.with_whitening_linearized_at(last.values, last.effects)
     before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
     if before is None:

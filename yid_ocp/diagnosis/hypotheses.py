@@ -37,7 +37,7 @@ CandidateNamesOrAll = Literal["all"] | Sequence[str]
 _BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
 _MIN_NOISE_GROWTH = 1.05  # of efforts beside effects from which weights are computed anew
 _MIN_PREDICTED_DURATION = 1.0  # shortest part of a truncated held-out recording that is kept [s]
-HELD_OUT_TRUNCATION_FRACTIONS = (0.9, 0.5, 0.0)
+SHORTER_HELD_OUT_FRACTIONS = (0.9, 0.5, 0.0)
 """Fractions of the duration until the simulation of a held-out recording fails, of which it keeps one. All are below 1,
 because the simulation deviates before it fails. The next fraction is tried if the refitted model fails earlier."""
 

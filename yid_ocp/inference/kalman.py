@@ -101,7 +101,7 @@ class KalmanStepMatrices:
         return (found + found.T) / 2, cross, added
 
 
-def kalman_gains_covariance_and_logdet(
+def one_kalman_step(
     covariance: Array, observation: Array, transition: StateTransition
 ) -> tuple[KalmanStepMatrices, Array, float]:
     """Compute the gains of a filter step, the next state covariance without process noise, and log det S.
@@ -240,7 +240,7 @@ def kalman_filter_and_covariance(
     if library is None:
         roots, parameters = np.split(white, np.cumsum(count**2)[:-1]), np.arange(ns, len(covariance))
         for k, (span, transition) in enumerate(zip(found._spans, found._transitions, strict=True)):
-            step, covariance, _ = kalman_gains_covariance_and_logdet(covariance, observation[span], transition)
+            step, covariance, _ = one_kalman_step(covariance, observation[span], transition)
             roots[k][:], projected[span] = step.whitening.ravel(), step.projected_covariance
             covariance[parameters, parameters] += variance[k]
             covariance[:ns, :ns] += moves[k, :, known:] @ moves[k, :, known:].T

@@ -26,7 +26,7 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, kalman_gains_covariance_and_logdet
+from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, one_kalman_step
 from yid_ocp.inference.smoother_model import (
     ResidualStateSpaceModel,
     SmoothedUnknownGroup,
@@ -152,7 +152,7 @@ def _forwards(model: ResidualStateSpaceModel, variance: Array) -> _Filtered:
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
         transition = StateTransition(move, np.full(nd, model.interval_correlation))
-        step, later, own = kalman_gains_covariance_and_logdet(p, design, transition)
+        step, later, own = one_kalman_step(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, used, products, math.inf, ())
         white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)

@@ -291,7 +291,7 @@ def animation_of_trajectories(
     return AnimationData(title, t, tuple(motions))
 
 
-def recording_animation(
+def measured_motion_animation(
     title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
 ) -> AnimationData | None:
     """Return the animation of a recording without predictions, or None if the recording holds no positions.

@@ -41,7 +41,7 @@ from yid_ocp.vision.sequence_calibration import (
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
 from yid_ocp.vision.shape_guesses import ShapeGuessFinder, cloud_centerline_tree, system_with_free_root
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, SceneDescription, TriangleMesh
-from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
+from yid_ocp.vision.track_result import FrameReport, SingleFrameStages, TrackResult
 
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
@@ -300,7 +300,7 @@ class FrameTracker:
         work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason or "")
         return work.report
 
-    def frame_clouds_and_skeleton(self, frame: FrameReport, common: SequenceEstimates) -> FrameProcessingStages | None:
+    def frame_clouds_and_skeleton(self, frame: FrameReport, common: SequenceEstimates) -> SingleFrameStages | None:
         """Return a frame's raw cloud, filtered cloud and skeleton for figures. None if its cloud cannot be read."""
         calibration = common.camera_calibration
         try:
@@ -309,7 +309,7 @@ class FrameTracker:
             return None
         work, _ = self._look(frame.index, calibration, common.background)
         filtered = None if work.filtered is None else work.filtered.points
-        return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
+        return SingleFrameStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
     def frame_report_before_processing(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Return a frame's report before its processing. `reason` says why the frame is dropped; empty if it is not."""

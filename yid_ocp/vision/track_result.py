@@ -53,7 +53,7 @@ def count_dropped_frames_by_reason(frames: Iterable[FrameReport]) -> dict[str, i
 
 
 @dataclass(frozen=True, eq=False)
-class FrameProcessingStages:
+class SingleFrameStages:
     """The processing stages of one frame, for figures. Stages that a dropped frame did not reach are None."""
 
     report: FrameReport
@@ -129,7 +129,7 @@ class _Picture(NamedTuple):
     line_colour: str = ""
 
 
-def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os.PathLike[str]) -> list[Path]:
+def draw_frame_processing_stages(stages: SingleFrameStages, folder: str | os.PathLike[str]) -> list[Path]:
     """Draw a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit. Returns their paths.
 
     The files are `NAME_1_cloud.png` to `NAME_5_fit.png` in `folder`, which is created. If the frame was dropped, the
@@ -149,7 +149,7 @@ def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os
     return written
 
 
-def _pictures(stages: FrameProcessingStages) -> list[_Picture]:
+def _pictures(stages: SingleFrameStages) -> list[_Picture]:
     raw, near, skeleton, fit = stages.raw_points, stages.filtered_points, stages.skeleton, stages.report.shape_fit
     made = [_Picture("cloud", f"{len(raw)} points of the camera", [(raw, _GREY, 0.4)])]
     if near is not None:

@@ -94,7 +94,7 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
                 sensors[name] = replace(said, used_points=cable.unclamped_vertex_names)
         for recording in recordings:
             lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording], _START_FRAMES)
-            if values := item.recording_edge_length_parameters(lengths):
+            if values := item.edge_length_parameter_values(lengths):
                 own[recording.name] = values
     return replace(
         run.problem,

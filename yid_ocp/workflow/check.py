@@ -21,7 +21,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
+from yid_ocp.report.animation import AnimationData, animation_of_trajectories, measured_motion_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, link_division_parameter_scale, urdf_reader_arguments
@@ -169,7 +169,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
             scenes.append(animation_of_trajectories(episode.name, [told], episode.recording))
         else:
             theta = problem.predictor.theta_with_episode_values(episode, shared)
-            alone = recording_animation(episode.name, problem.system, theta, episode.recording)
+            alone = measured_motion_animation(episode.name, problem.system, theta, episode.recording)
             scenes += [] if alone is None else [alone]
     return scenes
 
@@ -230,7 +230,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     return {"links": rows, "time_step": steps, "message": ""}
 
 
-def _row(value: float, found: discretisation.StepMapNaturalFrequencies) -> dict[str, Any]:
+def _row(value: float, found: discretisation.UndampedStepMapFrequencies) -> dict[str, Any]:
     hertz = found.frequencies_hz[:_N_MODES].tolist()
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 

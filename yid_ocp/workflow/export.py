@@ -42,7 +42,7 @@ from yid_ocp.virtual.mujoco_simulation import (
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
-from yid_ocp.workflow.import_recording import recording_contents_summary
+from yid_ocp.workflow.import_recording import recording_summary_dict
 from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import software_and_plugin_versions
 from yid_ocp.workflow.run_inputs import input_files_by_name, read_recordings_of_role
@@ -82,7 +82,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         files, notes = _export_run_signals(source, out)
     else:
         recording, files, notes = read_recording(source, allow_nan_effort=True), [], []
-        contents, texts = recording_contents_summary(recording), recording_summary_lines(recording)
+        contents, texts = recording_summary_dict(recording), recording_summary_lines(recording)
         if form == _MCAP:
             files = [Path(out) / f"{source.stem}.mcap"]
             notes = _shift_notes("", export_mcap(ros_signals_from_recording(recording), files[0]))

@@ -64,7 +64,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
             recording = read_third_party_recording(files[0], options, progress)
         write_recording(recording, arguments.out)
     out, issues = arguments.out, recording_issue_lines(recording)
-    result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording), "issues": issues}
+    result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
     print_result(arguments, result, lambda: [*recording_summary_lines(recording), *issues], f"recording: {out}", out)
     return EXIT_DONE
 
@@ -176,7 +176,7 @@ def _merged(
     return base.convert_to_si_and_validate(merged, ", ".join(files), base.JointPointAndUnitOptions(**late))
 
 
-def recording_contents_summary(recording: Recording) -> dict[str, Any]:
+def recording_summary_dict(recording: Recording) -> dict[str, Any]:
     """Summarise a recording's duration, groups and notes as plain data."""
     groups = {group.name: {"samples": len(group.t), "names": list(group.names)} for group in recording.all_groups}
     return {"duration": recording.duration, "groups": groups, "notes": list(recording.notes)}

@@ -25,7 +25,7 @@ from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import class_options_by_key
 from yid_ocp.problem.recorded_inputs import effect_kinds_by_missing_signals
-from yid_ocp.report.animation import recording_animation
+from yid_ocp.report.animation import measured_motion_animation
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import package_version
@@ -229,8 +229,8 @@ def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices
 def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -> str | None:
     """Write a page with the recorded motion, undeformed object, frames and points. Returns its path if there is one."""
     run, page = load_config(out), out.with_suffix(".html")
-    system = build_system(run)
-    scene = recording_animation(recording.name, system, system.parameters.vector(), recording, has_straight_object=True)
+    values = (system := build_system(run)).parameters.vector()
+    scene = measured_motion_animation(recording.name, system, values, recording, has_straight_object=True)
     if scene is None:
         return None
     known: dict[str, Any] = {"animations": [scene], "robot": run.model.robot}

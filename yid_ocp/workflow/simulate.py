@@ -15,7 +15,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import recording_from_prediction
-from yid_ocp.report.animation import AnimationData, animation_of_trajectories, recording_animation
+from yid_ocp.report.animation import AnimationData, animation_of_trajectories, measured_motion_animation
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import make_problem_options
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
@@ -78,7 +78,7 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
     simulation = SimulationOptions(run.problem.duration or _DEFAULT_DURATION)
     experiment = VirtualExperimentSettings(simulation=simulation, seed=seed, recording_name=run.name)
     made = run_virtual_experiment(system, None, replace(experiment, description=run.description))
-    alone = recording_animation("recorded", system, system.parameters.vector(), made)
+    alone = measured_motion_animation("recorded", system, system.parameters.vector(), made)
     return made, [] if alone is None else [alone]
 
 

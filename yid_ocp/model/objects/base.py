@@ -241,7 +241,7 @@ class ObjectBuilder:
         """Build the system of object and clamps from measured edge lengths [m] and gravity [m/s^2]."""
         raise NotImplementedError
 
-    def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    def edge_length_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         """Return length parameters from one recording's edge lengths [m]. Empty if all recordings share the lengths."""
         return {}
 

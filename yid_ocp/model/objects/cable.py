@@ -301,7 +301,7 @@ model:
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: Vector3) -> System:
         return clamped_cable_system(edge_lengths, self.branch_vertices(), replace(self, gravity=gravity))
 
-    def recording_edge_length_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    def edge_length_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         if not self.has_edge_lengths_per_recording:
             return {}
         return length_parameters_from_edges(self.branch_vertices(), edge_lengths)
