@@ -316,48 +316,27 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
     For joint i before joint j in the chain: d2x/dq_i dq_j = w_i x dx/dq_j for a point x, d2v/dq_i dq_j = w_i x (w_j x
     v) for a direction v.
     """
-    n, turning = system.n_coordinates, [joint.kind != "prismatic" for joint in system.mechanism.joints]
-    blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
-
-    def add(i: int, j: int, entry: ca.SX) -> None:
-        hessian[i, j] += entry
-        if i != j:
-            hessian[j, i] += entry
-
+    n, row = system.n_coordinates, 0
+    blocks, upper = [ca.SX(0, n)], ca.SX(n, n)
     for grasp in system.grasps:
         part = lam[row : row + grasp.n_constraint_equations]
         row += grasp.n_constraint_equations
-        holder, held = _grasped(system, grasp, "holder"), _grasped(system, grasp, "held")
+        frames = _grasped(system, grasp, "holder"), _grasped(system, grasp, "held")
+        axes = [kinematics.angular_jacobian(frame) for frame in frames]  # w_j, zero for a prismatic joint
         block = ca.SX(3, n)
-        for frame, sign in ((holder, 1.0), (held, -1.0)):
+        for sign, frame, own in zip((1.0, -1.0), frames, axes, strict=True):
             jacobian = kinematics.position_jacobian(frame)
             block += sign * jacobian
-            chain = system.mechanism.ancestor_joint_indices(frame.joint_index)
-            for above, i in enumerate(chain):
-                if not turning[i]:
-                    continue
-                turned = ca.cross(part[:3], kinematics.joint_screws[i][:3])
-                for j in chain[above:]:
-                    add(i, j, sign * ca.dot(jacobian[:, j], turned))
+            upper += sign * ca.triu((ca.skew(part[:3]) @ own).T @ jacobian)
         blocks.append(block)
         rows = _direction_products(grasp, kinematics)
-        if not rows:
-            continue
-        relative = kinematics.angular_jacobian(holder) - kinematics.angular_jacobian(held)
-        blocks += [sum((ca.cross(a, b).T @ relative for a, b in pairs), ca.SX(1, n)) for pairs in rows]
+        blocks += [sum((ca.cross(a, b).T @ (axes[0] - axes[1]) for a, b in pairs), ca.SX(1, n)) for pairs in rows]
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
-            turns: list[dict[int, ca.SX]] = []
-            for frame, vector, other in ((holder, a, b), (held, b, a)):
-                chain = tuple(j for j in system.mechanism.ancestor_joint_indices(frame.joint_index) if turning[j])
-                turns.append({j: ca.cross(kinematics.joint_screws[j][:3], vector) for j in chain})
-                for above, i in enumerate(chain):
-                    turned = ca.cross(other, kinematics.joint_screws[i][:3])
-                    for j in chain[above:]:
-                        add(i, j, ca.dot(turns[-1][j], turned))
-            for i, by_i in turns[0].items():
-                for j, by_j in turns[1].items():
-                    add(i, j, (2 if i == j else 1) * ca.dot(by_i, by_j))
-    return [ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(hessian)]
+            turns = [-ca.skew(vector) @ own for vector, own in ((a, axes[0]), (b, axes[1]))]
+            upper += ca.triu((ca.skew(b) @ axes[0]).T @ turns[0]) + ca.triu((ca.skew(a) @ axes[1]).T @ turns[1])
+            mixed = turns[0].T @ turns[1]
+            upper += ca.triu(mixed + mixed.T)
+    return [ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(ca.triu2symm(upper))]
 
 
 def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
