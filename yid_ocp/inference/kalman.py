@@ -12,7 +12,7 @@ import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import resources
 from itertools import pairwise
 from typing import Any
@@ -68,6 +68,12 @@ class KalmanStepMatrices:
     projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
     transition: StateTransition
 
+    @cached_property
+    def closed_loop(self) -> tuple[Array, Array]:
+        """S^(-1/2) H (r, nx) and the transition of the error of the filter's mean in this step, (nx, nx)."""
+        shaped = self.whitening @ self.observation
+        return shaped, self.transition.propagate_state(np.eye(shaped.shape[1]) - self.projected_covariance.T @ shaped)
+
     def normalized_innovations_and_next_mean(self, mean: Array, measured: Array) -> tuple[Array, Array]:
         """Compute normalized innovations of `measured` (r, c) and next state means (nx, c). Columns are independent."""
         white = self.whitening @ (measured - self.observation @ mean)
@@ -90,15 +96,12 @@ class KalmanStepMatrices:
         costates, already before the transition, with it. `seen` (r, m) is S^(-1/2) times the measurement's derivatives
         by them. Returns both before the step, and what the measurement adds to the parameters' variances (m,).
         """
-        shaped, projected = self.whitening @ self.observation, self.projected_covariance
-        pull = self.transition._propagate_costate_back
-        own, beside = pull(pull(information).T), pull(other.T).T
-        half, half_beside = own @ projected.T, beside @ projected.T
-        core = np.eye(len(shaped)) + projected @ half
-        found = shaped.T @ core @ shaped + own - half @ shaped - (half @ shaped).T
-        cross = seen.T @ (core @ shaped - half.T) + beside - half_beside @ shaped
-        added = np.sum(seen * (core @ seen) - 2 * seen * half_beside.T, axis=0)
-        return (found + found.T) / 2, cross, added
+        shaped, closed = self.closed_loop
+        drive = self.transition.propagate_state(self.projected_covariance.T @ seen)
+        pushed = information @ drive
+        found = closed.T @ information @ closed + shaped.T @ shaped
+        added = np.sum(seen**2, axis=0) + np.sum(drive * (pushed - 2 * other.T), axis=0)
+        return (found + found.T) / 2, (other - pushed.T) @ closed + seen.T @ shaped, added
 
 
 def one_kalman_step(
@@ -125,7 +128,7 @@ def one_kalman_step(
 @cache
 def _library() -> ctypes.CDLL | None:
     source = resources.files("yid_ocp.inference").joinpath("kalman.c").read_text(encoding="utf-8")
-    return compile_and_load_library(source, level="-O2")
+    return compile_and_load_library(source, level="-O3")
 
 
 @dataclass(frozen=True)

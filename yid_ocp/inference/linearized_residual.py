@@ -137,9 +137,9 @@ class ResidualDerivativesByStateAndEffort:
         for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
             used = np.flatnonzero(by_state.any(axis=1) | by_effort.any(axis=1))
             local = np.minimum(self.node[used] + shift - first, len(by_node) - 1)
-            found[used] += np.einsum("rx,rxd->rd", by_state[used], by_node[local])
-            if effort.shape[1]:
-                found[used] += np.einsum("rx,rxd->rd", by_effort[used], effort[local])
+            for node in np.unique(local):
+                rows = used[local == node]
+                found[rows] += by_state[rows] @ by_node[node] + by_effort[rows] @ effort[node]
         return found
 
 

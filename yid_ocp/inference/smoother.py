@@ -309,10 +309,12 @@ def _responses(base: _Filtered, chosen: IntArray, correlation: float) -> Array:
         unknown[k] = math.sqrt(1 - correlation**2) if k else 1.0
         begun, left = unknown[: k + 1], behind[:, : (k + 1) * u]
         rows, first = found[first : first + len(step.whitening), : left.shape[1]], first + len(step.whitening)
+        shaped, closed = step.closed_loop
         seen = step.whitening @ interval.unknown_jacobian[:, chosen]
-        rows[:] = (step.whitening @ step.observation) @ left + (seen[:, None] * begun).reshape(rows.shape)
-        left[:] = step.transition.propagate_state(left - step.projected_covariance.T @ rows)
-        left[:ns] += (interval.unknown_input_matrix[:, None, chosen] * begun).reshape(ns, -1)
+        pushed = -step.transition.propagate_state(step.projected_covariance.T @ seen)
+        pushed[:ns] += interval.unknown_input_matrix[:, chosen]
+        rows[:] = shaped @ left + (seen[:, None] * begun).reshape(rows.shape)
+        left[:] = closed @ left + (pushed[:, None] * begun).reshape(left.shape)
     return found
 
 
@@ -324,19 +326,24 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
     products, log_determinant = np.sum([b.products for b in bases], axis=0), sum(b.log_determinant for b in bases)
     if math.isinf(log_determinant):
         return -math.inf, _VARIANCE_BOUNDS[0]
-    values, pulls = [], []
+    parts = []
     for base in bases:
         chosen = np.flatnonzero([own == source for own in base.model.unknown_groups])
         rows = _responses(base, chosen, base.model.interval_correlation)
-        value, vectors = np.linalg.eigh(rows.T @ rows)
-        values.append(np.maximum(value, 0.0))
-        pulls.append(vectors.T @ (rows.T @ np.vstack([update.white for update in base.updates])))
-    value, pull = np.concatenate(values), np.vstack(pulls)
+        parts.append((rows.T @ rows, rows.T @ np.vstack([update.white for update in base.updates])))
 
     def cost(exponent: float) -> float:
-        variance = 10.0**exponent
-        closed = pull.T @ ((variance / (1 + variance * value))[:, None] * pull)
-        return -_judged(products - closed, log_determinant + float(np.sum(np.log1p(variance * value))))[0]
+        variance, left, determinant = 10.0**exponent, products, log_determinant
+        for information, pull in parts:
+            inner = variance * information
+            inner[np.diag_indices_from(inner)] += 1.0
+            factor, failed = scipy.linalg.lapack.dpotrf(inner.T, lower=1, overwrite_a=1)
+            if failed:  # rounding
+                return math.inf
+            seen = scipy.linalg.lapack.dtrtrs(factor, pull, lower=1)[0]
+            left = left - variance * seen.T @ seen
+            determinant += 2 * float(np.sum(np.log(np.diag(factor))))
+        return -_judged(left, determinant)[0]
 
     low, high = np.log10(_VARIANCE_BOUNDS)
     outcome = scipy.optimize.minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 0.4})
