@@ -196,7 +196,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     fine = EstimationProblem(step, [recording], coarse.free, coarse.options, values)
     found = fit_problem(coarse, GaussNewton())
     finer = fit_problem(fine, GaussNewton(), initial_unknowns=found.x)
-    own, _ = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
+    own, *_ = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
     # without segments there are no links to divide
     told, notes = parameter_shifts_at_finer_discretisation(coarse, found.x, found.evaluation, ("links", "time_step"))
     assert notes == []
@@ -230,7 +230,7 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
     found, finer = (fit_problem(problem, GaussNewton()) for problem in (coarse, anew))
     refined = _FinerDiscretisationProblem(fine)
-    own, left = _gauss_newton_step_in_finer_model(refined, found.problem, found.x, found.evaluation)
+    own, left, _ = _gauss_newton_step_in_finer_model(refined, found.problem, found.x, found.evaluation)
     std = np.array([found.std[name] for name in free])
     change = (finer.x - found.x) / std
     assert np.abs(change).max() > 2

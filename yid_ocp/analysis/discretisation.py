@@ -101,12 +101,12 @@ def _gauss_newton_step_in_finer_model(
     at_x: Evaluation,
     *,
     model_difference_only: bool = False,
-) -> tuple[dict[str, float], Array] | str:
+) -> tuple[dict[str, float], Array, Evaluation] | str:
     """Make one Gauss-Newton step in a finer model, from the coarse unknowns x (nx,).
 
-    Returns the shift of each shared free parameter and the linearised residual after the step, or a message if the step
-    fails. `at_x` is the coarse evaluation at `x`. With `model_difference_only`, for points that are no estimate, coarse
-    predictions replace the data. With process noise, Jacobian and priors are coarse, only the data residual is fine.
+    Returns the shift of each shared free parameter, the linearised residual after the step and the fine evaluation, or
+    a message if the step fails. `at_x` is the coarse evaluation at `x`. With `model_difference_only`, for points that
+    are no estimate, coarse predictions replace the data. With process noise, Jacobian and priors are coarse.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -130,7 +130,7 @@ def _gauss_newton_step_in_finer_model(
     step = scale * bounded_levenberg_marquardt_step(jacobian * scale, residual, 0.0, low, high)
     moved = dict(zip(problem.unknown_names, map(float, step), strict=True))
     factors = {name: 1.0 if weighted else refined._factor(name) for name in problem.shared_parameters}
-    return {name: moved[name] / factor for name, factor in factors.items()}, residual + jacobian @ step
+    return {name: moved[name] / factor for name, factor in factors.items()}, residual + jacobian @ step, evaluation
 
 
 def predicted_refit_residual_at_finer_step(
@@ -146,14 +146,14 @@ def predicted_refit_residual_at_finer_step(
     made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)
     if isinstance(made, str) or coarse.has_process_noise:
         return None if isinstance(made, str) else made[1]
-    start = refined._unknowns(coarse.unknown_names, x)
-    before = fine.evaluate(start, False, at_x.equilibrium_guesses)
-    is_alike = before.ok and len(before.residual) == len(at_x.residual)
+    _, left, before = made
+    is_alike = len(before.residual) == len(at_x.residual)
     changed = before.residual - at_x.residual if is_alike else np.zeros(1)
     if changed @ changed <= at_x.residual @ at_x.residual:
-        return made[1]
+        return left
+    start = refined._unknowns(coarse.unknown_names, x)
     fitted = fine.evaluate(GaussNewton().minimize_cost(fine, start, None).x, False, at_x.equilibrium_guesses)
-    return fitted.residual if fitted.ok and fitted.cost < before.cost else made[1]
+    return fitted.residual if fitted.ok and fitted.cost < before.cost else left
 
 
 def problem_corrected_for_few_links(
@@ -302,7 +302,7 @@ def parameter_shifts_at_finer_discretisation(
         if isinstance(own, str):
             notes.append(f"the effect of {words} on the estimates is unknown: {own}")
         else:
-            found[key], left = own
+            found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
             least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
             if not model_difference_only and excess - rest > least:

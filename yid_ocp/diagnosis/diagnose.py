@@ -26,6 +26,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrA
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
     EffectSearchRecord,
+    HeldOutPredictions,
     NominalSolutionAndRefitStore,
     RefitContext,
     RefitStatistics,
@@ -140,14 +141,16 @@ def _examined(
     search.record_stage_end("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
     effects = search.problem.candidates_with_prior_ranges_from_states(states)
-    held_out_test, spread = _held_out_null_test_and_spread(nominal, limits)
+    predicted = nominal.problem.predict_held_out(nominal.unknowns, True)
+    held_out_test, spread = _held_out_null_test_and_spread(nominal, limits, predicted)
     tests = _estimation_null_test(nominal, limits), held_out_test
     search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     composed.changes_by_encoder_noise.clear()
-    nominal = replace(nominal, held_out_loss=held_out_loss(own, nominal.unknowns, nominal.evaluation, spread))
+    loss = held_out_loss(own, nominal.unknowns, nominal.evaluation, spread, predicted)
+    nominal, predicted = replace(nominal, held_out_loss=loss), []
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, *tests, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
     found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
@@ -295,14 +298,16 @@ def _happened(
     guesses = fit.evaluation.equilibrium_guesses
     judged, residual = fit.problem, fit.evaluation
     pairs, parts = zip(judged.episodes, own.episodes, strict=True), ("torque", "measurements")
-    if any(getattr(a, part) is not getattr(b, part) for a, b in pairs for part in parts):
+    if is_other := any(getattr(a, part) is not getattr(b, part) for a, b in pairs for part in parts):
         judged = problem_with_whitening_at(own, x, guesses)
         residual = judged.evaluate(x, False, guesses)
     if not residual.ok:
         return NO_EVENTS, None
     test = _null_test(judged, residual.residual, len(fit.values), limits)
     is_flagged = any(window.is_flagged for window in test.windows)
-    evaluation = own.evaluate(x, is_flagged, guesses)
+    evaluation = residual
+    if (is_other and is_flagged) or own.has_process_noise:
+        evaluation = own.evaluate(x, is_flagged, guesses)
     if not evaluation.ok:
         return NO_EVENTS, None
     least = limits.min_log_bayes_factor
@@ -321,7 +326,7 @@ def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     evaluation = judged.evaluate(x, False, guesses)
     if evaluation.ok:
         with contextlib.suppress(SolverError):
-            held_out = [part.residual for part in _held_out_residuals(judged, x)]
+            held_out = [part.residual for part in _held_out_residuals(judged, judged.predict_held_out(x))]
             return _excess_of(np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out]))
     return math.inf
 
@@ -436,10 +441,10 @@ def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestRes
     return _null_test(fit.problem, residual, effective_parameter_count(fit.problem, fit.evaluation), limits)
 
 
-def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool = False) -> list[ResidualAndJacobian]:
-    """Whitened residual of each held-out recording. Raises `SolverError` if one cannot be predicted."""
-    found, pairs = [], zip(problem.predict_held_out(x, derivatives), problem.held_out_whitening_filters, strict=True)
-    for (episode, result), whitening in pairs:
+def _held_out_residuals(problem: EstimationProblem, predicted: HeldOutPredictions) -> list[ResidualAndJacobian]:
+    """Whitened residual of each held-out recording. Raises `SolverError` if one could not be predicted."""
+    found = []
+    for (episode, result), whitening in zip(predicted, problem.held_out_whitening_filters, strict=True):
         if isinstance(result, str):
             raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
         found.append(whitened_residual_and_jacobian(episode, whitening, result))
@@ -447,7 +452,7 @@ def _held_out_residuals(problem: EstimationProblem, x: Array, derivatives: bool 
 
 
 def _held_out_null_test_and_spread(
-    fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS
+    fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS, predicted: HeldOutPredictions = ()
 ) -> tuple[NullTestResult, Array]:
     """The held-out null test, and the change (n, k) of residuals by one std of each error of shared parameters."""
     problem, x, shared = fit.problem, fit.unknowns, len(fit.problem.shared_parameters)
@@ -456,10 +461,10 @@ def _held_out_null_test_and_spread(
     def residual_of(moved: EstimationProblem) -> Array | None:
         other = problem.with_episodes(problem.episodes, moved.episodes, problem.whitening_filters, filters)
         with contextlib.suppress(SolverError):
-            return np.concatenate([part.residual for part in _held_out_residuals(other, x)])
+            return np.concatenate([part.residual for part in _held_out_residuals(other, other.predict_held_out(x))])
         return None
 
-    found = _held_out_residuals(problem, x, True)
+    found = _held_out_residuals(problem, predicted or problem.predict_held_out(x, True))
     residual = np.concatenate([part.residual for part in found])
     slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
     by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, fit.evaluation)[:shared])

@@ -31,7 +31,7 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, whitened_residual_and_jacobian
 from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.solvers import GaussNewton, Solution, Status
@@ -255,6 +255,8 @@ class RefitContext:
         return found
 
 
+HeldOutPredictions = Sequence[PredictedEpisodeOrFailure]
+"""Predictions of all held-out recordings, with derivatives. Empty if they are not known."""
 EffectsWithStart = tuple[Sequence[EffectBase], Mapping[str, float]]
 """Effects to refit, and their values at the start."""
 _Attempt = tuple[EstimationProblem, SolverResult, Evaluation]
@@ -334,6 +336,8 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
         outcome = REFIT_SOLVER.minimize_cost(own, own.pack_unknowns({**start, **drawn}), None)
         if outcome.status != Status.FAILED:
             break
+    if not own.has_process_noise and outcome.evaluation is not None:
+        return own, outcome, outcome.evaluation  # there are no filters to linearise
     found = _seen(problem, effects, outcome)
     moving, _, end = found
     before, after = problem.problem.whitening_filters, moving.whitening_filters
@@ -432,16 +436,20 @@ def refit_with_each_effect(
 
 @np.errstate(invalid="ignore")  # of recordings that cannot be predicted
 def held_out_loss(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, spread: Array | None = None
+    problem: EstimationProblem,
+    x: Array,
+    evaluation: Evaluation,
+    spread: Array | None = None,
+    predicted: HeldOutPredictions = (),
 ) -> HeldOutLoss:
     """Compute the prediction loss on held-out recordings of a fit at `x`, where it has the given evaluation.
 
-    `spread` (n, k) is from `AllCandidatesProblem`.
+    `spread` (n, k) is from `AllCandidatesProblem`. `predicted` are predictions with derivatives, if they are known.
     """
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
     factor = noise_only_covariance_sqrt(problem, evaluation)[: len(problem.shared_parameters)]
-    found, residuals, errors, numbered, count = problem.predict_held_out(x, True), [], [], [], 0
+    found, residuals, errors, numbered, count = predicted or problem.predict_held_out(x, True), [], [], [], 0
     for (episode, result), whitening in zip(found, problem.held_out_whitening_filters, strict=True):
         blocks = []
         for samples in episode.measurements:
@@ -476,7 +484,7 @@ def held_out_loss(
 
 
 def held_out_rmse_and_unit_by_channel(
-    found: Sequence[tuple[Episode, EpisodePrediction | str]],
+    found: HeldOutPredictions,
 ) -> dict[str, tuple[float, str]]:
     """Return the root mean square error and unit of each channel over all predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
