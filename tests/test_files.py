@@ -127,7 +127,7 @@ OPENERS |= {"imread", "read_image", "read_point_cloud", "read_triangle_mesh"}
 """Functions that open a file: Python's own, and those of the libraries that the package uses."""
 GUARDS = {"check_input_file", "check_readable_in_child_process", "read_input_text"}
 OPENED_ELSEWHERE = {
-    "files.memory_limit_context": "/proc",
+    "files.process_memory_limit": "/proc",
     "files.atomic_write": "what was written",
     "version.sha256_of_source_files": "the package's own sources",
     "cli._discard_what_follows": "/dev/null",
