@@ -17,7 +17,7 @@ def assert_nothing_impossible_is_said(finding: DiagnosisResult, text: str) -> No
         assert residuals_exceed_noise(tests, finding.thresholds.null_test_excess_criteria), text
     if finding.verdict == "no_gap" and not finding.residual_exceeds_noise(finding.thresholds):
         is_significant = min(test.p_value for test in tests) < finding.thresholds.significance_level
-        assert ("The excess over noise is significant, but a gap needs" in text) == is_significant
+        assert ("The excess over noise is significant, but too small" in text) == is_significant
     if finding.verdict in ("no_gap", "insufficient_data"):
         assert "The gap is real" not in text
         assert not finding.accepted_effects

@@ -48,7 +48,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     texts = {
         "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
         "unknown": mostly or "Record other motions, faster and larger.",
-        "no_gap": f"None needed: no relevant gap was found.{_listed(' The data that are used cannot reveal ', unseen)}",
+        "no_gap": f"None needed: no relevant gap was found.{_listed(' These motions cannot show ', unseen)}",
         "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
     }
     return texts[result.verdict]
@@ -80,8 +80,8 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
-    used, whole = cut.kept_duration, cut.full_duration
-    return f"The nominal model follows {cut.recording} for {used:.3g} of {whole:.3g} s only; the rest is ignored."
+    used = f"Only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of '{cut.recording}' are used"
+    return f"{used}: the nominal model cannot be simulated any further."
 
 
 def overspeed_truncation_messages(events: EventSet) -> list[str]:
@@ -134,8 +134,8 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     scores, level = result.screening.candidate_scores, limits.gap_significance_level
     best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
-    needs = f"chi2 per degree of freedom above {least:.4g} and p below {level:.2g} with both tests counted"
-    small = f"The excess over noise is significant, but a gap needs {needs}."
+    needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
+    small = f"The excess over noise is significant, but too small for a gap, which needs {needs}."
     seen = f"A residual along {''.join(best)} is significant (p {_p_value_relation(along)})"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but it counts as a gap only with an accepted effect."
@@ -149,6 +149,8 @@ def _places(result: DiagnosisResult) -> str:
     if not named:
         return "These data cannot locate it."
     assert result.smoother_result is not None  # it found the locations
+    rest = 1 - sum(place.gap_share for place in where)
+    named += [f"other places ({100 * rest:.0f} %)"] * (rest >= 0.005)
     side = _GAP_ORIGIN_PHRASES.get(result.smoother_result.plant_or_sensor_origin, "")
     return f"It lies in {' and '.join(named)}{side}."
 
@@ -167,29 +169,26 @@ def _causes(result: DiagnosisResult) -> list[str]:
             part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
         text.append(f"{names} {verb} {part}.")
     for own, *others in (entry.equivalent_effects for entry in result.accepted_selected_effects):
-        text.append(_listed(f"Not separable from {own.label}: ", [effect.label for effect in others]))
+        text.append(_listed(f"These recordings cannot distinguish {own.label} from ", [o.label for o in others]))
     explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
     reasons = {
-        "": f"The probability that this names the cause is {100 * result.probability:.0f} %.",
-        "none": "No effect tried is significant and closes enough of it.",
-        "little": f"On the fitted motions this explains {explained:.3g} % of the gap; {enough:.3g} % is required.",
-        "stand_in": f"This only imitates the cause: {'; '.join(apart)}.",
+        "": f"The probability that the cause is named here is {100 * result.probability:.0f} %.",
+        "none": "None of the effects that were tried explains it well enough.",
+        "little": f"This explains {explained:.3g} % of the gap in the fitted motions; {enough:.3g} % is needed.",
+        "stand_in": f"This only imitates the cause, because it changes with the recordings: {'; '.join(apart)}.",
     }
-    text.append(reasons[result.unknown_reason])
-    if result.unknown_reason:
-        text.append(_several_places(result))
-    return text
+    return [*text, reasons[result.unknown_reason], _several_places(result)]
 
 
 def _several_places(result: DiagnosisResult) -> str:
-    """Sentence on the places where the kind of the best single effect is significant, if there are several."""
+    """Sentence for an unknown cause: the places where the kind of the best single effect is significant, if several."""
     scores, level = result.screening.candidate_scores, result.thresholds.gap_significance_level
     best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
     alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
     places = abbreviated_names_text([s.effect.location for s in alike])
     advice = "add it to the model at all of them (`model.effects`, or `yid-ocp friction` for friction)"
-    return f"{best[0]} is significant at {places}: {advice}." if len(alike) > 1 else ""
+    return f"{best[0]} is significant at {places}: {advice}." if result.unknown_reason and len(alike) > 1 else ""
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:
@@ -219,7 +218,7 @@ def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
         low, high = effect.prior_ranges[name]
         odd = f" (far outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
     is_unsure = all(abs(fit.values[n] - neutral[n]) <= fit.std.get(n, 0.0) for n in effect.amplitude_parameter_names)
-    return f"{effect.label} with {', '.join(values)}{odd}{' (its size is not determined by these data)' * is_unsure}"
+    return f"{effect.label} with {', '.join(values)}{odd}{' (these recordings do not determine its size)' * is_unsure}"
 
 
 def _remains(result: DiagnosisResult) -> list[str]:
@@ -238,7 +237,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
         for name, own in result.nominal_parameters_before_and_after.items()
         if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
     ]
-    return [f"{what} {said}.", _listed("Changed parameters of the nominal model: ", moved)]
+    return [f"{what} {said}.", _listed("The fit with effects changes parameters of the nominal model: ", moved)]
 
 
 def _earlier_runs(result: DiagnosisResult) -> list[str]:
