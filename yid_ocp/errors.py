@@ -72,7 +72,7 @@ class SolverError(YidError):
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
     """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
     hint = "set other initial values (parameters.NAME.initial), or a smaller problem.time_step"
-    what, allowed = f"the model cannot be simulated: {reason}", "values at which the simulation succeeds"
+    what, allowed = f"the model cannot be simulated: {reason}", "values with which the simulation reaches the end"
     return SolverError(what, where=where, allowed=allowed, hint=hint)
 
 

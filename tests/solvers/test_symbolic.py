@@ -180,7 +180,7 @@ def test_what_it_does_not_do_is_refused(urdf_folder):
 def test_blocks_are_named_after_what_they_hold(urdf_folder):
     problem = problem_of(urdf_folder, "driven, proportional")
     program = transcribe(problem)
-    with pytest.raises(SolverError, match="the program has 2 blocks 'q'"):
+    with pytest.raises(SolverError, match="'q' is ambiguous"):
         program["q"]
     assert program["q[run_2]"].shape == (2, STEPS + 1)
     assert program["torque[run_1]"].shape == (1, STEPS)
@@ -346,7 +346,7 @@ def test_blocks_and_rows_have_names():
     np.testing.assert_array_equal(at(program, program["chain"]).ravel(), at(program, program.w).ravel()[1:])
     np.testing.assert_array_equal(at(program, program["s"]), [[1.5]])
     assert program.with_user_terms(0.0, program.w[:2]).constraint_names()[-2:] == ("added.0", "added.1")
-    with pytest.raises(SolverError, match="has 0 blocks 'chian'"):
+    with pytest.raises(SolverError, match="no block 'chian'"):
         program["chian"]
 
 

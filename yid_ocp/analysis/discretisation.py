@@ -443,7 +443,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 def min_gap_by_grasp_at_robot_posture(
     system: System, configuration: Mapping[str, float], theta: Array, near: Array | None = None
 ) -> dict[str, float]:
-    """Compute the smallest gap [m] that each grasp can reach if the robot is fixed and the object can bend freely.
+    """Compute the smallest distance [m] of the two points of each grasp: the robot is fixed, the object bends freely.
 
     `configuration` holds the driven and prescribed coordinates by name [rad or m]. `theta` are all parameters; only
     lengths matter. The search starts at the configuration `near` (n,), if given, and at random ones.

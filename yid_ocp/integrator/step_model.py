@@ -129,10 +129,10 @@ class RolloutConvergenceInfo:
 
 @dataclass(frozen=True)
 class SensitivityDirections:
-    """The d directions along which a rollout is differentiated. The first directions are the named parameters.
+    """The d quantities with respect to which a rollout is differentiated, the named parameters first.
 
     The tangents are the derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path
-    (N + 1, nc, d) along these directions.
+    (N + 1, nc, d) with respect to them.
     """
 
     parameter_names: tuple[str, ...]

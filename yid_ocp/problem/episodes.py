@@ -110,14 +110,14 @@ class TorqueAndAngleErrorModel:
 
     @property
     def with_torque_bias_only(self) -> TorqueAndAngleErrorModel:
-        """The same error model with only the constant torque offset, without torque noise and smoothed reference."""
+        """The same error model with only the constant torque offset, no torque noise and no smoothing of angles."""
         none = np.zeros_like(self.torque_noise)
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
     def on_finer_steps(self, ratio: int) -> TorqueAndAngleErrorModel:
-        """Return this model for `ratio` times shorter steps, with torques held and the reference interpolated."""
+        """Return this model for `ratio` times shorter steps, with torque errors held and angles interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
         if (known := self.smoothed_reference) is not None:

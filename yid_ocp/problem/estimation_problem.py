@@ -266,7 +266,7 @@ class EstimationProblem(ReprMixin):
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
     def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[PredictedEpisodeOrFailure]:
-        """Predict the held-out recordings from the inputs of `held_out_prediction_arguments`.
+        """Predict every held-out recording at the unknowns `x` of a fit to the estimation recordings.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
         prior and the first measurements. With `derivatives`, predictions hold derivatives with respect to the free

@@ -286,7 +286,7 @@ def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) ->
 def estimated_curve_figure(
     curve: tuple[Array, Array, Array], others: Mapping[str, Array], visited: tuple[float, float], x: str, y: str
 ) -> _Figure:
-    """Plot a curve (x, y, std) with a band of two stds, `others` (y) dashed, and lines at the ends of `visited` x."""
+    """Plot a curve (x, y, std) with a band of two stds, other curves dashed, and the ends of the visited x range."""
     figure, (at, middle, std) = _styled_figure(340, x, y), curve
     edges = np.concatenate([middle + 2 * std, (middle - 2 * std)[::-1]])
     band = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False, "opacity": 0.25}

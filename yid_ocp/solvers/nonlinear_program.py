@@ -339,7 +339,8 @@ class NonlinearProgram(ReprMixin):
         if len(alike) == 1:
             return blocks[alike[0]]
         said = unknown_name_error_arguments(name, alike or blocks)
-        raise SolverError(f"the program has {len(alike)} blocks '{name}'", where=f"nlp['{name}']", **said)
+        what = f"'{name}' is ambiguous" if alike else f"the program has no block '{name}'"
+        raise SolverError(what, where=f"nlp['{name}']", **said)
 
     def __getitem__(self, name: str) -> ca.MX:
         """Block of variables or parameters as an MX matrix of its shape."""

@@ -99,7 +99,7 @@ def run_blind(
     folder holds another ensemble.
     """
     if count < 1:
-        raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
+        raise ConfigError(f"an ensemble cannot have {count} cases", where="--cases", allowed="a whole number from 1")
     if seed < 0:
         raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
     for entry in runs:

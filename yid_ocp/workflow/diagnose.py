@@ -339,7 +339,7 @@ class _SingleJsonFileRefitStore(RefitStore):
                 files.write_strict_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
-                    log.warning("finished refits cannot be stored (%s); the diagnosis continues", error)
+                    log.warning("finished refits cannot be stored and would be lost by an interruption (%s)", error)
                 self._warned = True
 
     def delete_file(self) -> None:
@@ -356,8 +356,8 @@ class _SingleJsonFileRefitStore(RefitStore):
             held = files.read_input_json(self.file)
             if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
                 return {name: files.dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
-            reason = "other inputs, another configuration or another version"
+            reason = "they belong to other inputs, another configuration or another version"
         except (DataError, ValueError, LookupError, TypeError, AttributeError):
-            reason = "a file that cannot be read"
-        log.warning("the refits in %s are from %s and are not reused", self.file, reason)
+            reason = "the file cannot be read"
+        log.warning("stored refits in %s are not used, and all effects are fitted again: %s", self.file, reason)
         return {}
