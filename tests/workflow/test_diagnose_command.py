@@ -122,7 +122,7 @@ def test_a_changed_configuration_resumes_nothing(rubbing, tmp_path, monkeypatch,
     caplog.clear()
     with pytest.raises(KeyboardInterrupt):
         run_diagnose(load_config(rubbing, ["diagnosis.significance_level=0.02"]), None, Interrupting(after=1))
-    assert sum("not reused" in record.getMessage() for record in caplog.records) == 1
+    assert sum("fitted again" in record.getMessage() for record in caplog.records) == 1
 
 
 def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(rubbing, whole):
