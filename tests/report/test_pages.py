@@ -64,9 +64,15 @@ addEventListener("load", async () => {
   viewers.forEach((viewer) => { viewer.at(viewer.from); viewer.play(); });
   const played = () => viewers.map((viewer) => viewer.time > viewer.from);
   for (let i = 0; i < 200 && played().includes(false); i++) await new Promise((go) => setTimeout(go, 20));
+  const { style } = document.body;
+  const fit = () => boxes.every((box) => box.querySelector(".main-svg").clientWidth <= box.clientWidth);
+  style.width = "320px";
+  for (let i = 0; i < 200 && !fit(); i++) await new Promise((go) => setTimeout(go, 20));
+  const narrowed = fit();
+  style.width = "";
   parent.postMessage(JSON.stringify({
     width: innerWidth, wide, scroll: document.documentElement.scrollWidth,
-    cut: cut.map((e) => e.outerHTML.slice(0, 80)),
+    cut: cut.map((e) => e.outerHTML.slice(0, 80)), narrowed,
     boxes: boxes.length, drawn: document.querySelectorAll(".plot .main-svg").length, moments,
     played: played(),
     dark: matchMedia("(prefers-color-scheme: dark)").matches, ground: getComputedStyle(document.body).backgroundColor,
@@ -224,6 +230,7 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     assert "Refitted: joint_coulomb@elbow" in text_of(page_of(replace(moved, nominal_model=quiet), tmp_path))
     text = text_of(page_of(moved, tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
+    assert "Of the nominal model, without the effects that explain the gap: every coordinate" in text
     assert "would have been detected" in text
     assert "By evidence the gap lies in the mechanics or what the effort sensors read" in text
     assert "Closed by joint_coulomb@elbow" in text
@@ -292,6 +299,7 @@ def check_in_browser(page: Path, width: int, scheme: str, folder: Path) -> None:
     assert (seen["width"], seen["dark"], seen["cut"]) == (width, scheme == "dark", [])
     assert seen["scroll"] <= seen["wide"]
     assert seen["drawn"] >= seen["boxes"]
+    assert seen["narrowed"]
     assert seen["ground"] == ("rgb(21, 27, 32)" if scheme == "dark" else "rgb(255, 255, 255)")
     for i in range(0, len(seen["moments"]), 3):
         assert len(set(seen["moments"][i : i + 3])) == 3, "the picture does not move"

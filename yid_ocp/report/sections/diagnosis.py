@@ -112,9 +112,11 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     }
     evidence = smoothed.log_evidence
     left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
+    without = ", without the effects that explain the gap" if finding.accepted_effects else ""
     sentences = [
-        "Every coordinate was given an unknown force, every grasp an unknown offset and every measured point an "
-        "unknown bias, free to change in time; the fewest groups of them that explain the residual were kept.",
+        f"Of the {_NOMINAL_LABEL}{without}: every coordinate was given an unknown force, every grasp an unknown offset "
+        "and every measured point an unknown bias, free to change in time; the fewest groups of them that explain the "
+        "residual were kept.",
         f"By evidence the gap lies in {verdicts[smoothed.plant_or_sensor_origin]}: the log evidence rises by "
         f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
         f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
@@ -129,7 +131,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         if not kept:
             break
         figure, sentence = _time_map(finding, smoothed, i, kept)
-        maps.append((f"Recording {trace.recording}", figure))
+        maps.append((f"Recording {trace.recording}, {_NOMINAL_LABEL}", figure))
         sentences += [sentence] if i == 0 else []
     if maps:
         sentences.append("Red is a force, offset or bias in the positive direction, blue in the negative one.")

@@ -38,10 +38,10 @@ function fitted({ data, layout }, width) {
 }
 
 function draw(box) {
-  const figure = JSON.parse(inColors(box.querySelector("script").textContent));
-  const config = { responsive: true, displaylogo: false, displayModeBar: box.clientWidth > 560 ? "hover" : false };
-  box.drawn = true;
-  return Plotly.react(box.target, figure.data, fitted(figure, box.clientWidth), config);
+  const figure = JSON.parse(inColors(box.querySelector("script").textContent)), width = box.clientWidth;
+  const config = { displaylogo: false, displayModeBar: width > 560 ? "hover" : false };
+  box.drawn = width;
+  return Plotly.react(box.target, figure.data, { ...fitted(figure, width), width }, config);
 }
 
 async function figures() {
@@ -59,6 +59,9 @@ async function figures() {
     { rootMargin: "600px" },
   );
   boxes.forEach((box) => near.observe(box));
+  // a turned phone or a dragged window: Plotly's own answer comes late and keeps the layout of the old width
+  const sized = new ResizeObserver((entries) => entries.map((entry) => entry.target).filter((box) => box.drawn && box.drawn !== box.clientWidth).forEach(draw));
+  boxes.forEach((box) => sized.observe(box));
   darkness.addEventListener("change", () => boxes.filter((box) => box.drawn).forEach(draw));
   addEventListener("beforeprint", () => boxes.filter((box) => !box.drawn).forEach(draw));
 }

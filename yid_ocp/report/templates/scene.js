@@ -62,6 +62,12 @@ class Viewer {
       bar.append(label);
     };
     if (this.dressed) choice("meshes", "dressed");
+    const parted = motions.some((motion) => motion.sticks.some((stick) => stick[3]) && motion.sticks.some((stick) => !stick[3]));
+    this.following = parted && document.querySelectorAll("section").length === 1; // a page that is only the picture
+    if (parted) choice("follow the object", "following");
+    const seen = new Set(motions.flatMap((motion) => Object.keys(motion.points)));
+    this.named = seen.size > 0 && seen.size <= 6;
+    if (seen.size) choice("names of points", "named");
     if ((this.marked = motions.some((motion) => motion.acting.length))) choice("what acts", "marked");
     this.swatches();
   }
@@ -82,19 +88,15 @@ class Viewer {
     this.scene = this.scenes[i];
     this.from = this.scene.t[0];
     this.to = this.scene.t[this.scene.t.length - 1];
-    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    const places = [], take = (flat, k) => flat[3 * k] !== null && places.push([0, 1, 2].map((c) => flat[3 * k + c] / this.scene.scale));
     for (const motion of this.scene.motions) {
       const used = new Set([...motion.sticks.flatMap(([a, b]) => [a, b]), ...Object.values(motion.points)]);
-      for (const places of motion.places) for (const k of used) for (let c = 0; c < 3; c++) {
-        const x = places[3 * k + c];
-        if (x !== null) { low[c] = Math.min(low[c], x / this.scene.scale); high[c] = Math.max(high[c], x / this.scene.scale); }
-      }
+      for (const flat of motion.places) for (const k of used) take(flat, k);
     }
     const [still = []] = (this.scene.motions.some((motion) => motion.poses) && this.meshes[""]) || [];
-    still.forEach((value, k) => { const x = value / this.scene.scale; low[k % 3] = Math.min(low[k % 3], x); high[k % 3] = Math.max(high[k % 3], x); });
-    this.middle = low.map((x, c) => (x + high[c]) / 2);
-    this.reach = Math.max(0.05, Math.hypot(...high.map((x, c) => x - low[c])) / 2);
-    this.floor = low[2];
+    for (let k = 0; 3 * k < still.length; k++) take(still, k);
+    this.whole = this.around(places);
+    this.floor = places.reduce((low, place) => Math.min(low, place[2]), Infinity);
     this.at(this.from);
   }
 
@@ -153,6 +155,20 @@ class Viewer {
     };
   }
 
+  // the middle of places, and how far from it they reach
+  around(places) {
+    const ends = [0, 1, 2].map((c) => places.reduce(([low, high], place) => [Math.min(low, place[c]), Math.max(high, place[c])], [Infinity, -Infinity]));
+    const middle = ends.map(([low, high]) => (low + high) / 2);
+    return { middle, reach: places.reduce((far, place) => Math.max(far, Math.hypot(...place.map((x, c) => x - middle[c]))), 0.05) };
+  }
+
+  // where the object is now; a little of what holds it is seen, too
+  near() {
+    const places = this.scene.motions.flatMap((motion) => [...motion.sticks.filter((stick) => stick[3]).flatMap(([a, b]) => [a, b]), ...Object.values(motion.points)].map(this.places(motion)));
+    const { middle, reach } = this.around(places.filter((place) => place));
+    return { middle, reach: 1.3 * reach };
+  }
+
   places(motion) {
     const { scale } = this.scene, [i, part] = this.moment(), [a, b] = [motion.places[i - 1], motion.places[i]];
     const near = part < 0.5 ? a : b, fresh = motion.fresh ? motion.fresh[part < 0.5 ? i - 1 : i] : null;
@@ -166,6 +182,7 @@ class Viewer {
   paint() {
     const { canvas } = this, ratio = devicePixelRatio || 1, [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !this.scene) return;
+    Object.assign(this, this.following ? this.near() : this.whole, { labels: [] });
     if (canvas.width !== Math.round(width * ratio)) [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
     const pen = canvas.getContext("2d"), see = this.eye(width, height), style = getComputedStyle(document.documentElement);
     const [ink, pale, card] = ["--ink", "--pale", "--card"].map((name) => style.getPropertyValue(name).trim());
@@ -174,7 +191,7 @@ class Viewer {
     pen.lineCap = "round";
     this.ground(pen, see, pale);
     const shown = this.scene.motions.filter((motion) => !this.hidden.has(motion.name));
-    const strokes = [];
+    const strokes = [], names = [];
     const clothed = this.dressed && shown.some((motion) => motion.poses);
     const predicted = shown.filter((motion) => motion.name !== "measured");
     for (const motion of shown) {
@@ -193,13 +210,14 @@ class Viewer {
       }
     }
     const measured = shown.find((motion) => motion.name === "measured");
-    if (measured) strokes.push(...this.points(pen, see, measured, predicted, ink));
+    if (measured) strokes.push(...this.points(pen, see, measured, predicted, names, card));
     else for (const motion of predicted) {
       const at = this.places(motion);
-      for (const k of Object.values(motion.points)) { const p = see(at(k)); strokes.push([p[2] - 0.05 * this.reach, () => this.dot(pen, p, 4, this.color(motion.name), true, card)]); }
+      for (const [name, k] of Object.entries(motion.points)) { const p = see(at(k)); strokes.push([p[2] - 0.05 * this.reach, () => { this.dot(pen, p, 4, this.color(motion.name), card); names.push([name, p]); }]); }
     }
     strokes.sort((a, b) => b[0] - a[0]).forEach(([, stroke]) => stroke());
-    if (this.marked) this.acting(pen, see, shown, style, card);
+    if (this.named) names.forEach(([name, [x, y]]) => this.write(pen, name, x + 10, y - 6, ink, card));
+    if (this.marked) this.acting(pen, see, shown, ink, card);
   }
 
   // between which two moments the time is, and where
@@ -252,21 +270,9 @@ class Viewer {
   }
 
   // effects as marks, unknown forces as arrows and, about a joint, as rings: the largest of a unit is the longest
-  acting(pen, see, shown, style, card) {
-    const [i, part] = this.moment(), color = darkness.matches ? "#d9a6f0" : "#7a2f96", ink = style.getPropertyValue("--ink").trim();
-    const elsewhere = [], used = [];
-    const write = (text, x, y) => {
-      while (used.some(([a, b]) => Math.abs(a - x) < 150 && Math.abs(b - y) < 15)) y += 15;
-      used.push([x, y]);
-      pen.font = "12px system-ui, sans-serif";
-      const wide = pen.measureText(text).width, left = Math.max(4, Math.min(x, this.canvas.clientWidth - wide - 4));
-      pen.globalAlpha = 0.8;
-      pen.fillStyle = card;
-      pen.fillRect(left - 2, y - 11, wide + 4, 15);
-      pen.globalAlpha = 1;
-      pen.fillStyle = ink;
-      pen.fillText(text, left, y);
-    };
+  acting(pen, see, shown, ink, card) {
+    const [i, part] = this.moment(), color = darkness.matches ? "#d9a6f0" : "#7a2f96";
+    const elsewhere = [], write = (text, x, y) => this.write(pen, text, x, y, ink, card);
     for (const motion of shown) {
       const at = this.places(motion), largest = {};
       for (const [, , unit, values] of motion.acting) for (const row of values) largest[unit] = Math.max(largest[unit] || 0, Math.hypot(...row));
@@ -293,7 +299,7 @@ class Viewer {
     elsewhere.forEach((text) => write(text, 8, 18));
   }
 
-  points(pen, see, measured, predicted, ink) {
+  points(pen, see, measured, predicted, names, card) {
     const at = this.places(measured), color = PALETTE.points[darkness.matches ? 1 : 0], found = [];
     for (const [i, [name, k]] of Object.entries(measured.points).entries()) {
       const place = at(k);
@@ -301,7 +307,7 @@ class Viewer {
       // a point that waits for its next measurement says nothing of now
       if (at.fresh && !at.fresh[i]) {
         const q = see(place);
-        found.push([q[2] - 0.25 * this.reach, () => { pen.globalAlpha = 0.35; this.dot(pen, q, 3, color, false, ink); pen.globalAlpha = 1; }]);
+        found.push([q[2] - 0.25 * this.reach, () => { pen.globalAlpha = 0.35; this.dot(pen, q, 3, color); pen.globalAlpha = 1; }]);
         continue;
       }
       let shown = place;
@@ -310,10 +316,10 @@ class Viewer {
         const from = this.places(motion)(motion.points[name]), p = see(from);
         const to = place.map((x, c) => from[c] + this.factor * (x - from[c])), q = see(to);
         if (motion === predicted[predicted.length - 1]) shown = to;
-        found.push([Math.min(p[2], q[2]) - 0.2 * this.reach, () => { this.line(pen, p, q, color, 1.5); this.dot(pen, p, 3.5, this.color(motion.name), true, ink); }]);
+        found.push([Math.min(p[2], q[2]) - 0.2 * this.reach, () => { this.line(pen, p, q, color, 1.5); this.dot(pen, p, 6, card, this.color(motion.name)); }]);
       }
       const q = see(shown);
-      found.push([q[2] - 0.25 * this.reach, () => this.dot(pen, q, 4, color, false, ink)]);
+      found.push([q[2] - 0.25 * this.reach, () => { this.dot(pen, q, 4, color); names.push([name, q]); }]);
     }
     return found;
   }
@@ -345,12 +351,26 @@ class Viewer {
     pen.globalAlpha = 1;
   }
 
-  dot(pen, p, radius, color, hollow, edge) {
+  dot(pen, p, radius, color, edge) {
     pen.beginPath();
     pen.arc(p[0], p[1], radius, 0, 2 * Math.PI);
     pen.fillStyle = color;
     pen.fill();
-    if (hollow) { pen.strokeStyle = edge; pen.lineWidth = 1.2; pen.stroke(); }
+    if (edge) { pen.strokeStyle = edge; pen.lineWidth = 2; pen.stroke(); }
+  }
+
+  // a text at a place, or below the texts that are there
+  write(pen, text, x, y, ink, card) {
+    pen.font = "12px system-ui, sans-serif";
+    const wide = pen.measureText(text).width, left = Math.max(4, Math.min(x, this.canvas.clientWidth - wide - 4));
+    while (this.labels.some(([a, b, own]) => left < a + own + 4 && a < left + wide + 4 && Math.abs(b - y) < 15)) y += 15;
+    this.labels.push([left, y, wide]);
+    pen.globalAlpha = 0.8;
+    pen.fillStyle = card;
+    pen.fillRect(left - 2, y - 11, wide + 4, 15);
+    pen.globalAlpha = 1;
+    pen.fillStyle = ink;
+    pen.fillText(text, left, y);
   }
 
   softer(color, card) {
