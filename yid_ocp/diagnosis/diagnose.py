@@ -104,7 +104,7 @@ def diagnose(
         deadline = begun + (thresholds.budget or math.inf)
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
         search.record_stage_end("compose")
-        progress.begin_stage("fitting the nominal model", 3.0, 10.5)
+        progress.begin_stage("fitting the nominal model", 3.0, 15.5)
         nominal = fit_nominal_model(problem, composed, known_fits.solution, known_fits.store, thresholds)
         return _diagnosed(problem, _examined(search, nominal), earlier)
 
@@ -135,7 +135,7 @@ def _examined(
     limits = search.thresholds
     search, nominal, cuts = _followed(search, nominal, known)
     search.record_stage_end("nominal")
-    search.progress.begin_stage("looking for events", 2.0, 8.5)
+    search.progress.begin_stage("looking for events", 4.0, 11.5)
     with_events = search
     search, nominal, events, smoothed = _without_events(search, nominal)
     search.record_stage_end("events")
@@ -144,7 +144,6 @@ def _examined(
     predicted = nominal.problem.predict_held_out(nominal.unknowns, True)
     held_out_test, spread = _held_out_null_test_and_spread(nominal, limits, predicted)
     tests = _estimation_null_test(nominal, limits), held_out_test
-    search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
@@ -153,6 +152,8 @@ def _examined(
     nominal, predicted = replace(nominal, held_out_loss=loss), []
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, *tests, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
+    ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
+    search.progress.begin_stage(f"screening {len(effects)} candidates", 4.0, ahead)
     found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
     seen = _Examined(replace(search, problem=composed), *found)
     try:
@@ -218,7 +219,7 @@ def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examin
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
     """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
-    search.progress.begin_stage("trying half the time step", 1.0, 8.5)
+    search.progress.begin_stage("trying half the time step", 1.0, 12.0)
     composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
     fine = problem_corrected_for_events(composed.with_nominal_and_effects_free(fit.effects), events)
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
@@ -235,7 +236,7 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
 def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined | None:
     """The nominal model, examined again on data without the error of the links, if that lowers r'r by so much."""
     search = seen.with_events
-    search.progress.begin_stage("trying twice the links", 1.0, 8.5)
+    search.progress.begin_stage("trying twice the links", 1.0, 11.0)
     own = search.problem.with_nominal_and_effects_free(fit.effects)
     corrected = problem_corrected_for_few_links(search.problem.problem, own, fit.unknowns, fit.evaluation, least)
     if corrected is None:
@@ -280,7 +281,7 @@ def _without_events(
         if not events:
             break
         less = replace(first, problem=problem_corrected_for_events(first.problem, events))
-        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events", 3.0, 8.5)
+        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events", 3.0, 11.5)
         search, name = replace(search, problem=less), f"the nominal model without events, round {round_ + 1}"
         nominal, before = _fitted_nominal_model(search, nominal.values, name), events
         # the smoother's result includes the events
@@ -347,7 +348,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):
-        search.progress.begin_stage("locating the gap", 1.0, 2.0)
+        search.progress.begin_stage("locating the gap", 3.0, 2.0)
         # without events, the smoother already ran on all fitted data
         known = nominal.problem, nominal.unknowns, nominal.evaluation
         smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)

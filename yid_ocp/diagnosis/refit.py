@@ -217,7 +217,7 @@ class RefitContext:
         """The effects of a fit, refitted with estimation and held-out recordings exchanged."""
         if self.problem.is_split_in_blocks:
             return None
-        self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
+        self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 5.5)
         composed = self._problem_of_round(fit.effects)
         problem = composed.problem
         exchanged = problem.with_episodes(problem.held_out, problem.episodes)
@@ -408,7 +408,7 @@ def refit_with_each_effect(
     noun, head = ("effects", "pairs")[len(tried[0][0]) - 1], ("effects", "held-out chi2/n")
     text = f"refitting {join_effect_labels(base)} with each of {len(tried)} {noun}"
     # one effect is often enough; otherwise pairs, more effects and replacements follow
-    search.progress.begin_stage(text, 2 + 0.5 * len(tried), (8.0, 14.0, 9.0)[min(len(base), 2)])
+    search.progress.begin_stage(text, 2 + 0.5 * len(tried), (10.0, 16.0, 11.0)[min(len(base), 2)])
     parts = PartsDoneCounter(search.progress, len(tried), join_effect_labels(tried[0][0]))
 
     def table() -> list[tuple[str, str]]:

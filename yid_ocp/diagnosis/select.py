@@ -232,7 +232,7 @@ def select_effects(
         is_full = len(base) >= limits.max_effects
         if is_full or _leaves_noise(better, limits) or search.record_skip_if_past_deadline(rest):
             break
-        search.progress.begin_stage(f"scoring {rest}", 1.0, 12.0)
+        search.progress.begin_stage(f"scoring {rest}", 3.0, 13.0)
         seen = search.screen(base, better.values, f"beside {beside}")
         # what the effects close together with what another one promises in the linear model
         promised = 2 * (nominal.cost - better.cost) + seen.largest_predicted_chi2_decrease
@@ -300,7 +300,7 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     if not _is_needed(without, full, limits):
         search.progress.begin_stage(f"left {label} out again: the others do as well")
         return replace(chosen, fit=without)
-    search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
+    search.progress.begin_stage(f"looking for others in the place of {label}", 3.0, 13.0)
     company = f"in the place of {label}"
     screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
     best = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]

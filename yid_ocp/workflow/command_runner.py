@@ -102,6 +102,7 @@ _MAX_LIVE_ROWS = 10  # results shown below the bar on a terminal
 _MIN_ESTIMATE_TIME = 2.0  # shortest time of a stage before its remaining time is estimated [s]
 _USUAL_IMPORT_TIME = 1.6  # usual import time of a command, at the pace of the stages' usual times [s]
 _USUAL_ITERATIONS = 20  # usual number of iterations of a search
+_MAX_PLAN_EXCESS = 6.0  # a plan that grows by more may grow again [usual s]
 
 
 class _RemainingTime:
@@ -113,17 +114,18 @@ class _RemainingTime:
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._spent = min(max(import_time, _USUAL_IMPORT_TIME / 4), _USUAL_IMPORT_TIME * 32)
         self._usual, self._work, self._ahead = _USUAL_IMPORT_TIME, 0.0, math.nan
-        self._begun, self.n_iterates = time.monotonic(), 0
+        self._begun, self.n_iterates, self._has_grown = time.monotonic(), 0, False
         self._first: tuple[int, float] | None = None
 
     def begin_stage(self, work: float, ahead: float | None) -> None:
         now = time.monotonic()
         if self._work > 0:
             as_before = self._work * self._spent / self._usual
-            self._spent = self._spent / 2 + min(max(now - self._begun, as_before / 4), 4 * as_before)
+            self._spent = self._spent / 2 + min(max(now - self._begun, as_before / 4), 16 * as_before)
             self._usual = self._usual / 2 + self._work
         # only a stage that is part of the planned work announces later stages
         if ahead is not None and (work == 0 or not math.isnan(self._ahead)):
+            self._has_grown |= work + ahead > self._ahead + _MAX_PLAN_EXCESS
             self._ahead = ahead
         else:
             self._ahead = max(self._ahead - work, 0.0)
@@ -133,8 +135,8 @@ class _RemainingTime:
 
     def of_command(self) -> str:
         """Return the text of the command's remaining time. Empty if its stages do not state their usual time."""
-        seconds = self.seconds_left()
-        return "" if math.isnan(seconds) else f", about {_format_duration(seconds)} left"
+        seconds, how = self.seconds_left(), "at least" if self._has_grown else "about"
+        return "" if math.isnan(seconds) else f", {how} {_format_duration(seconds)} left"
 
     def seconds_left(self) -> float:
         spent, pace = time.monotonic() - self._begun, self._spent / self._usual

@@ -72,7 +72,7 @@ def run_diagnose(
         made_from = folder.input_hashes, config_yaml_with_defaults(run), software_and_plugin_versions()
         refits = _SingleJsonFileRefitStore(folder, *made_from)
         logged = _LoggedProgress(progress, folder)
-        progress.begin_stage("building the model and its compiled step", ahead=18.5)
+        progress.begin_stage("building the model and its compiled step", ahead=24.5)
         runs = run_history.estimates_of_each_baseline_run(run)
         without, said = run_history.load_recordings_without_effect(run)
         if said:
@@ -88,7 +88,7 @@ def run_diagnose(
         try:
             if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
                 # in units of noise, the solver would reject any fit and restart
-                logged.begin_stage("solving the nominal model", 5.0, 16.0)
+                logged.begin_stage("solving the nominal model", 5.0, 19.5)
                 nominal = fit_problem(problem, run.solver, callback=logged.report_iterate)
             finding = diagnose(
                 _with_noise_only_stds(problem, run),
