@@ -22,6 +22,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data import JointGroup, PointGroup, Recording, SensorChannelGroup, read_recording, write_recording
 from yid_ocp.model.servos_and_springs import MotorKindAndPreset
 from yid_ocp.model.urdf import urdf_path_from_robot_name
+from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.workflow.build import build_system, free_parameter_names
 
 RATE = 125.0
@@ -180,6 +181,8 @@ def test_the_low_pass_lies_above_motion_that_exceeds_the_noise_of_the_encoders(b
     assert proposed(replace(shaken, joints=replace(shaken.joints, position=angles))).problem.path_cutoff == 20.0
     uneven = np.sort(t + 4e-3 * np.random.default_rng(0).uniform(-1, 1, len(t)))
     assert proposed(moved(uneven, moving=True)).problem.path_cutoff == 10.0, "an uneven clock does not show the noise"
+    joints, noise = tuple(f"j{i}" for i in range(80)), np.random.default_rng(0).normal(scale=1e-4, size=(len(t), 80))
+    assert select_path_cutoff([Recording(JointGroup(joints, t, noise))], joints) == 10.0, "one of many is no motion"
 
 
 def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

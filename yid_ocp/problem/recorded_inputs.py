@@ -25,7 +25,8 @@ from yid_ocp.sensors.joints import is_point_group_measured_by_arm
 
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
 _MIN_PATH_CUTOFF, _MAX_CUTOFF_OVER_RATE = 10.0, 0.2  # [Hz], and as a fraction of the sample rate
-_NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion in a frequency band
+_NOISE_ONLY_LEVEL = 1e-3  # p-value of noise alone below which there is motion in a frequency band, over all channels
+_SAMPLES_PER_NOISE_DEGREE = 6.0  # samples that give a robust estimate of noise one degree of freedom, by simulation
 
 
 def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -> float:
@@ -44,9 +45,11 @@ def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -
         for (t, angle), std in zip(channels, sizes, strict=True):
             impulse = std * (t == t[len(t) // 2])[:, None]
             kept, noise = (higher(t, values) - ZeroPhaseLowPassFilter(cutoff)(t, values) for values in (angle, impulse))
-            degrees = 2 * (higher.cutoff - cutoff) * (t[-1] - t[0])
-            p_values.append(scipy.special.chdtrc(degrees, degrees * np.mean(kept**2) / np.sum(noise**2)))
-        if min(p_values) > _NOISE_ONLY_LEVEL:
+            # beside the ends, where filters amplify noise
+            end = min(round(0.5 / (cutoff * median_sample_period(t))), len(t) // 4)
+            degrees = 2 * (higher.cutoff - cutoff) * (t[-1 - end] - t[end]), len(t) / _SAMPLES_PER_NOISE_DEGREE
+            p_values.append(scipy.special.fdtrc(*degrees, np.mean(kept[end : len(t) - end] ** 2) / np.sum(noise**2)))
+        if min(p_values) > _NOISE_ONLY_LEVEL / len(p_values):
             break
         cutoff = higher.cutoff
     return cutoff
