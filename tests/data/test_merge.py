@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.data import JointGroup, PointGroup, Recording
+from yid_ocp.data.checks import recording_quality_issues
 from yid_ocp.data.merge import merge_recordings
 from yid_ocp.errors import DataError
+from yid_ocp.sensors import SensorOptions
 
 
 def wander(t: np.ndarray, seed: int) -> np.ndarray:
@@ -53,6 +55,10 @@ def test_points_that_are_late_on_a_shared_clock_are_said_but_not_shifted(late: f
     assert "later" in note
     offset = float(note.partition("--clock-offset camera=")[2].rstrip(")"))
     assert offset == pytest.approx(-late, abs=0.05)
+    [issue] = recording_quality_issues(merged, lambda group: SensorOptions())
+    assert (issue.cause, issue.severity) == ("clock_offset", "warning")
+    assert issue.setting == f"sensors.points.clock_offset_std: {-offset:g}"
+    assert recording_quality_issues(merged, lambda group: SensorOptions(clock_offset_std=0.1)) == []
     cured = merge_recordings([ROBOT, camera(late)], {"camera": -late})
     assert np.allclose(cured.points[0].t, FRAMES - late)
 

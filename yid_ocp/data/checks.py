@@ -18,6 +18,7 @@ from scipy.integrate import cumulative_trapezoid
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data import channel_checks
 from yid_ocp.data.channel_checks import (
+    LATE_POINTS_WORDS,
     LIMIT_VIOLATION_RATIO_CAP,
     QUALITY_LIMITS,
     Issue,
@@ -115,6 +116,7 @@ def recording_quality_issues(recording: Recording, options: SensorOptionsFunctio
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(
         _common_clock(recording),
+        _late_points_of_merged_files(recording, options),
         _dropped(recording),
         _velocities(recording),
         channel_checks.stuck_channel_issues(recording),
@@ -172,6 +174,16 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
             what = f"begin and end of {group.name} minus those of the joints are {late:+.3g} s and {over:+.3g} s"
             advice = f"shift the times of {group.name} to the joints' clock"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
+
+
+def _late_points_of_merged_files(recording: Recording, options: SensorOptionsFunction) -> Iterator[Issue]:
+    """Find points that were late when files were merged, according to a note, if no offset of their clock is stated."""
+    for what in (note[note.index(LATE_POINTS_WORDS) :] for note in recording.notes if LATE_POINTS_WORDS in note):
+        for group in recording.points:
+            if options(group.name).clock_offset_std is None and group.clock_offset_std is None:
+                advice = "if the object does not lag behind, state the size of the offset, and a fit finds it"
+                setting = f"sensors.{group.name}.clock_offset_std: {what.removeprefix(LATE_POINTS_WORDS).split()[0]}"
+                yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
 
 
 def _dropped(recording: Recording) -> Iterator[Issue]:

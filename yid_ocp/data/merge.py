@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import QUALITY_LIMITS, mean_sample_rate, median_sample_period
+from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, mean_sample_rate, median_sample_period
 from yid_ocp.data.readers.base import joints_on_fastest_clock
 from yid_ocp.data.recording import JointGroup, Recording, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
@@ -109,7 +109,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
             return 0.0, said
         if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
             late = f"{abs(best.lag):.2g} s {'later' if best.lag > 0 else 'earlier'}"
-            said += f"; the points match the angles best {late} ({best.explained:.1%} of the motion): the sensor is "
+            said += f"; {LATE_POINTS_WORDS}{late} ({best.explained:.1%} of the motion): the sensor is "
             said += f"late, the object lags behind, or clocks differ (--clock-offset {other.name}={-best.lag:.2g})"
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:

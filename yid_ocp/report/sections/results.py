@@ -272,7 +272,7 @@ def _overlaid_predictions(findings: ReportData) -> Iterator[tuple[str, Any]]:
             curves.append(TimePlotData(f"{name} [{first.unit}]", lines, first.t, first.measured[:, i]))
             band = 2 * factor * float(np.nanmedian(first.noise_std[:, i]))
             difference = {f"{other} minus {own}": (first.t, factor * apart[:, i])}
-            title = f"difference, two stated standard deviations shaded [{shown}]"
+            title = f"difference, ± 2 stated std shaded [{shown}]"
             curves.append(TimePlotData(title, difference, band_half_height=band, is_low_row=True))
         yield f"{first.channel} in {first.recording}", figures.time_plots_figure(curves, figures.MEASURED_COLOR)
 
