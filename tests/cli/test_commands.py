@@ -25,7 +25,7 @@ SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
     "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation",
         "covariance", "discretisation_notes", "stability",
-    "issues", "torque_offsets", "to_use",
+    "issues", "torque_offsets", "to_use", "unused_efforts",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval"}
 

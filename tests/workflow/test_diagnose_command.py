@@ -24,12 +24,8 @@ from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.diagnose import (
-    _has_unused_efforts,
-    _SingleJsonFileRefitStore,
-    _with_noise_only_stds,
-    run_diagnose,
-)
+from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
+from yid_ocp.workflow.prediction_outputs import has_unused_efforts
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
@@ -264,7 +260,7 @@ def test_no_weak_prior_stays_none_and_encoders_without_noise_need_none(problem_o
 def test_recorded_torques_that_nothing_uses_are_told(problem_of):
     unused = {**STATED, "joints.effort": replace(STATED["joints.effort"], use=False)}
     cases = [("prescribed", unused), ("prescribed", STATED), ("driven", unused)]
-    assert [_has_unused_efforts(problem_of(role, sensors)) for role, sensors in cases] == [True, False, False]
+    assert [has_unused_efforts(problem_of(role, sensors)) for role, sensors in cases] == [True, False, False]
     result = {"summary": "", "verdict": "no_gap", "next_plan": None, "seconds": {}, "which": [], "unused_efforts": True}
     blocks = SUMMARY_BY_RESULT_FORMAT["yid-diagnosis/2"](result | {"gap": {"before": {"rmse": {}, "unit": {}}}})
     assert any("set sensors.joints.effort.use: true" in line for line in summary_terminal_lines(blocks))
@@ -349,8 +345,8 @@ def test_what_is_found_is_told_as_text_that_a_configuration_takes(rubbing, whole
         with (tmp_path / "merged.yaml").open("w") as file:
             reader.dump(merged(reader.load(rubbing), reader.load("\n".join(use["yaml"]))), file)
         known = build_system(load_config(tmp_path / "merged.yaml")).parameters
-        for name, value in (line.split(" ±")[0].split(" = ") for line in use["values"]):
-            assert known[name].value == pytest.approx(float(value), rel=1e-3)
+        for name, value in (line.split(" = ") for line in use["values"]):
+            assert known[name].value == pytest.approx(float(value.split()[0]), rel=1e-3)
     fit = law["laws"][law["warranted"]]["parameters"]
     assert law["friction_parameters"] == [name for name in fit if name != "shoulder.stiffness"]
     first_screen = (tmp_path / "law" / "report.html").read_text("utf-8").partition('id="scene"')[0]

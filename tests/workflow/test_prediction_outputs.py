@@ -24,7 +24,7 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.report.summaries import _noise_words
-from yid_ocp.report.terminal import torque_offset_table_rows
+from yid_ocp.report.terminal import copyable_estimates_blocks, torque_offset_table_rows
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.check import _input_noise
@@ -256,11 +256,11 @@ def test_a_group_without_a_sample_has_no_expected_error():
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
 
 
-def copied(system, values, **estimates):
+def copied(system, values, *uncounted, **estimates):
     """Texts to copy, of estimates given as (value, std, unit, verdict); all parameters have `values`."""
     made = {n: ParameterEstimate(*own[:3], 3.0, 0.0, np.inf, True, own[3]) for n, own in estimates.items()}
     theta = system.parameters.vector(values)
-    return prediction_outputs.estimate_texts_by_format(system, theta, made, ("export", "my runs/a"))
+    return prediction_outputs.estimate_texts_by_format(system, theta, made, ("export", "my runs/a"), *uncounted)
 
 
 def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
@@ -286,14 +286,17 @@ def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_fo
 
 def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     system, lost = build_system(load_config(None)), {"T1.twist": (7.0, 0.5, "N m/rad", "not_identifiable")}
-    told = copied(system, {"T1.bend": 22.0}, **{"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")}, **lost)
-    assert told["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
+    found = {"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")} | lost
+    told, rough = copied(system, {"T1.bend": 22.0}, (), **found), copied(system, {"T1.bend": 22.0}, **found)
+    assert (told["values"], rough["values"]) == (["T1.bend = 22 ± 0.5 N m/rad"], ["T1.bend = 22 N m/rad"])
+    assert (rough["latex"], rough["uncounted_errors"]) == ([r"T1.bend & $22$ & N m/rad \\"], ["of discretisation"])
+    assert "`solve` tells their ±" in next(copyable_estimates_blocks({"to_use": rough}))
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
-    assert (told["export"], told["uncounted_errors"]) == ("yid-ocp export 'my runs/a'", ["of discretisation"])
-    small = copied(system, {}, **{"T1.bend": (2.2e-5, 5e-7, "1", "identifiable")})
+    assert (told["export"], told["uncounted_errors"]) == ("yid-ocp export 'my runs/a'", [])
+    small = copied(system, {}, (), **{"T1.bend": (2.2e-5, 5e-7, "1", "identifiable")})
     assert small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & 1 \\"]
     assert small["values"] == ["T1.bend = 2.2e-05 ± 5e-07"]
     assert copied(system, {}, **lost) == {}

@@ -27,6 +27,7 @@ from yid_ocp.report.terminal import (
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
+    unused_efforts_sentence,
 )
 
 _MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # smallest listed share of the gap, and largest number of listed time windows
@@ -43,10 +44,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     verdict = result["verdict"].replace("_", " ")
     found, _, advice = result["summary"].partition(" Next experiment: ")
     gap, _, cause = found.partition(". ")
-    unused = "Recorded torques are not used: set sensors.joints.effort.use: true to find friction and loads of the arm."
-    told = unused if result.get("unused_efforts") else ""
     planned = f"Next experiment: {advice}" if advice else ""
-    parts = f"Verdict: {verdict}. {gap.removesuffix('.')}.", told, cause, planned
+    parts = f"Verdict: {verdict}. {gap.removesuffix('.')}.", unused_efforts_sentence(result), cause, planned
     yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]

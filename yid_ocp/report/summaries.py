@@ -32,6 +32,7 @@ from yid_ocp.report.terminal import (
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
+    unused_efforts_sentence,
 )
 
 _BASELINE_DESCRIPTIONS = {
@@ -76,7 +77,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = "the values are the best point that was reached; their uncertainty is unknown"
         yield SummaryStatement(said, "verdict")
     else:
-        yield from (SummaryStatement(text, "verdict") for text in _found_and_lost(free))
+        texts = *_found_and_lost(free), unused_efforts_sentence(result)
+        yield from (SummaryStatement(text, "verdict") for text in texts)
         if result["fit"]["explains"]:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
     yield from copyable_estimates_blocks(result)

@@ -124,12 +124,20 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
         yield SummaryStatement("no value counts as found, because a recording has a severe issue", "verdict")
 
 
+def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
+    """Return what recorded torques that a result does not use could tell. Empty if there are none."""
+    key = "sensors.joints.effort.use: true"
+    said = f"Recorded torques are not used: set {key} to find friction (`yid-ocp friction`) and loads of the arm."
+    return said if result.get("unused_efforts") else ""
+
+
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the found values of a result in the formats of other programs, to copy. Nothing if none is found."""
     if use := result.get("to_use"):
         left_out = " and ".join(use["uncounted_errors"])
-        without = f", without the error {left_out}" if left_out else ""
-        yield f"to use these numbers (± is one standard deviation{without}):"
+        stated = f"± is one standard deviation{f', without the error {left_out}' if left_out else ''}"
+        stated = stated if "±" in use["values"][0] else f"`solve` tells their ± with the error {left_out}"
+        yield f"to use these numbers ({stated}):"
         lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
         yield CodeBlock("\n".join(lines))
 

@@ -120,7 +120,7 @@ def run_diagnose(
             "torque_offsets": prediction_outputs.torque_offsets_by_recording(last.problem, x),
             "to_use": _texts_of_final_model(finding, os.path.relpath(folder.final_path)) if is_found else {},
             "not_candidates": effect_kinds_by_missing_signals(recordings),
-            "unused_efforts": _has_unused_efforts(problem),
+            "unused_efforts": prediction_outputs.has_unused_efforts(problem),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
@@ -128,14 +128,6 @@ def run_diagnose(
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
     refits.delete_file()
     return CommandOutcome(folder.path, written, finding)
-
-
-def _has_unused_efforts(problem: EstimationProblem) -> bool:
-    """Check whether torques are recorded, but neither drive the arms nor are compared with predictions."""
-    episode = problem.episodes[0]
-    joints, used = episode.recording.joints, {own.sensor.group_name for own in episode.measurements}
-    recorded = joints is not None and joints.effort is not None
-    return recorded and not problem.system.driven and JOINT_EFFORT_SENSOR_KEY not in used
 
 
 def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:

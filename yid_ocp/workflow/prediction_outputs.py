@@ -23,11 +23,14 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
+from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import Solution
 from yid_ocp.virtual.mjcf import ExpressionEvaluator, system_joint_dynamics_terms
 
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
+
+_DISCRETISATION = "of discretisation"  # the error of finite links and steps, where nothing of it was computed
 
 
 def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
@@ -60,17 +63,26 @@ def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[st
     return found
 
 
+def has_unused_efforts(problem: EstimationProblem) -> bool:
+    """Check whether torques are recorded, but neither drive the arms nor are compared with predictions."""
+    episode = problem.episodes[0]
+    joints, used = episode.recording.joints, {own.sensor.group_name for own in episode.measurements}
+    recorded = joints is not None and joints.effort is not None
+    return recorded and not problem.system.driven and JOINT_EFFORT_SENSOR_KEY not in used
+
+
 def estimate_texts_by_format(
     system: System,
     theta: Array,
     estimates: Mapping[str, ParameterEstimate],
     command: Sequence[str],
-    uncounted_errors: Sequence[str] = ("of discretisation",),
+    uncounted_errors: Sequence[str] = (_DISCRETISATION,),
     model_yaml: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return texts to copy, with those of the `estimates` that are identifiable. Empty without such a parameter.
 
-    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `joints` (number of links and range
+    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±; there is no ± if discretisation as a
+    whole is one, because it may be the largest), `joints` (number of links and range
     of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of
     `latex`, `export` (the `command` to continue with) and `cite`. `theta` (ntheta,) holds all parameters.
     """
@@ -94,10 +106,12 @@ def estimate_texts_by_format(
             shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}
-    rows = [rf"{labels[n]} & ${e.value:.4g} \pm {e.std:.2g}$ & {e.unit} \\" for n, e in found.items()]
+    spread = {n: "" if _DISCRETISATION in uncounted_errors else f" ± {e.std:.2g}" for n, e in found.items()}
+    sizes_in_tex = {n: f"{e.value:.4g}{spread[n]}".replace("±", r"\pm") for n, e in found.items()}
+    rows = [rf"{labels[n]} & ${sizes_in_tex[n]}$ & {e.unit} \\" for n, e in found.items()]
     initial = [f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items()]
     return {
-        "values": [f"{n} = {e.value:.4g} ± {e.std:.2g} {e.unit}".removesuffix(" 1") for n, e in found.items()],
+        "values": [f"{n} = {e.value:.4g}{spread[n]} {e.unit}".removesuffix(" 1") for n, e in found.items()],
         "uncounted_errors": list(uncounted_errors),
         "joints": joints,
         "yaml": [*model_yaml, "parameters:", *initial],

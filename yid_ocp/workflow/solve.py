@@ -56,6 +56,7 @@ def run_solve(
             "discretisation": discretisation_shifts_to_dict(checks.discretisation_shifts, checks.data_std),
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
+            "unused_efforts": prediction_outputs.has_unused_efforts(problem),
             "to_use": prediction_outputs.estimate_texts_by_format(*copied, export, checks.uncounted_errors),
             "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
