@@ -172,9 +172,12 @@ def measured_and_predicted_friction_torques(
         q[:, list(system.actuated_coordinate_indices)] = path + shift
         without = theta.copy()
         without[[system.parameters.index(name) for name in friction_parameters]] = 0.0
-        lacking, given = (_missing_torque(problem, at, q, inputs.torque) for at in (without, theta))
-        speed = (q[2:] - q[:-2]) / (2 * step.time_step)
         nodes = {"state": q, "torque": inputs.torque, "multipliers": np.zeros((len(inputs.torque), 0))}
+        still = np.hstack([q, np.zeros_like(q)]), nodes["multipliers"], inputs.torque, (), False
+        residuals = (step.kernel.step_residuals_and_jacobians(at, *still) for at in (without, theta))
+        # torques (N - 1, n) that the equations lack at the inner nodes
+        lacking, given = ((own.residual[1:, : q.shape[1]] + own.p1[:-1]) / step.time_step for own in residuals)
+        speed = (q[2:] - q[:-2]) / (2 * step.time_step)
         nodes["time_step"] = np.array(step.time_step)
         for name, found in parts.items():
             at = system.mechanism.joint_index(name)
@@ -188,15 +191,6 @@ def measured_and_predicted_friction_torques(
         speed, load, measured, predicted = rows[:, keep]
         clouds.append(_FrictionTorqueCloud(name, speed, load, -measured, -predicted))
     return tuple(clouds)
-
-
-def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: Array) -> Array:
-    """Return the torque (N - 1, n) [N m] that the equations lack at the inner nodes of the motion q (N + 1, n)."""
-    step = problem.step
-    n, none = step.sizes["n"], np.zeros((len(torque), 0))
-    state = np.hstack([q, np.zeros((len(q), n))])
-    found = step.kernel.step_residuals_and_jacobians(theta, state, none, torque, (), False)
-    return np.asarray((found.residual[1:, :n] + found.p1[:-1]) / step.time_step)
 
 
 def problems_with_common_samples(problems: Sequence[EstimationProblem]) -> list[EstimationProblem]:

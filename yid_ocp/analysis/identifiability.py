@@ -306,8 +306,7 @@ class _Sensitivities:
         own = covariance[np.ix_(self.chosen, self.chosen)]
         std = np.sqrt(np.diag(own))
         largest = np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
-        most = uncertainty.MIN_RELATIVE_STD_TAKEN_AS_INFINITE * largest
-        std = np.where(std < most, std, np.nan)
+        std = np.where(std < uncertainty.MIN_RELATIVE_STD_TAKEN_AS_INFINITE * largest, std, np.nan)
         return np.asarray(own / np.outer(std, std))
 
 

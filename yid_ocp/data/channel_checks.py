@@ -336,8 +336,7 @@ class Issue:
     def location_text(self) -> str:
         """Location of the issue as text: recording, group, channel and time."""
         place = "/".join(part for part in (self.recording, self.group, self.channel) if part)
-        span = "" if self.begin is None or self.end is None else f", {self.begin:.4g} to {self.end:.4g} s"
-        return place + span
+        return place if self.begin is None or self.end is None else f"{place}, {self.begin:.4g} to {self.end:.4g} s"
 
 
 _LINES = Path(__file__).with_name("issue_causes.yaml").read_text(encoding="utf-8").splitlines()

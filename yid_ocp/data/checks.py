@@ -115,8 +115,7 @@ def recording_quality_issues(recording: Recording, options: SensorOptionsFunctio
     recording = recording.with_effort_sampling_kind(options("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(
-        _common_clock(recording),
-        _late_points_of_merged_files(recording, options),
+        _common_clock(recording, options),
         _dropped(recording),
         _velocities(recording),
         channel_checks.stuck_channel_issues(recording),
@@ -151,8 +150,8 @@ def _few_samples(recording: Recording) -> Iterator[Issue]:
             yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 
-def _common_clock(recording: Recording) -> Iterator[Issue]:
-    joints = recording.joints
+def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Iterator[Issue]:
+    joints, late_notes = recording.joints, [note for note in recording.notes if LATE_POINTS_WORDS in note]
     if joints is None:
         return
     first, last = joints.t[0], joints.t[-1]
@@ -174,16 +173,11 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
             what = f"begin and end of {group.name} minus those of the joints are {late:+.3g} s and {over:+.3g} s"
             advice = f"shift the times of {group.name} to the joints' clock"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
-
-
-def _late_points_of_merged_files(recording: Recording, options: SensorOptionsFunction) -> Iterator[Issue]:
-    """Find points that were late when files were merged, according to a note, if no offset of their clock is stated."""
-    for what in (note[note.index(LATE_POINTS_WORDS) :] for note in recording.notes if LATE_POINTS_WORDS in note):
-        for group in recording.points:
-            if options(group.name).clock_offset_std is None and group.clock_offset_std is None:
-                advice = "if the object does not lag behind, state the size of the offset, and a fit finds it"
-                setting = f"sensors.{group.name}.clock_offset_std: {what.removeprefix(LATE_POINTS_WORDS).split()[0]}"
-                yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
+        elif late_notes and options(group.name).clock_offset_std is None and group.clock_offset_std is None:
+            lag = late_notes[0].partition(LATE_POINTS_WORDS)[2]
+            advice = "if the object does not lag behind, state the size of the offset, and a fit finds it"
+            known = {"group": group.name, "setting": f"sensors.{group.name}.clock_offset_std: {lag.split()[0]}"}
+            yield Issue("clock_offset", LATE_POINTS_WORDS + lag, "warning", 1.0, advice, "", **known)
 
 
 def _dropped(recording: Recording) -> Iterator[Issue]:

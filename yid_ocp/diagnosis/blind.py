@@ -156,8 +156,7 @@ class CaseGroundTruth:
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
         """Restore the true effects and parameters from a dictionary that `to_dict` returned."""
-        injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
-        return CaseGroundTruth(**{**data, "injected": injected})
+        return CaseGroundTruth(**{**data, "injected": tuple(InjectedEffect(**entry) for entry in data["injected"])})
 
 
 @dataclass(frozen=True)

@@ -250,8 +250,7 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
     residual, jacobian = residual_and_jacobian_with_stated_priors(own, evaluation)
     names = list(own.unknown_names)
     ours = {name for law in laws for name in law.parameters.names}
-    nuisance = [i for i, name in enumerate(names) if name not in ours]
-    basis, _ = np.linalg.qr(jacobian[:, nuisance])
+    basis, _ = np.linalg.qr(jacobian[:, [i for i, name in enumerate(names) if name not in ours]])
     residual = residual - basis @ (basis.T @ residual)
     families = []
     for law in laws:

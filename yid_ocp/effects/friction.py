@@ -140,8 +140,7 @@ class _JointLoadFriction(_JointFriction):
         smoothing_speed = min(self.sign_smoothing_speed, _LOAD_SIGN_SMOOTHING_SPEED)
         friction = self["share"] * size * ca.tanh(state.v[index] / smoothing_speed)
         # it dissipates energy, but is not a dissipative force of the speed alone: its size depends on weight and motor
-        force = base.generalized_force_at_joint(system, self.location, -friction)
-        return EffectStepTerms(generalized_force=force)
+        return EffectStepTerms(generalized_force=base.generalized_force_at_joint(system, self.location, -friction))
 
 
 @EFFECTS.register("joint_presliding")

@@ -268,7 +268,6 @@ def _noise_autocorrelation(low_pass: SmoothingFilter | None, step: float) -> Arr
     half = int(2 * low_pass.passes / (low_pass.cutoff * step)) + 10
     impulse = np.zeros((2 * half + 1, 1))
     impulse[half] = 1.0
-    times = step * np.arange(2 * half + 1, dtype=float)
-    response = low_pass(times, impulse)[:, 0]
+    response = low_pass(step * np.arange(2 * half + 1, dtype=float), impulse)[:, 0]
     full = np.correlate(response, response, "full")[2 * half :]
     return np.asarray(full[:half] / full[0])[:: low_pass.decorrelation_stride_for_step(step)]

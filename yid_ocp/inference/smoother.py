@@ -550,8 +550,7 @@ def gap_locations_from_effects_and_smoother(
     found = []
     for location in dict.fromkeys([*share, *known]):
         first = known.get(location, GapLocation(location, 0.0, False, ()))
-        part = share.get(location, 0.0) / total if total > 0 else 0.0
-        own = replace(first, gap_share=part)
+        own = replace(first, gap_share=share.get(location, 0.0) / total if total > 0 else 0.0)
         if location in closed:
             when = first.time_windows or windows
             own = replace(own, is_observable=True, time_windows=when, indistinguishable_from=())

@@ -290,8 +290,7 @@ def _steps(
     if feedback is not None:
         # the momentum of the measured motion contains half the impulse of an unknown force (of the previous step, taken
         # as that of this step)
-        followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
-        inputs = feedback.gain @ followed
+        inputs = feedback.gain @ np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
     for pair in iterate_step_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
         push, done = pushes[done : done + len(pair[0])], done + len(pair[0])
         by_state = (one[:, :, moving] for one in pair)

@@ -281,8 +281,7 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
     """
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
     factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
-    kept = matrix[np.ix_(at, at)] * np.outer(factor, factor)
-    return {"names": [names[i] for i in at], "matrix": kept.tolist()}
+    return {"names": [names[i] for i in at], "matrix": (matrix[np.ix_(at, at)] * np.outer(factor, factor)).tolist()}
 
 
 def cost_with_stated_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:

@@ -138,8 +138,7 @@ class WhiteningFilter:
                 own[rows] -= np.einsum("ru,ruc->rc", part.by_torque[rows], push[part.step_of_row[rows]])
         # after each step, the noise of the sample that begins then, else zero
         shift, begins = np.zeros_like(part.kalman.decay), np.flatnonzero(part.kalman.decay[:, 0] == 0)
-        fresh = -noise if white is None else white - noise
-        shift[begins, : noise.shape[1]] = fresh[part.first + 1 + begins]
+        shift[begins, : noise.shape[1]] = (-noise if white is None else white - noise)[part.first + 1 + begins]
         return part.kalman.normalized_innovations_and_next_mean(mean, own, shift, known, white is not None)
 
 

@@ -47,12 +47,6 @@ class StepFunctions:
         """All CasADi functions of the step, in the order of the generated C code."""
         return tuple(map(self.function, self._outputs))
 
-    def _expression_text(self) -> str:
-        """Serialized graphs of the functions, which identify a compiled kernel in the cache."""
-        with CASADI_LOCK:
-            together = [output for own in self._outputs.values() for output in own]
-            return str(ca.Function("step", self.equations.arguments, together).serialize())
-
 
 def build_casadi_step_functions(equations: DiscreteEquations) -> StepFunctions:
     """Build the CasADi functions of a step. The kernel forms the Jacobians of the bodies from vectors per joint."""
@@ -224,7 +218,10 @@ def kernel_cache_key_text(functions: StepFunctions, tables: StepSparsityTables) 
     """Return the text that identifies a kernel in the cache: generators, index tables and serialized equations."""
     folder = resources.files("yid_ocp.integrator")
     files = [folder.joinpath(name).read_text(encoding="utf-8") for name in ("codegen.py", "simd.c", "kernel.c")]
-    return "\0".join([*files, *_kernel_tables(functions, tables), functions._expression_text()])
+    with CASADI_LOCK:
+        together = [output for own in functions._outputs.values() for output in own]
+        graphs = str(ca.Function("step", functions.equations.arguments, together).serialize())
+    return "\0".join([*files, *_kernel_tables(functions, tables), graphs])
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:

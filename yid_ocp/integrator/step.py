@@ -46,8 +46,7 @@ class Step(ReprMixin):
 
     def _summary(self) -> ReprTexts:
         how = "compiled" if self.is_compiled else "interpreted"
-        of_what = self.system._summary().one_line
-        return ReprTexts(f"{self.time_step:g} s, {self.force_split}, {how}, of {of_what}")
+        return ReprTexts(f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().one_line}")
 
     @property
     def system(self) -> System:

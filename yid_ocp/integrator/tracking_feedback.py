@@ -42,8 +42,7 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     if np.any(values < 0):
         what = f"a tracking gain is negative: {values.min():g} N m/rad"
         raise ModelError(what, where="problem.arm_proportional_gains", allowed="0 or more [N m/rad]")
-    steps = len(reference) - 1
-    gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
+    gain = np.broadcast_to(np.diag(values), (len(reference) - 1, nu, nu)).copy()
     return TrackingFeedback(np.array(step.system.actuated_coordinate_indices, np.int32), gain, reference[:-1])
 
 
@@ -172,8 +171,7 @@ class EffectMomentumCalculator:
             q = ca.SX(ca.DM.zeros(system.n_coordinates))
             q[driven] = arm
             whole.append(q)
-        seen = _columns(e.p1[driven], ca.vertcat(e.z0, e.z1))
-        self._kept = sorted({row % e.z0.numel() for row in seen})
+        self._kept = sorted({row % e.z0.numel() for row in _columns(e.p1[driven], ca.vertcat(e.z0, e.z1))})
         z0, z1 = (ca.SX(ca.DM.zeros(e.z0.numel())) for _ in range(2))
         if self._kept:
             z0[self._kept], z1[self._kept] = (x[self._kept] for x in (e.z0, e.z1))

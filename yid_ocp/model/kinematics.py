@@ -218,8 +218,7 @@ def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, c
 
 def _rotated_tensor(body: Inertia, rotation: ca.SX) -> ca.SX:
     tensor = ca.densify(body.inertia_about_com)
-    off = [(0, 1), (0, 2), (1, 2)]
-    diagonal = all(tensor[i, j].is_zero() and tensor[j, i].is_zero() for i, j in off)
+    diagonal = all(tensor[i, j].is_zero() and tensor[j, i].is_zero() for i, j in [(0, 1), (0, 2), (1, 2)])
     if diagonal and ca.is_equal(tensor[0, 0], tensor[1, 1], 8):
         axis = rotation[:, 2]
         return tensor[0, 0] * ca.SX.eye(3) + (tensor[2, 2] - tensor[0, 0]) * (axis @ axis.T)

@@ -216,8 +216,7 @@ def _because(sizes: TubeDimensionEstimates, matters: bool) -> str:
 
 def _hint(sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], otherwise: str) -> str:
     """Advice in an error message: on wrong dimensions and foreign objects first, then the advice `otherwise`."""
-    notes = [*sizes.messages, *(thing.text for thing in things)]
-    return "; ".join([*notes[:_MAX_NOTES], otherwise])
+    return "; ".join([*[*sizes.messages, *(thing.text for thing in things)][:_MAX_NOTES], otherwise])
 
 
 _TOUCHING_DISTANCE = 1e-3  # [m]

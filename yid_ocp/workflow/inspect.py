@@ -197,13 +197,9 @@ def _dependence(
 
 
 def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]:
-    marked = pattern.marked_mask
-    return {
-        "shape": list(pattern.nonzero_mask.shape),
-        "nonzeros": pattern.n_nonzeros,
-        "at_point": None if marked is None else int(np.count_nonzero(pattern.nonzero_mask & marked)),
-        "title": pattern.title,
-    }
+    marked, nonzero = pattern.marked_mask, pattern.nonzero_mask
+    count = None if marked is None else int(np.count_nonzero(nonzero & marked))
+    return {"shape": list(nonzero.shape), "nonzeros": pattern.n_nonzeros, "at_point": count, "title": pattern.title}
 
 
 def _entry_result(entry: EquationOrDerivativeFormula, symbols: NamedStepEquations, at: Array) -> dict[str, Any]:

@@ -30,8 +30,6 @@ from yid_ocp.virtual.mjcf import ExpressionEvaluator, system_joint_dynamics_term
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 
-_DISCRETISATION = "of discretisation"  # the error of finite links and steps, where nothing of it was computed
-
 
 def torque_offsets_by_recording(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
     """Return torque offsets by recording (also held-out ones) and joint: `value`, `std`, `prior_std` [N m].
@@ -76,13 +74,13 @@ def estimate_texts_by_format(
     theta: Array,
     estimates: Mapping[str, ParameterEstimate],
     command: Sequence[str],
-    uncounted_errors: Sequence[str] = (_DISCRETISATION,),
+    uncounted_errors: Sequence[str] | None = None,
     model_yaml: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return texts to copy, with those of the `estimates` that are identifiable. Empty without such a parameter.
 
-    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±; there is no ± if discretisation as a
-    whole is one, because it may be the largest), `joints` (number of links and range
+    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±; None: there is no ±, because the
+    error of discretisation, which may be the largest, is unknown), `joints` (number of links and range
     of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of
     `latex`, `export` (the `command` to continue with) and `cite`. `theta` (ntheta,) holds all parameters.
     """
@@ -106,13 +104,12 @@ def estimate_texts_by_format(
             shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}
-    spread = {n: "" if _DISCRETISATION in uncounted_errors else f" ± {e.std:.2g}" for n, e in found.items()}
-    sizes_in_tex = {n: f"{e.value:.4g}{spread[n]}".replace("±", r"\pm") for n, e in found.items()}
-    rows = [rf"{labels[n]} & ${sizes_in_tex[n]}$ & {e.unit} \\" for n, e in found.items()]
+    told = {n: f"{e.value:.4g}" + ("" if uncounted_errors is None else f" ± {e.std:.2g}") for n, e in found.items()}
+    rows = [rf"{labels[n]} & ${told[n]}$ & {e.unit} \\".replace("±", r"\pm") for n, e in found.items()]
     initial = [f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items()]
     return {
-        "values": [f"{n} = {e.value:.4g}{spread[n]} {e.unit}".removesuffix(" 1") for n, e in found.items()],
-        "uncounted_errors": list(uncounted_errors),
+        "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in found.items()],
+        "uncounted_errors": ["of discretisation"] if uncounted_errors is None else list(uncounted_errors),
         "joints": joints,
         "yaml": [*model_yaml, "parameters:", *initial],
         "mjcf": lines,
