@@ -349,8 +349,7 @@ def test_the_tracking_filter_is_part_of_the_loop():
 
 def test_growth_is_that_of_the_worst_stretch():
     """Ten steps of ten percent, five that calm it down, three of fifty percent."""
-    sizes = [1.1] * 10 + [0.1] * 5 + [1.5] * 3
-    found = growth(*made([diagonal(-size, 0, 0, 0) for size in sizes]))
+    found = growth(*made([diagonal(-size, 0, 0, 0) for size in [1.1] * 10 + [0.1] * 5 + [1.5] * 3]))
     assert found.growth_decades == pytest.approx(max(10 * np.log10(1.1), 3 * np.log10(1.5)))
     assert found.max_step_factor == pytest.approx(1.5)
     assert found.max_growth_time == pytest.approx(15 * H)

@@ -247,8 +247,7 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     made, half = informed(swung(duration=0.4))
     assert made.problem.episodes[0].grid.steps == 20
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
-    problem = swung()
-    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(problem, np.array([np.nan, 0.1])))
+    builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(swung(), np.array([np.nan, 0.1])))
     found = builder.position_sensitivities_of_variant(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 

@@ -486,8 +486,7 @@ def test_a_guess_of_a_cable_covers_the_samples_that_the_model_predicts():
     episode = SimpleNamespace(recording=run, grid=SimpleNamespace(start_time=0.5, node_times=np.array([0.5, 1.0])))
     sensor = SimpleNamespace(naive_prediction="stays", point_names=names, group_name="points")
     guess = _baselines(episode, SimpleNamespace(sensor=sensor, value=np.zeros((51, 6))), CABLE)["stays"]
-    start = run.points[0].position[1, [4, 11]].ravel()
-    np.testing.assert_array_equal(guess, np.tile(start, (51, 1)))
+    np.testing.assert_array_equal(guess, np.tile(run.points[0].position[1, [4, 11]].ravel(), (51, 1)))
 
 
 POSE = np.eye(4)

@@ -162,8 +162,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
 @pytest.mark.parametrize("case", CSV_ERRORS)
 def test_csv_errors(case: str, tmp_path: Path) -> None:
     text, options, message, hint = CSV_ERRORS[case]
-    path = table(tmp_path, text)
-    error = refused(path, message.replace("(", r"\("), **options)
+    error = refused(table(tmp_path, text), message.replace("(", r"\("), **options)
     assert "run" in error.where
     assert hint in error.hint
 

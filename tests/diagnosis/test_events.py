@@ -137,8 +137,7 @@ def test_nothing_happens_in_a_clean_run(twin, seed):
 
 
 def test_a_snag_is_an_event_of_its_joint(twin):
-    snag = Push("elbow", 2.0, 2.3, stiffness=30.0)
-    found = twin.events(twin.recording(DisturbanceTerms(snag))).disturbances
+    found = twin.events(twin.recording(DisturbanceTerms(Push("elbow", 2.0, 2.3, stiffness=30.0)))).disturbances
     assert found
     assert {event.location for event in found} == {"elbow"}
     assert all(event.start_time > 1.8 and event.end_time < 2.5 for event in found)

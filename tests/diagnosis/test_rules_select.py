@@ -483,8 +483,7 @@ EACH_LEFT_OUT += [("b@x and c@x without c@x", ["b"], 2.0), (["b"], ["a"], 1.0)]
 
 
 def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
-    losses = GROWING | {"bc": (1.4, 1.6), "b": (4.0, 4.2)}
-    rounds = Rounds(monkeypatch, losses)
+    rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "b": (4.0, 4.2)})
     _, chosen, added = rounds.compose()
     assert chosen == ["b", "c"]
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2]
@@ -523,8 +522,7 @@ def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
 
 def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
     # a looks best alone and b beside it; beside b, c does better than a
-    losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (1.2, 1.3)}
-    rounds = Rounds(monkeypatch, losses)
+    rounds = Rounds(monkeypatch, GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (1.2, 1.3)})
     _, chosen, added = rounds.compose(max_effects=2)
     assert chosen == ["b", "c"]
     assert added[-1].refitted_model.held_out_loss.chi2_per_sample == pytest.approx(1.25)

@@ -384,8 +384,7 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
 
 def test_the_smoother_starts_at_rest_and_counts_priors_once(step):
     """Rest under constant unknowns stays rest; a prior of a parameter is an observation beside all recordings."""
-    files = [recorded(step, seed) for seed in (1, 2)]
-    plain = problem_with_sensor_noise_only(problem_of(step, files))
+    plain = problem_with_sensor_noise_only(problem_of(step, [recorded(step, seed) for seed in (1, 2)]))
     x = 1.1 * plain.initial_unknowns
     given = plain.with_options(replace(plain.options, prior_stds={"elbow.stiffness": 0.5}))
     bare, models = (residual_models_with_smoother_unknowns(own, x, own.evaluate(x)) for own in (plain, given))

@@ -135,8 +135,7 @@ def test_what_acts_follows_the_recorded_effort_of_a_prescribed_joint(time_consta
     joint = task.episodes[0].measurements[at].sensor.effort_joints.index("left_a")
     z, c = (found.predicted_outputs[at][:, joint] for found in (acting, recorded))
     follower, other = (z, c) if time_constant > 0 else (c, z)
-    rate = np.gradient(follower, H)
-    error = 0.02 * rate - (other - follower)
+    error = 0.02 * np.gradient(follower, H) - (other - follower)
     # the ramp of the motion ends in a step of its acceleration, which no difference of rates resolves
     assert np.median(np.abs(error)) < 0.05 * np.median(np.abs(other - follower))
     others = [k for k in range(recorded.predicted_outputs[at].shape[1]) if k != joint]
@@ -218,8 +217,7 @@ def somewhere(effect) -> dict[str, float]:
     """Values well inside the expected ranges, away from neutral."""
     values = {}
     for i, (name, (low, high)) in enumerate(effect.prior_ranges.items()):
-        share = (0.3, 0.65, 0.8)[i % 3]
-        values[name] = low + share * (high - low)
+        values[name] = low + (0.3, 0.65, 0.8)[i % 3] * (high - low)
     return values
 
 

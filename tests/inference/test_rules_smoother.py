@@ -425,15 +425,13 @@ def test_a_sensor_that_reads_wrong_is_told_from_a_push(driven):
     group = recording.points[0]
     moved = group.position.copy()
     moved[80:130, 1] += [0.0, 0.02, 0.0]
-    wrong = replace(recording, points=(replace(group, position=moved),))
-    found = said_of(problem_of(driven, wrong))
+    found = said_of(problem_of(driven, replace(recording, points=(replace(group, position=moved),))))
     assert found.plant_or_sensor_origin == "sensor"
     assert gap_locations_by_smoother_evidence(found)[0].location == "points"
 
 
 def test_efforts_of_prescribed_joints_say_which(bench):
-    recording = bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, 1, duration=2.0)
-    found = said_of(bench.problem([recording]))
+    found = said_of(bench.problem([bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, 1, duration=2.0)]))
     places = gap_locations_by_smoother_evidence(found)
     assert places[0].location == "elbow"
     assert places[0].gap_share > 0.8

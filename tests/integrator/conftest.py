@@ -265,8 +265,7 @@ def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
     for name, value in {"slide": 0.1, "spin": 0.4, "hinge": -0.5, "extend": 0.15, "swing": 0.3, "nod": 0.7}.items():
         q[robot.joint_index(name)] = value
     holder, held = tip(robot, "tool", q), tip(robot, "nose", q)
-    offset = np.linalg.solve(holder, held)[:3, 3]
-    grasp = Grasp("loop", "tool", "nose", holder_offset=ca.SX(ca.DM(offset)))
+    grasp = Grasp("loop", "tool", "nose", holder_offset=ca.SX(ca.DM(np.linalg.solve(holder, held)[:3, 3])))
     driven, prescribed = ["spin", "extend"], ["swing"]
     system = System.build(robot, grasps=[grasp], driven=driven, prescribed=prescribed, damping=0.3, effects=effects)
     return system, q

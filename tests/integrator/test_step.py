@@ -88,8 +88,7 @@ def test_a_maxwell_branch_relaxes_with_its_time_constant(parts, hinge, roll):
         rollout = roll(step, theta, q, np.zeros(3), count)
         assert rollout.status.is_converged, rollout.status.message
         z = rollout.state[:, -1]
-        time = np.arange(count + 1) * step.time_step
-        expected = angle * (1 - np.exp(-time / tau))
+        expected = angle * (1 - np.exp(-np.arange(count + 1) * step.time_step / tau))
         errors.append(np.max(np.abs(z - expected)))
         assert rollout.status.internal_coordinates == pytest.approx([z[-1]])
         # torque on the held joint: the spring beside, and what is left of the branch's
