@@ -175,9 +175,9 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
         elif late_notes and options(group.name).clock_offset_std is None and group.clock_offset_std is None:
             lag = late_notes[0].partition(LATE_POINTS_WORDS)[2]
-            advice = "if the object does not lag behind, state the size of the offset, and a fit finds it"
-            known = {"group": group.name, "setting": f"sensors.{group.name}.clock_offset_std: {lag.split()[0]}"}
-            yield Issue("clock_offset", LATE_POINTS_WORDS + lag, "warning", 1.0, advice, "", **known)
+            setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0]}"
+            what, advice = LATE_POINTS_WORDS + lag, f"if the object does not lag behind, set {setting}: a fit finds it"
+            yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
 
 
 def _dropped(recording: Recording) -> Iterator[Issue]:
