@@ -7,6 +7,7 @@ import gc
 import importlib.util
 import json
 import os
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -103,6 +104,14 @@ def _unchanged_files_are_tried_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recording_hdf5, "check_readable_in_child_process", once)
         yield
+
+
+@pytest.fixture(scope="session")
+def c_compiler() -> str:
+    """Path of the C compiler that the package takes."""
+    wanted = os.environ.get("CC")
+    path = next(filter(None, map(shutil.which, [wanted] if wanted else ["cc", "gcc", "clang"])), None)
+    return path or pytest.skip("this machine has no C compiler")
 
 
 @pytest.fixture

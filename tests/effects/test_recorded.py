@@ -13,7 +13,6 @@ import pytest
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError, ModelError, SolverError
-from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
@@ -284,7 +283,7 @@ def test_readings_have_exact_slopes(which, prescribed, all_effects, sensors) -> 
         assert np.allclose(exact[:, column], (above - below).ravel() / 2e-6, rtol=1e-6, atol=1e-8), name
 
 
-@pytest.mark.skipif(_compiler_path() is None, reason="no C compiler")
+@pytest.mark.usefixtures("c_compiler")
 def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
     case = cases("driven", "away")
     bench = case.bench

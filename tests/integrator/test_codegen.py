@@ -5,6 +5,8 @@ import math
 import shutil
 from dataclasses import replace
 from importlib import resources
+from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -15,7 +17,7 @@ from yid_ocp.integrator.codegen import _simd_c_source
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
-pytestmark = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
+pytestmark = pytest.mark.usefixtures("c_compiler")
 
 # Newton stops at 1e-14 in these cases; the rest is rounding of sums in another order
 TOLERANCE = 1e-9
@@ -156,7 +158,13 @@ def everything():
     return ca.Function("everything", [x], [ca.vertcat(*outputs)])
 
 
-MACHINES = {"this": compiler._NATIVE_FLAGS, "avx2": ("-mavx2", "-mfma"), "any": ()}
+MACHINES = {"this": "-march=native", "avx2": "-mavx2 -mfma", "any": ""}
+# a compiler that makes code for such a machine, whatever flags it is called with
+COMPILER = """#!/bin/sh
+[ "$1" = --version ] && echo "{flags}"
+for given; do shift; [ "$given" = -march=native ] || set -- "$@" "$given"; done
+exec {program} "$@" {flags}
+"""
 
 
 def arithmetic_source(function, batched=True):
@@ -186,17 +194,19 @@ def assert_those_of_casadi(library, function):
 
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("program", ["cc", "clang"])
-def test_arithmetic_of_a_batch_is_that_of_one(monkeypatch, machine, program):
-    path = compiler._compiler_path() if program == "cc" else shutil.which(program)
+def test_arithmetic_of_a_batch_is_that_of_one(monkeypatch, tmp_path, c_compiler, machine, program):
+    path, processor = c_compiler if program == "cc" else shutil.which(program), Path("/proc/cpuinfo")
     if path is None:
         pytest.skip(f"there is no {program}")
-    if machine == "avx2" and "avx2" not in compiler._machine():
+    features = processor.read_text() if processor.is_file() else ""
+    if machine == "avx2" and "avx2" not in features:
         pytest.skip("this machine has no AVX2")
-    monkeypatch.setattr(compiler, "_compiler_path", lambda: path)
-    monkeypatch.setattr(compiler, "_NATIVE_FLAGS", MACHINES[machine])
+    (tmp_path / "cc").write_text(COMPILER.format(program=path, flags=MACHINES[machine]))
+    (tmp_path / "cc").chmod(0o755)
+    monkeypatch.setenv("CC", str(tmp_path / "cc"))
     function = everything()
     library = compiler.compile_and_load_library(arithmetic_source(function))
-    assert library.yid_simd_width() == (8 if machine == "this" and "avx512f" in compiler._machine() else 4)
+    assert library.yid_simd_width() == (8 if machine == "this" and "avx512f" in features else 4)
     assert_those_of_casadi(library, function)
 
 
@@ -231,7 +241,8 @@ def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, n
 
 def test_an_operation_without_a_form_is_refused():
     x = ca.SX.sym("x")
-    assert _simd_c_source([ca.Function("odd", [x], [ca.erfinv(x)])]) is None
+    functions = SimpleNamespace(all_functions=[ca.Function("odd", [x], [ca.erfinv(x)])])
+    assert codegen.kernel_c_source(functions, None, batched=True) is None
 
 
 def test_elimination_fills_no_more_than_the_tree(single_step):

@@ -20,7 +20,7 @@ from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 
-needs_compiler = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
+needs_compiler = pytest.mark.usefixtures("c_compiler")
 
 
 @pytest.fixture
@@ -141,9 +141,7 @@ GIVEN = ("state", "multipliers", "effort", "state_sensitivity", "multipliers_sen
 
 @pytest.fixture(params=[True, False], ids=["compiled", "interpreted"])
 def use_compiler(request):
-    if request.param and compiler._compiler_path() is None:
-        pytest.skip("this machine has no C compiler")
-    return request.param
+    return request.param and bool(request.getfixturevalue("c_compiler"))
 
 
 def at_once(function, items):

@@ -56,9 +56,8 @@ _NOT_LOADED = "compiled code cannot be loaded (%s); continuing without it"
 
 
 @functools.cache
-def _compiler_path() -> str | None:
+def _compiler_path(wanted: str | None) -> str | None:
     """Path of the C compiler, or None and one log message. The environment variable CC names it, or is `none`."""
-    wanted = os.environ.get("CC")
     names = () if wanted == "none" else (wanted,) if wanted else ("cc", "gcc", "clang")
     path = next((found for name in names if (found := shutil.which(name))), None)
     if path is None and wanted not in (None, "", "none"):
@@ -125,14 +124,13 @@ def _version(path: str) -> str:
 
 
 @functools.cache
-def _machine() -> str:
+def _machine(compiler: str) -> str:
     processor = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
         lines = set(info.read_text(errors="replace").splitlines())
         processor += "".join(sorted(line for line in lines if line.startswith(("model name", "flags", "Features"))))
-    version = _version(_compiler_path() or "none")
-    return f"{version}|{platform.system()}|{processor}"
+    return f"{_version(compiler)}|{platform.system()}|{processor}"
 
 
 def compile_and_load_library(
@@ -171,11 +169,11 @@ def compile_casadi_function(function: ca.Function) -> ca.Function:
 
 def _library_file(source: str, level: str, make: Callable[[], str | None] | None = None) -> Path | None:
     """Path of the library in the cache, compiled if it is missing. None if no compiler works."""
-    path = _compiler_path()
+    path = _compiler_path(os.environ.get("CC"))
     if path is None or path in _HUNG_COMPILERS:
         return None
     flags = (*_COMMON_FLAGS, *_GCC_FLAGS) if "Free Software Foundation" in _version(path) else _COMMON_FLAGS
-    told = [source, level, *flags, *_NATIVE_FLAGS, _machine(), ca.CasadiMeta.version()]
+    told = [source, level, *flags, *_NATIVE_FLAGS, _machine(path), ca.CasadiMeta.version()]
     folder, key = private_cache_folder(), hashlib.sha256("\0".join(told).encode()).hexdigest()[:32]
     if (kept := _kept(folder, key)) is not None:
         return kept
