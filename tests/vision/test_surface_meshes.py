@@ -1,4 +1,5 @@
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,18 +10,39 @@ from yid_ocp.model.mechanism import homogeneous_transform
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import surface_meshes
-from yid_ocp.vision.surface_meshes import (
-    ArticulatedSurfaces,
-    TriangleMesh,
-    _tube_meshes_by_joint,
-    load_robot_meshes_by_joint,
-)
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, TriangleMesh, load_robot_meshes_by_joint
 
 SHAPE = (480, 640)
 
 
-def wall(depth):
-    return np.full(SHAPE, depth), np.ones(SHAPE)
+def frames(system, until=1.0, values=None, **camera):
+    """What a virtual camera takes of an object that stays as it is."""
+    scene, still = vision.SceneDescription(system, None, values), np.zeros((2, system.n_coordinates))
+    return vision.render_virtual_frames(scene, [0, until], still, vision.VirtualCameraSetup(np.eye(4), **camera))
+
+
+@pytest.fixture
+def image(alone, monkeypatch):
+    """image(camera, depth and cosine everywhere): the depths that it measures, NaN where none."""
+
+    def taken(camera, depth, cosine=1.0):
+        scene = np.broadcast_to(depth, SHAPE), np.broadcast_to(cosine, SHAPE), None
+        monkeypatch.setattr(ArticulatedSurfaces, "render_depth_incidence_and_part", lambda *_: scene)
+        points = frames(alone, sensor_model=camera).sequence.load_cloud(0)
+        lens, seen = camera.intrinsics, np.full(SHAPE, np.nan)
+        column, row = np.rint(points[:, :2] / points[:, 2:] * [lens.fx, lens.fy] + [lens.cx, lens.cy]).astype(int).T
+        seen[row, column] = points[:, 2]
+        return seen
+
+    return taken
+
+
+def tubes(system, values=None):
+    """Meshes of the object's tubes by joint, as a virtual camera has them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surface_meshes, "ArticulatedSurfaces", made := Mock())
+        frames(system, values=values)
+    return made.call_args.args[1]
 
 
 def inner(image):
@@ -28,36 +50,36 @@ def inner(image):
 
 
 @pytest.mark.parametrize("distance", [1.0, 2.0, 3.0])
-def test_noise_grows_with_the_square_of_distance(distance):
+def test_noise_grows_with_the_square_of_distance(image, distance):
     camera = vision.DepthCameraModel()
-    seen = inner(camera._simulate_depth_image(*wall(distance), np.random.default_rng(0)))
+    seen = inner(image(camera, distance))
     disparity_std = np.hypot(camera.disparity_std, camera.disparity_step / np.sqrt(12.0))
     expected = distance**2 / (camera.intrinsics.fx * camera.baseline) * disparity_std
     assert np.nanstd(seen) == pytest.approx(expected, rel=0.15)
     assert abs(np.nanmean(seen) - distance) < 0.002 * distance
 
 
-def test_the_figures_at_two_metres():
+def test_the_figures_at_two_metres(image):
     cameras = replace(vision.DepthCameraModel(), disparity_step=0.0), vision.DepthCameraModel()
-    fine, stepped = (inner(own._simulate_depth_image(*wall(2.0), np.random.default_rng(0))) for own in cameras)
+    fine, stepped = (inner(image(own, 2.0)) for own in cameras)
     assert np.nanstd(fine) == pytest.approx(0.0058, rel=0.05)
     steps = np.unique(stepped)
     assert np.diff(steps[np.isfinite(steps)]).mean() == pytest.approx(0.0115, rel=0.1)
 
 
-def test_what_is_out_of_range_or_seen_at_a_grazing_angle_is_lost():
-    camera, rng = vision.DepthCameraModel(), np.random.default_rng(0)
-    assert np.isnan(camera._simulate_depth_image(*wall(0.5), rng)).all()
-    assert np.isnan(camera._simulate_depth_image(*wall(np.inf), rng)).all()
-    assert np.isnan(camera._simulate_depth_image(np.full(SHAPE, 2.0), np.full(SHAPE, 0.05), rng)).all()
-    assert np.isfinite(inner(camera._simulate_depth_image(*wall(2.0), rng))).mean() > 0.97
+def test_what_is_out_of_range_or_seen_at_a_grazing_angle_is_lost(image):
+    camera = vision.DepthCameraModel()
+    assert np.isnan(image(camera, 0.5)).all()
+    assert np.isnan(image(camera, np.inf)).all()
+    assert np.isnan(image(camera, 2.0, 0.05)).all()
+    assert np.isfinite(inner(image(camera, 2.0))).mean() > 0.97
 
 
-def test_edges_have_holes_and_a_shadow_on_one_side():
-    depth, cosine = wall(3.0)
+def test_edges_have_holes_and_a_shadow_on_one_side(image):
+    depth = np.full(SHAPE, 3.0)
     depth[:, 300:340] = 1.5
     camera = replace(vision.DepthCameraModel(), loss_probability=0.0)
-    lost = np.isnan(camera._simulate_depth_image(depth, cosine, np.random.default_rng(1))).mean(axis=0)
+    lost = np.isnan(image(camera, depth)).mean(axis=0)
     shift = round(camera.intrinsics.fx * camera.baseline * (1 / 1.5 - 1 / 3.0))
     assert (lost[342 : 338 + shift] == 1).all(), "the projector's shadow"
     assert lost[345 + shift] == 0
@@ -66,20 +88,19 @@ def test_edges_have_holes_and_a_shadow_on_one_side():
     assert lost[320] == 0
 
 
-def test_outliers_are_as_many_as_asked_for():
+def test_outliers_are_as_many_as_asked_for(image):
     camera = replace(vision.DepthCameraModel(), outlier_probability=0.2)
-    seen = inner(camera._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
+    seen = inner(image(camera, 2.0))
     assert (np.abs(seen - 2.0) > 0.04).mean() == pytest.approx(0.2 * 0.9, abs=0.02)
 
 
-def test_frame_timing():
-    rng = np.random.default_rng(0)
-    when = vision.VirtualCameraTiming(10.0, dropped_frame_fraction=1 / 3, latency=0.05, latency_std=0.002)
-    taken, stamps = when._sample_times_and_stamps(0.0, 300.0, rng)
-    assert len(taken) == pytest.approx(2000, rel=0.05)
-    assert np.std(stamps - taken - 0.05) == pytest.approx(0.002, rel=0.1)
+def test_frame_timing(alone):
+    timing = vision.VirtualCameraTiming(10.0, dropped_frame_fraction=1 / 3, latency=0.05, latency_std=0.002)
+    made = frames(alone, 300.0, timing=timing)
+    assert len(made.capture_times) == pytest.approx(2000, rel=0.05)
+    assert np.std(made.sequence.stamps - made.capture_times - 0.05) == pytest.approx(0.002, rel=0.1)
     with pytest.raises(ConfigError, match="rate"):
-        vision.VirtualCameraTiming(mean_rate=0.0)._sample_times_and_stamps(0.0, 1.0, rng)
+        frames(alone, timing=replace(timing, mean_rate=0.0))
 
 
 def test_virtual_frames_are_the_same_every_time(system, run):
@@ -94,8 +115,8 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert np.array_equal(first, one.sequence.load_cloud(1))
     assert not np.array_equal(one.capture_times[:3], two.capture_times[:3])
     # the object's surface is where the points are
-    tubes = ArticulatedSurfaces(system.mechanism_with_values(), _tube_meshes_by_joint(system))
-    away, _, _ = tubes.distance_to_moving_surface(
+    surfaces = ArticulatedSurfaces(system.mechanism_with_values(), tubes(system))
+    away, _, _ = surfaces.distance_to_moving_surface(
         one.sequence.load_world_cloud(1), one.true_configuration_at(one.capture_times[1]), 0.2
     )
     assert np.median(away) < 0.006
@@ -105,9 +126,13 @@ def test_virtual_frames_are_the_same_every_time(system, run):
 
 
 @pytest.fixture(scope="module")
-def ball(urdf_folder):
+def tree(urdf_folder):
+    return read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
+
+
+@pytest.fixture(scope="module")
+def ball(tree):
     """A ball of 0.1 m on the second joint's frame of a double pendulum, and a box in the world."""
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
     box = TriangleMesh.box([1.0, 1.0, 1.0]).transformed(homogeneous_transform(np.eye(3), [0.0, 5.0, 0.0]))
     return ArticulatedSurfaces(tree, {1: TriangleMesh.sphere(0.1), -1: box})
 
@@ -172,35 +197,38 @@ def test_baxters_meshes_are_found_and_move(system):
 
 
 def test_tubes_have_their_lengths_and_radii(system):
-    meshes = _tube_meshes_by_joint(system)
+    meshes = tubes(system)
     link = meshes[system.mechanism.joint_index("T3_3_z")].vertices
     assert link[:, 2].max() == pytest.approx(0.737 / 4)
     assert np.abs(link[:, :2]).max() == pytest.approx(0.019)
     assert len(meshes) == 12
-    thin = _tube_meshes_by_joint(system, {"T3.radius": 0.01})[system.mechanism.joint_index("T3_3_z")].vertices
+    thin = tubes(system, {"T3.radius": 0.01})[system.mechanism.joint_index("T3_3_z")].vertices
     assert np.abs(thin[:, :2]).max() == pytest.approx(0.01)
 
 
-def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
+def test_what_cannot_be_seen_is_said(tmp_path, tree):
     with pytest.raises(DataError, match="no object"):
-        _tube_meshes_by_joint(System.build(tree))
+        tubes(System.build(tree))
     with pytest.raises(ModelError, match="no URDF file"):
         load_robot_meshes_by_joint(tmp_path / "none.urdf", tree)
     bare = tmp_path / "bare.urdf"
     bare.write_text('<robot name="bare"><link name="base"/></robot>')
     with pytest.raises(ModelError, match="no visual meshes"):
         load_robot_meshes_by_joint(bare, tree)
-    with pytest.raises(ModelError, match="does not exist"):
-        surface_meshes._resolve_mesh_path("package://nobody/mesh.dae", bare)
 
 
-def test_names_of_mesh_files(tmp_path):
-    package = tmp_path / "share" / "arm"
-    (package / "urdf").mkdir(parents=True)
-    (package / "mesh.stl").write_text("")
-    urdf = package / "urdf" / "arm.urdf"
-    for name in ("package://arm/mesh.stl", "../mesh.stl", f"file://{package}/mesh.stl"):
-        assert surface_meshes._resolve_mesh_path(name, urdf).resolve() == package / "mesh.stl"
-    renamed = package.rename(tmp_path / "share" / "arm_1.2")  # a package's folder need not bear its name
-    assert surface_meshes._resolve_mesh_path("package://arm/mesh.stl", renamed / "urdf" / "arm.urdf").is_file()
+def test_names_of_mesh_files(tmp_path, tree):
+    """A package's folder need not bear its name."""
+    urdf, mesh = tmp_path / "arm" / "urdf" / "arm.urdf", tmp_path / "arm" / "mesh.obj"
+    urdf.parent.mkdir(parents=True)
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+
+    def corners(name):
+        shape = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+        urdf.write_text(f'<robot name="arm"><link name="ceiling">{shape}</link></robot>')
+        return load_robot_meshes_by_joint(urdf, tree)[-1].vertices.sum(axis=0).tolist()
+
+    for name in ("package://arm/mesh.obj", "package://arm_1.2/mesh.obj", "../mesh.obj", f"file://{mesh}"):
+        assert corners(name) == [1, 1, 0]
+    with pytest.raises(ModelError, match=r"package://nobody/none.obj.*does not exist"):
+        corners("package://nobody/none.obj")
