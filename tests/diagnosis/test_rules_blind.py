@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from factories import amplitude, cases, effect, shape, signature
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import blind as module
 from yid_ocp.diagnosis.blind import (
-    _OUT_OF_LIBRARY_SIZES,
     MAX_DRAWS_PER_CASE,
     BlindCaseGenerator,
     CaseGroundTruth,
@@ -26,6 +26,7 @@ from yid_ocp.diagnosis.blind import (
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.problem import ProblemOptions
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -64,8 +65,13 @@ def problem(of=None):
         theta=np.array([20.0, 5.0, 0.05]),
         episodes=(SimpleNamespace(recording=recording),),
         step="step",
-        options=SimpleNamespace(prior_stds={}),
+        options=ProblemOptions(),
     )
+
+
+def detectable(of, columns):
+    """What a generator is told of a candidate's sensitivity."""
+    return {"effect": of.label, "shape": dict.fromkeys(of.shape_parameter_names, 0.25), "columns": columns}
 
 
 @pytest.fixture
@@ -88,11 +94,8 @@ def drawn(monkeypatch):
         monkeypatch.setattr(module, "make_candidate_effects", lambda *_: list(candidates))
         ensemble = BlindCaseGenerator(problem(**given), seed, finer, conditions=conditions)
         columns = {"kelvin_voigt": [[100.0]], "joint_coulomb": [[0.5]], "gravity_tilt": [[30.0, 40.0]]}
-        signatures = [
-            signature(of, columns.get(of.kind, [[50.0]]), **({"s": 0.25} if of.shape_parameter_names else {}))
-            for of in candidates
-        ]
-        ensemble._detectable = tuple((s.effect, s.shape_values, s.projected_sensitivity) for s in signatures)
+        seen = [detectable(of, columns.get(of.kind, [[50.0]])) for of in candidates]
+        ensemble.set_candidate_sensitivities_from_json(seen)
         return ensemble
 
     monkeypatch.setattr(module, "run_experiment_with_injected_effects", experiment)
@@ -120,11 +123,17 @@ def test_what_cannot_be_simulated_is_refused(drawn, given, words):
 def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     ensemble, composed = drawn(), AllCandidatesProblem("by the sensors", (DAMPER,), False)
     weighted = SimpleNamespace(problem="by all noise", values={"k": 1.0})
-    monkeypatch.setattr(ensemble, "_nominal_problem", lambda recordings: SimpleNamespace(system="system"))
+    columns = {"by the sensors": [[1.0]], "by all noise": [[2.0]]}
+
+    def linearized(of, base, values):
+        return SimpleNamespace(signatures=[signature(DAMPER, columns[of.problem])])
+
+    monkeypatch.setattr(module, "EstimationProblem", lambda *_: problem())
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
     monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
-    monkeypatch.setattr(module, "linearize_candidates", lambda of, base, values: of)
-    assert ensemble._linearize_clean_recordings().problem == "by all noise"
+    monkeypatch.setattr(module, "linearize_candidates", linearized)
+    [told] = BlindCaseGenerator(ensemble.problem, 3, None).candidate_sensitivities_to_json()
+    assert np.abs(told["columns"]) == 2.0
 
 
 def test_a_recording_says_nothing_of_what_is_in_it(drawn):
@@ -209,7 +218,7 @@ def test_what_is_detectable_survives_as_plain_data(drawn):
     other.set_candidate_sensitivities_from_json(told)
     assert other.candidate_sensitivities_to_json() == told
     assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
-    assert other._inside(np.random.default_rng(1), 3.0) == drawn()._inside(np.random.default_rng(1), 3.0)
+    assert of_category(other, "single", 3.0)[1] == of_category(drawn(seed=5), "single", 3.0)[1]
 
 
 WEIGHTS = {"a": 0.4, "b": 0.2, "bare": 0.1}
@@ -270,7 +279,7 @@ def test_truth_has_ordinary_friction_and_parameters_as_uncertain_as_their_priors
     known.system.parameters.names += ("joint_coulomb@elbow.tau_c",)
     known.theta = np.append(known.theta, 0.0)
     ensemble.simulated_system = system()
-    known.options.prior_stds = {"T2.bend": 0.05}
+    known.options = ProblemOptions(prior_stds={"T2.bend": 0.05})
     for number in range(8):
         case = PlannedBlindCase(number, "one", "null", None)
         truth = ensemble.draw_recordings_and_ground_truth(case)[1].truth
@@ -280,13 +289,14 @@ def test_truth_has_ordinary_friction_and_parameters_as_uncertain_as_their_priors
         assert 0.08 <= held.values["tau_c"] <= 0.32
 
 
-def test_parameters_with_priors_are_drawn_in_their_order_so_that_a_seed_draws_the_same_everywhere(drawn):
+def test_parameters_with_priors_are_drawn_in_their_order_so_that_a_seed_draws_the_same_everywhere(drawn, monkeypatch):
     ensemble, names = drawn(), tuple(f"joint_{i}.mass_scale" for i in range(12))
     known = ensemble.problem
     known.free, known.theta, known.system.parameters.names = names, np.ones(12), names
-    known.options.prior_stds, draws = dict.fromkeys(names, 0.05), itertools.count()
-    counted = SimpleNamespace(uniform=lambda *_: next(draws), choice=lambda _: 1.0)
-    truth = ensemble._draw_true_parameters(counted)
+    known.options, draws = ProblemOptions(prior_stds=dict.fromkeys(names, 0.05)), itertools.count()
+    counted = Mock(uniform=lambda *_: next(draws), choice=lambda _: 1.0, integers=lambda _: 0)
+    monkeypatch.setattr(np.random, "default_rng", lambda seed: counted)
+    truth = of_category(ensemble, "null")[1].truth
     assert [truth[name] for name in names] == sorted(truth.values())
 
 
@@ -308,11 +318,6 @@ def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
     assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
 
 
-def detectable(of, columns, **shapes):
-    made = signature(of, columns, **shapes)
-    return made.effect, made.shape_values, made.projected_sensitivity
-
-
 @cases(
     "of, column, wanted, largest",
     {
@@ -323,47 +328,55 @@ def detectable(of, columns, **shapes):
     },
 )
 def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(drawn, of, column, wanted, largest):
-    ensemble = drawn()
+    ensemble = drawn(candidates=(of,))
     columns = [[column]] if len(of.amplitude_parameter_names) == 1 else [[0.6 * column, 0.8 * column]]
-    for seed in range(5):
-        found, multiple = ensemble._sized(detectable(of, columns), np.random.default_rng(seed), wanted)
-        values = np.array(list(found.values.values()))
+    ensemble.set_candidate_sensitivities_from_json([detectable(of, columns)])
+    for number in range(5):
+        told = ensemble.draw_recordings_and_ground_truth(PlannedBlindCase(number, "one", "single", wanted))[1]
+        [found], values = told.injected, np.array(list(told.injected[0].values.values()))
         assert found.label == of.label
-        seen = abs(float(np.array(columns[0]) @ values))
-        assert multiple == pytest.approx(seen / 3.858)
-        assert multiple <= wanted * (1 + 1e-12)
+        seen = abs(float(np.array(columns[0]) @ values)) / 3.858
+        # nine tenths of the wanted size count as reached
+        assert told.multiple == pytest.approx(seen, rel=0.1 if told.multiple == wanted else 1e-9)
+        assert seen <= wanted * (1 + 1e-12)
         assert np.all(np.abs(values) <= largest * (1 + 1e-12))
-        if multiple < wanted * (1 - 1e-9):
+        if seen < wanted * (1 - 1e-9):
             assert np.max(np.abs(values)) == pytest.approx(largest)
 
 
 def test_the_wanted_size_or_the_nearest_that_any_effect_reaches(drawn):
-    found, size = drawn()._inside(np.random.default_rng(1), 3.0)
+    def single(wanted, **given):
+        told = of_category(drawn(**given), "single", wanted)[1]
+        return told.injected[0], told.multiple
+
+    found, size = single(3.0)
     assert (found.kind in ("kelvin_voigt", "gravity_tilt", "standard_linear_solid"), size) == (True, 3.0)
-    weak, most = drawn(candidates=(FRICTION,))._inside(np.random.default_rng(1), 3.0)
+    weak, most = single(3.0, candidates=(FRICTION,))
     assert weak.values["tau_c"] == pytest.approx(3.0)
     assert most == pytest.approx(1.5 / 3.858)
-    # nine tenths of it count as reached
-    near, reached = drawn(candidates=(DAMPER,))._inside(np.random.default_rng(1), 0.2 * 100 / 3.858 / 0.91)
+    near, reached = single(0.2 * 100 / 3.858 / 0.91, candidates=(DAMPER,))
     assert reached == pytest.approx(0.2 * 100 / 3.858 / 0.91)
-    short, not_reached = drawn(candidates=(DAMPER,))._inside(np.random.default_rng(1), 0.2 * 100 / 3.858 / 0.89)
+    short, not_reached = single(0.2 * 100 / 3.858 / 0.89, candidates=(DAMPER, FRICTION))
     assert not_reached == pytest.approx(0.2 * 100 / 3.858)
     assert near.values == short.values
 
 
 def test_only_kinds_that_the_other_engine_can_do_are_injected(drawn):
-    ensemble = drawn(candidates=(DAMPER, ABROAD))
-    kinds = {ensemble._inside(np.random.default_rng(seed), 1.0)[0].kind for seed in range(12)}
-    assert kinds == {"kelvin_voigt"}
+    for seed in range(12):
+        [injected] = of_category(drawn(seed, candidates=(DAMPER, ABROAD)), "single", 1.0)[1].injected
+        assert injected.kind == "kelvin_voigt"
 
 
 def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
     ensemble = drawn()
-    found = [ensemble._outside(np.random.default_rng(seed)) for seed in range(600)]
-    by_kind = {
-        kind: [f for f in found if f.kind == kind] for kind in {*OUT_OF_LIBRARY_FORCE_BUILDERS} - {"slipping_grasp"}
-    }
+    ensemble.simulated_system.grasps = (SimpleNamespace(name="left"),)
+    wanted = [PlannedBlindCase(number, "one", "outside", None) for number in range(600)]
+    found = [f for entry in wanted for f in ensemble.draw_recordings_and_ground_truth(entry)[1].injected]
+    by_kind = {kind: [f for f in found if f.kind == kind] for kind in OUT_OF_LIBRARY_FORCE_BUILDERS}
     assert all(len(group) > 10 for group in by_kind.values())
+    assert all(
+        0 < min(sizes) < max(sizes) for group in by_kind.values() for sizes in [[f.values["size"] for f in group]]
+    )
     ripples = by_kind["torque_ripple"]
     assert {f.location for f in ripples} == {"s0"}, "the first half of the joints, rounded down"
     assert all(0.5 <= f.values["size"] <= 2.0 for f in ripples)
@@ -374,8 +387,6 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
         assert low <= min(ratios) < max(ratios) <= high
         assert {f.location for f in by_kind[kind]} == {"T1", "T2"}
     assert all(0.05 <= f.values["size"] <= 0.15 for f in by_kind["gusts"])
-    assert {*_OUT_OF_LIBRARY_SIZES} == {*OUT_OF_LIBRARY_FORCE_BUILDERS}
-    assert all(0 < low < high for _, low, high, _ in _OUT_OF_LIBRARY_SIZES.values())
 
 
 def chain(links, **values):
