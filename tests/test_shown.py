@@ -10,7 +10,7 @@ from small_problems import joints, pendulum_step, recording, seen, taken
 
 import yid_ocp as yid
 from yid_ocp.analysis.step_symbols import NamedStepEquations
-from yid_ocp.display import _MAX_NOTEBOOK_ROWS, ReprMixin, ReprTexts, count_with_noun
+from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.model import FlexibleSegment, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
@@ -29,9 +29,9 @@ def test_a_line_and_a_table():
     table = "<table><tr><th>name</th><th>value</th></tr><tr><td>x &amp; y</td><td>1</td></tr></table>"
     assert thing._repr_html_() == f"<p><b>Thing</b>: a &lt; b</p>{table}"
     assert "<table>" not in Thing("alone", [("head",)])._repr_html_()
-    rows = [("name", "value"), *((f"r{i}", "") for i in range(_MAX_NOTEBOOK_ROWS + 5))]
+    rows = [("name", "value"), *((f"r{i}", "") for i in range(35))]
     text = Thing("long", rows)._repr_html_()
-    assert text.count("<tr>") == _MAX_NOTEBOOK_ROWS + 2
+    assert text.count("<tr>") == 32
     assert "<td>and 5 more</td><td></td>" in text
 
 
@@ -81,7 +81,7 @@ def test_public_objects_are_short(shown, name, words):
     assert "\n" not in text
     html = shown[name]._repr_html_()
     assert html.startswith(f"<p><b>{name}</b>: ")
-    assert len(re.findall("<tr>", html)) <= _MAX_NOTEBOOK_ROWS + 2
+    assert len(re.findall("<tr>", html)) <= 32
 
 
 def test_results_state_shapes_and_units(shown):

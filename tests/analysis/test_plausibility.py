@@ -14,8 +14,6 @@ from small_problems import joints, measured, pendulum_step, points, recording, s
 from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, point_clock_offset_drift_and_rms_error
 from yid_ocp.analysis.estimation import _baselines
 from yid_ocp.analysis.joint_checks import (
-    _GRASP_FORCE_STD,
-    _OFFSET_FRACTION,
     RecordedJointsModel,
     _loaded,
     inverse_dynamics_effort_issues,
@@ -462,7 +460,7 @@ def test_a_held_object_loads_a_joint_by_its_lever(drives):
     slopes = np.array([[[[0.3, 0.0], [0.4, 0.1], [0.0, 0.0]], [[0.2, 0.0], [0.2, 0.0], [0.2, 0.1]]]])
     arm = SimpleNamespace(frame_positions_and_jacobians=lambda frames, q: (None, slopes))
     data = SimpleNamespace(holders=("a", "b"), motion=SimpleNamespace(q=np.zeros((1, 2))), arm=arm)
-    reach = _GRASP_FORCE_STD * np.array([0.5, 0.1]) / (3 * _OFFSET_FRACTION)
+    reach = 30.0 * np.array([0.5, 0.1]) / (3 * 0.05)
     for factor, loaded in ((0.99, True), (1.01, False)):
         data.size = factor * reach
         assert _loaded(data).tolist() == [loaded, loaded]

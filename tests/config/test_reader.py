@@ -7,6 +7,7 @@ from dataclasses import MISSING
 from typing import Literal, get_args, get_origin
 
 import pytest
+from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 
 from yid_ocp import options
@@ -237,9 +238,8 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
         if entries is not None:
             yield from numbers(entries, lambda value: wrap([value]), path, option)
         if bare in (int, float):
-            kinds = tuple(kind for kind, *_ in options._BOUND_MARKERS)
-            bounds = [marker for marker in (*options.split_annotated(hint)[1], *markers) if isinstance(marker, kinds)]
-            yield ".".join(path), wrap, option, bounds
+            every = (*options.split_annotated(hint)[1], *markers)
+            yield ".".join(path), wrap, option, [own for own in every if isinstance(own, Gt | Ge | Lt | Le)]
 
 
 def within(wrap, name, beside=None):
@@ -260,8 +260,8 @@ def outside():
     """A wrong value for every bound."""
     for key, wrap, option, bounds in NUMBERS:
         for bound in bounds:
-            [value] = [getattr(bound, name) for kind, name, *_ in options._BOUND_MARKERS if isinstance(bound, kind)]
-            wrong = {"Gt": value, "Lt": value, "Ge": value - 1, "Le": value + 1}[type(bound).__name__]
+            kind = type(bound).__name__
+            wrong = getattr(bound, kind.lower()) + {"Gt": 0, "Lt": 0, "Ge": -1, "Le": 1}[kind]
             yield pytest.param(key, wrap(wrong), option, id=f"{key}={wrong}")
 
 

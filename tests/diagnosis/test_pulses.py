@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis.pulse_detection import (
-    _MODEL_ERROR_TIME,
-    _SLOW_FORCE_TIME,
-    DetectedForcePulse,
-    ForceEstimate,
-    _Rest,
-    detect_force_pulses,
-)
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate, _Rest, detect_force_pulses
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import benjamini_hochberg_mask
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
@@ -130,8 +123,8 @@ def test_the_evidence_is_a_gaussians():
 
     def total(error, floor, slow):
         quick = (error * 0.03) ** 2 + floor**2 + 0.1**2 / 3
-        covariance = quick * (np.eye(len(T)) + np.exp(-apart / _MODEL_ERROR_TIME)) / 2
-        return covariance + slow**2 * np.exp(-apart / _SLOW_FORCE_TIME) + NOISE**2 * np.eye(len(T))
+        covariance = quick * (np.eye(len(T)) + np.exp(-apart / 0.3)) / 2
+        return covariance + slow**2 * np.exp(-apart / 2.0) + NOISE**2 * np.eye(len(T))
 
     def log_density(matrix: np.ndarray) -> float:
         return -0.5 * float(value @ np.linalg.solve(matrix, value)) - 0.5 * float(np.linalg.slogdet(matrix)[1])

@@ -21,7 +21,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
-from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, residual_models_with_smoother_unknowns
+from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
 from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
@@ -371,11 +371,11 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     weighted = problem_with_sensor_noise_only(problem)
     x = problem.initial_unknowns
     model = residual_models_with_smoother_unknowns(weighted, x, weighted.evaluate(x))[0]
-    decay = math.exp(-_MIN_INTERVAL / _CORRELATION_TIME)
+    decay = math.exp(-0.1 / 0.5)  # intervals of 0.1 s of forces that last for 0.5 s
     column = model.unknown_names.index("shoulder")
     # the integral over a long time has the variance of white noise that is held over each sample
     variance = model.torque_noise_variance[column] * model.reference_std[column] ** 2 - OFFSET**2
-    lasting = variance * _MIN_INTERVAL * (1 + decay) / (1 - decay)
+    lasting = variance * 0.1 * (1 + decay) / (1 - decay)
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
     assert np.count_nonzero(model.torque_noise_variance) == 1
     calm = problem_with_exact_inputs(problem)

@@ -10,7 +10,6 @@ import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.effects.base import effort_limit_ratio_to_baxter, frame_names_at_arm_link_ends, one_frame_name_per_arm_link
-from yid_ocp.effects.bodies import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.mechanism import (
@@ -131,7 +130,7 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     assert near["my"].value == pytest.approx(0.2, rel=1e-3)
     assert near["my"].std == 0.01
     far = effect.to_reported_parameters(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), std)
-    most = np.hypot(_MAX_PAYLOAD_DISTANCE * 1.0, _MAX_COM_SHIFT * 1.2)
+    most = np.hypot(0.5 * 1.0, 0.05 * 1.2)
     assert np.hypot(far["my"].value, far["mz"].value) == pytest.approx(most, rel=1e-6)
     assert np.isnan(far["my"].std)
     assert far["mass"].std == 0.01
@@ -148,8 +147,8 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
 @pytest.mark.parametrize(
     ("mass", "moments", "other"),
     [
-        (0.2, (0.0, 0.03, -0.04), -0.05 / _MAX_PAYLOAD_DISTANCE),
-        (-0.2, (0.0, 0.03, -0.04), 0.05 / _MAX_PAYLOAD_DISTANCE),
+        (0.2, (0.0, 0.03, -0.04), -0.05 / 0.5),
+        (-0.2, (0.0, 0.03, -0.04), 0.05 / 0.5),
         (0.2, (3.0, 0.0, 0.0), -0.9 * 1.2),
         (0.2, (0.0, 0.0, 0.0), None),
         (0.0, (0.1, 0.0, 0.0), None),

@@ -21,7 +21,6 @@ from yid_ocp.inference.smoother import (
     smooth_unknown_forces_and_biases,
 )
 from yid_ocp.inference.smoother_model import (
-    _FORCE_POINT,
     ResidualStateSpaceModel,
     SmoothedUnknownGroup,
     _generalized_forces_per_newton,
@@ -448,9 +447,7 @@ def test_a_push_is_what_virtual_work_says_by_the_weight_of_its_segment():
     found = _generalized_forces_per_newton(SYSTEM, THETA, q, ("T1", "T3"))
     assert found.shape == (2, SYSTEM.n_coordinates, 6)
     symbol = ca.SX.sym("q", SYSTEM.n_coordinates)
-    at = ca.vertcat(
-        *(forward_kinematics(SYSTEM.mechanism, symbol).frame_position(f"{s}:{_FORCE_POINT}") for s in ("T1", "T3"))
-    )
+    at = ca.vertcat(*(forward_kinematics(SYSTEM.mechanism, symbol).frame_position(f"{s}:75%") for s in ("T1", "T3")))
     place = ca.Function("place", [symbol, SYSTEM.parameters.symbols], [at])
     for k, row in enumerate(q):
         for i in range(SYSTEM.n_coordinates):

@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.discrete import RIGID_HOLD_STIFFNESS, equilibrium_equations
-from yid_ocp.integrator.statics import (
-    _HOLD_STIFFNESS_WITH_COMMAND,
-    _HOLD_STIFFNESS_WITH_TORQUE,
-    EquilibriumSolver,
-    steady_state_internal_coordinates,
-)
+from yid_ocp.integrator.statics import EquilibriumSolver, steady_state_internal_coordinates
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
@@ -86,7 +81,7 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
         np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=1e-7, atol=1e-8, err_msg=name)
     if not fast.is_converged:
         return
-    stiffness = RIGID_HOLD_STIFFNESS if torque is None else _HOLD_STIFFNESS_WITH_TORQUE
+    stiffness = RIGID_HOLD_STIFFNESS if torque is None else 1e3
     held = np.zeros(0) if torque is None else torque
     expected = derivatives(steps[1], fast, given, held, stiffness, case.theta)
     for rest in (fast, slow):
@@ -102,7 +97,7 @@ def test_the_equations_of_rest_hold_a_joint_whose_motor_is_off(urdf_folder):
     theta, names = step.system.parameters.vector(), step.system.parameters.names
     given, held = np.array([0.6, -0.3]), np.array([MOTOR_OFF_COMMAND, 0.2])
     rest, e = EquilibriumSolver(step).solve(given, theta, held, None, names), equilibrium_equations(step.equations)
-    at = rest.state[:2], given, held, _HOLD_STIFFNESS_WITH_COMMAND, theta, step.time_step
+    at = rest.state[:2], given, held, 1e-9, theta, step.time_step
     residual, state = (np.array(x).ravel() for x in ca.Function("rest", e.inputs, [e.residual, e.state])(*at))
     np.testing.assert_allclose(residual, 0.0, atol=1e-8)
     np.testing.assert_allclose(state, rest.state, atol=1e-12)

@@ -26,7 +26,7 @@ from yid_ocp.report.animation import (
     measured_motion_animation,
 )
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
-from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
+from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.vision.surface_meshes import load_robot_meshes_by_joint
 
 
@@ -268,7 +268,7 @@ def test_a_picture_shows_the_pattern_with_its_names(drawn, tmp_path):
 
 
 def test_many_rows_share_the_label_of_their_owner(drawn, tmp_path):
-    height = _MAX_SINGLE_LABELS + 9
+    height = 64 + 9
     draw_sparsity_patterns(tmp_path / "p.png", [[pattern(height)]])
     (axes,) = drawn[0].get_axes()
     owners = dict.fromkeys(f"T{1 + i // 3}" for i in range(height - 2))
@@ -343,7 +343,7 @@ def test_long_curves_are_thinned_and_gaps_stay():
     predicted, plot_data = {"predicted": np.sin(t)}, figures.channel_prediction_and_residual_plot_data
     plots = plot_data("x", "m", t, measured, 0 * t + 1e-3, predicted)
     figure = go.Figure(figures.time_plots_figure(plots))
-    assert max(len(trace.x) for trace in figure.data) <= figures._MAX_CURVE_POINTS
+    assert max(len(trace.x) for trace in figure.data) <= 1200
     assert np.isnan(figure.data[0].y[0])
 
 

@@ -221,7 +221,7 @@ def test_blocks_on_a_terminal():
         "a  b", "-  -", "1  2", "", "said", "", "a  b", "-  -", "1  2", "", "  do it", "  now",
     ]  # fmt: skip
     prose = terminal.summary_terminal_lines([SummaryStatement("A sentence of some length. " * 9 + "It ends.")])
-    assert max(map(len, prose)) <= terminal._PROSE_WIDTH
+    assert max(map(len, prose)) <= 100
     note = terminal.summary_terminal_lines([SummaryStatement("a note " * 40)])
     assert all(line.startswith("  ") for line in note[1:])
 

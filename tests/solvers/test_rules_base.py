@@ -19,7 +19,6 @@ from yid_ocp.inference.linearized_residual import (
 from yid_ocp.problem.evaluation import PriorResiduals
 from yid_ocp.solvers import GaussNewton, base
 from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, fit_problem
-from yid_ocp.solvers.gradient_methods import _LENGTH_AFTER_FAILURE, _PATIENCE_STEPS
 
 INSIDE = [((1, 1), (3, -4), 8.0), ((1, 1), (5, -1), 5.0)]
 LOW = [((0, 1), (5, -1), 2.0), ((0, 1), (-5, -1), 5.0), ((0, 2), (5, -9), 0.0), ((-0.1, 2.1), (5, -9), 0.0)]
@@ -503,7 +502,7 @@ def test_the_step_after_a_rejected_one_is_as_long_as_that_suggests_whatever_the_
     problem = edge(1.2, weak=0.1)
     GaussNewton(initial_damping=1e-12).minimize_cost(problem, np.array([1.0, 0.0]), None)
     moved = problem.asked[2][0][0] - 1.0
-    assert 0.05 < moved <= _LENGTH_AFTER_FAILURE
+    assert 0.05 < moved <= 0.25
 
 
 def test_at_the_edge_of_what_can_be_predicted_the_search_stalls_soon():
@@ -635,12 +634,12 @@ def test_steps_that_are_worth_nothing_beside_the_noise_are_an_end():
     problem = winding(1e4, 0.4, size=1.0)
     found = fit_problem(problem, GaussNewton(max_iterations=100), initial_unknowns=[0.0, 0.0], restarts=False)
     assert found.status == Status.CONVERGED
-    assert found.n_iterations == _PATIENCE_STEPS
+    assert found.n_iterations == 20
     assert "moved nothing by a tenth of its standard deviation" in found.message
 
 
 @pytest.mark.parametrize(("steepness", "pull"), [(1e4, 2.5), (1e2, 1.5)], ids=["worth more", "quick enough"])
 def test_what_is_worth_a_standard_deviation_or_is_gained_is_none(steepness, pull):
     problem = winding(steepness, pull, size=1.0)
-    found = GaussNewton(max_iterations=_PATIENCE_STEPS + 5).minimize_cost(problem, np.zeros(2), None)
+    found = GaussNewton(max_iterations=25).minimize_cost(problem, np.zeros(2), None)
     assert not found.stopped_at_noise_level

@@ -7,7 +7,7 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import ShapeFitOptions, ShapeFitter
-from yid_ocp.vision.fit import _NODE_RADIUS_FRACTION, _Task
+from yid_ocp.vision.fit import _Task
 from yid_ocp.vision.shape_evidence import ProcessedFrameCloud
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd
 
@@ -35,7 +35,7 @@ def seen(shape, q, count=250, noise=0.0, seed=0):
         around = radius * (across[:, None] * side + np.sqrt(1 - across**2)[:, None] * front)
         points.append(start + rng.uniform(0, 1, count)[:, None] * (end - start) + around)
         for t in (np.arange(NODES) + 0.5) / NODES:
-            nodes.append(start + t * (end - start) + _NODE_RADIUS_FRACTION * radius * front)
+            nodes.append(start + t * (end - start) + np.pi / 4 * radius * front)
     cloud = np.concatenate(points)
     sight = cloud - CAMERA
     cloud = cloud + noise * rng.standard_normal(len(cloud))[:, None] * sight / np.linalg.norm(sight, axis=1)[:, None]

@@ -276,14 +276,14 @@ def test_a_file_that_is_missing_or_changed(kinds, pendulum) -> None:
 def test_distributions_are_found_by_their_entry_point(kinds, pendulum, monkeypatch) -> None:
     (pendulum.parent / "constant_effect.py").write_text(EFFECT.format(kind="constant"))
     monkeypatch.syspath_prepend(str(pendulum.parent))
-    entry = metadata.EntryPoint("constant", "constant_effect", run_inputs._ENTRY_POINT_GROUP)
+    entry = metadata.EntryPoint("constant", "constant_effect", "yid_ocp.effects")
     found = replace_dist(entry, SimpleNamespace(name="my-effects", version="1.2"))
     monkeypatch.setattr(run_inputs, "_installed", lambda: [found])
     assert software_and_plugin_versions()["entry point constant"] == "my-effects 1.2"
     build_system(load_config(pendulum))
     assert "constant" in EFFECTS
     build_system(load_config(pendulum))  # as if a script had imported it before
-    broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", run_inputs._ENTRY_POINT_GROUP), found.dist)
+    broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", "yid_ocp.effects"), found.dist)
     monkeypatch.setattr(run_inputs, "_installed", lambda: [broken])
     with pytest.raises(ConfigError, match=r"entry point gone raised ModuleNotFoundError(.|\n)*my-effects 1.2"):
         build_system(load_config(pendulum))
