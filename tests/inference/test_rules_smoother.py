@@ -97,7 +97,7 @@ class Dense:
             design, _ = dense(model)
             blocks.append(design)
             observed.append(np.vstack([i.negative_residual_jacobian for i in model.intervals]))
-            by_source = np.array([variance[s] for s in model.unknown_groups])
+            by_source = np.array([variance[s] for s in model.unknown_groups]) + model.torque_noise_variance
             prior.append(np.concatenate([model.initial_state_std**2, np.tile(by_source, COUNT)]))
             for interval in model.intervals:
                 values, vectors = np.linalg.eigh(interval.unreachable_products)
@@ -148,30 +148,19 @@ def smoothed(monkeypatch, models, **limits):
 NOTHING = dict.fromkeys(SOURCES, 0.0)
 
 
-def test_variances_stay_within_their_range_and_rounding_is_never_the_best():
-    variance, _ = smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6})
-    assert variance[FORCE] >= 1e-6
-    exploding, _ = smoother._refined([made(3, size=np.full(3, 1e9))], NOTHING | {FORCE: 1e6})
-    assert exploding[FORCE] <= 1e7
-    assert smoother._refined([made(1, loose=1e12)], NOTHING)[1].log_evidence == -math.inf
+def test_variances_stay_within_their_range(monkeypatch):
+    assert set(smoothed(monkeypatch, [made(3, size=np.full(3, 1e9))]).group_variance.values()) == {1e7}
+    assert smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6})[0][FORCE] >= 1e-6
 
 
-def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
-    models = [made(3, size=np.array([30.0, 0.0, 0.0])), made(4, size=np.array([20.0, 0.0, 0.0]))]
-    evidence, size = smoother._largest_evidence(smoother._run(models, NOTHING).filtered, FORCE)
-    assert evidence == pytest.approx(Dense(models, NOTHING | {FORCE: size}).log_evidence, rel=1e-9)
-    assert evidence > Dense(models, NOTHING | {FORCE: 4 * size}).log_evidence
-    assert evidence > Dense(models, NOTHING | {FORCE: size / 4}).log_evidence
-    base = NOTHING | {OTHER_FORCE: 1.0}
-    more, at = smoother._largest_evidence(smoother._run(models, base).filtered, FORCE)
-    assert more == pytest.approx(Dense(models, base | {FORCE: at}).log_evidence, rel=1e-9)
-    # a group may hold several unknowns, and some of them errors that are known
+def test_a_group_may_hold_several_unknowns_and_some_of_them_errors_that_are_known(monkeypatch):
     shared = {"unknown_groups": (FORCE, FORCE, BIAS), "torque_noise_variance": np.array([0.0, 0.4, 0.0])}
-    both = [replace(model, **shared) for model in models]
-    some = {FORCE: 0.0, BIAS: 0.3}
-    most, here = smoother._largest_evidence(smoother._run(both, some).filtered, FORCE)
-    assert most == pytest.approx(smoother._run(both, some | {FORCE: here}).log_evidence, rel=1e-9)
-    assert most > smoother._run(both, some).log_evidence + 1
+    models = [replace(made(seed, size=np.array([size, 0.0, 0.0])), **shared) for seed, size in ((3, 30.0), (4, 20.0))]
+    found = smoothed(monkeypatch, models)
+    none, most = {FORCE: 0.0, BIAS: 0.0}, Dense(models, found.group_variance).log_evidence
+    assert found.log_evidence["both"] == pytest.approx(most - Dense(models, none).log_evidence, rel=1e-7)
+    for times in (0.25, 4.0):
+        assert most > Dense(models, found.group_variance | {FORCE: times * found.group_variance[FORCE]}).log_evidence
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -285,25 +274,18 @@ HERE, OTHER = (SmoothedUnknownGroup(place, "force") for place in ("here", "elsew
 LIKE = SmoothedUnknownGroup("there", "push")
 
 
-def test_a_place_that_does_as_well_is_told():
-    """Two unknowns at two places do the same, a third something else, and the first one is at work."""
-    model, intervals, rng = made(2), [], np.random.default_rng(0)
+@pytest.mark.parametrize(("otherwise", "named"), [(0.9, (LIKE,)), (1.2, ())])
+def test_a_place_that_does_as_well_is_told(monkeypatch, otherwise, named):
+    """Two unknowns at two places do much the same, a third something else, and the first one is at work."""
+    model, rng, intervals = made(2, size=np.array([7.0, 0.0, 0.0])), np.random.default_rng(0), []
     for one in model.intervals:
-        by, drive = one.unknown_jacobian.copy(), one.unknown_input_matrix.copy()
-        by[:, 1] = by[:, 0] + 0.02 * rng.standard_normal(len(by))
-        drive[:, 1] = drive[:, 0]
-        observed = 0.1 * one.negative_residual_jacobian
-        observed[:, 0] += 8.0 * by[:, 0]
-        changed = {"negative_residual_jacobian": observed, "unknown_jacobian": by, "unknown_input_matrix": drive}
-        intervals.append(replace(one, **changed))
-    twice = replace(model, intervals=tuple(intervals), unknown_groups=(HERE, LIKE, OTHER))
-    variance = {HERE: 50.0, LIKE: 0.0, OTHER: 0.0}
-    none, state = (smoother._run([twice], own) for own in (dict.fromkeys(variance, 0.0), variance))
-    drop, found = smoother._alternatives([twice], variance, none, state, 5.0)
-    assert drop[HERE] > 100
-    assert found == {HERE: (LIKE,)}
-    better = replace(state, log_evidence=state.log_evidence + 0.2 * drop[HERE])
-    assert LIKE not in smoother._alternatives([twice], variance, none, better, 1e-9)[1][HERE]
+        by, drive = one.unknown_jacobian[:, [0, 0, 2]], one.unknown_input_matrix[:, [0, 0, 2]]
+        by[:, 1] += otherwise * rng.standard_normal(len(by))
+        intervals.append(replace(one, unknown_jacobian=by, unknown_input_matrix=drive))
+    same = {"unknown_groups": (HERE, LIKE, OTHER), "initial_state_jacobian": model.initial_state_jacobian[:, [0, 0, 2]]}
+    found = smoothed(monkeypatch, [replace(model, intervals=tuple(intervals), **same)])
+    assert found.log_evidence_drop[HERE] > 50
+    assert found.alternative_groups == {HERE: named}
 
 
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():
