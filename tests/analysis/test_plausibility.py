@@ -12,7 +12,7 @@ import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
 from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, point_clock_offset_drift_and_rms_error
-from yid_ocp.analysis.estimation import _baselines
+from yid_ocp.analysis.estimation import prediction_errors_units_and_fit_errors
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
     _loaded,
@@ -36,7 +36,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
-from yid_ocp.problem import EstimationProblem, SensorOptions
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.workflow.build_problem import build_problem
@@ -479,12 +479,35 @@ def test_a_search_without_drifts_finds_a_lateness_alone():
     assert both == pytest.approx((0.2, 0.02, 0.0), abs=1e-4)
 
 
+def errors_of_guess(names, value, run=None, cable=None):
+    """By channel, the errors of a guess that points stay, in a prediction from 0.5 to 1 s; values (M, 3 per point)."""
+    sensor = SimpleNamespace(naive_prediction="stays", point_names=names, group_name="points", outputs_per_channel=3)
+    sensor.channel_names = tuple(f"points.{name}" for name in names)
+    seen = SimpleNamespace(sensor=sensor, value=value, node=np.arange(len(value)), fraction=0.0)
+    grid = SimpleNamespace(start_time=0.5, node_times=np.array([0.5, 1.0]))
+    episode = SimpleNamespace(recording=run, name="run", measurements=[seen], grid=grid)
+    options = ProblemOptions(initial_state="equilibrium", cable_topology=cable)
+    problem, fit = (
+        SimpleNamespace(options=options, step=SimpleNamespace(time_step=0.1)),
+        SimpleNamespace(evaluation=None),
+    )
+    [told], *_ = prediction_errors_units_and_fit_errors(problem, fit, [(episode, "not predicted")])
+    return told["baselines"]["stays"]
+
+
 def test_a_guess_of_a_cable_covers_the_samples_that_the_model_predicts():
-    run, names = hanging(), ("p4", "a3")
-    episode = SimpleNamespace(recording=run, grid=SimpleNamespace(start_time=0.5, node_times=np.array([0.5, 1.0])))
-    sensor = SimpleNamespace(naive_prediction="stays", point_names=names, group_name="points")
-    guess = _baselines(episode, SimpleNamespace(sensor=sensor, value=np.zeros((51, 6))), CABLE)["stays"]
-    np.testing.assert_array_equal(guess, np.tile(run.points[0].position[1, [4, 11]].ravel(), (51, 1)))
+    run = hanging()
+    position = run.points[0].position[:, [4, 11]]
+    square = np.sum((position[50:101] - position[1]) ** 2, axis=2)
+    errors = errors_of_guess(("p4", "a3"), position[50:101].reshape(51, 6), run, CABLE)
+    means = [*np.mean(square, axis=0), np.mean(square)]
+    assert errors == pytest.approx(dict(zip(("points.p4", "points.a3", "points"), np.sqrt(means), strict=True)))
+
+
+def test_a_guess_is_not_judged_by_the_sample_that_made_it():
+    """A point that is seen once makes a guess without an error, which would beat every model."""
+    value = np.array([[1.0, 1, 1, np.nan, np.nan, np.nan], [2.0, 2, 2, 5, 5, 5], [np.nan] * 6])
+    assert errors_of_guess(("p", "q"), value) == pytest.approx(dict.fromkeys(("points.p", "points"), np.sqrt(3)))
 
 
 POSE = np.eye(4)

@@ -235,17 +235,6 @@ def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum
     assert ("a prediction without a model has a smaller error" in done.out) is not believed
 
 
-def test_a_guess_is_not_judged_by_the_sample_that_made_it():
-    """A point that is seen once makes a guess without an error, which would beat every model."""
-    sensor = SimpleNamespace(naive_prediction="stays", point_names=("p", "q"))
-    value = np.array([[1.0, 1, 1, np.nan, np.nan, np.nan], [2.0, 2, 2, 5, 5, 5], [np.nan] * 6])
-    guess = estimation._baselines(None, SimpleNamespace(sensor=sensor, value=value), None)["stays"]
-    assert np.isnan(guess[0, :3]).all()
-    assert np.isnan(guess[1, 3:]).all()
-    assert np.array_equal(guess[1:, :3], np.ones((2, 3)))
-    assert np.array_equal(guess[[0, 2], 3:], np.full((2, 3), 5.0))
-
-
 def test_a_group_without_a_sample_has_no_expected_error():
     sensor = SimpleNamespace(channel_names=("points.p",), outputs_per_channel=3)
     empty = np.zeros((0, 3))
