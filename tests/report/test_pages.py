@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
-from yid_ocp.report.html import _plotly_script, _shared_script, write_report, write_shared_plotly_script
+from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT
 from yid_ocp.workflow.build_problem import load_problem
@@ -328,20 +328,23 @@ def test_a_browser_draws_pages_with_their_script_in_them_or_beside_them(solved_p
     page = tmp_path / "runs" / "one" / "report.html"
     page.parent.mkdir(parents=True)
     write_shared_plotly_script(tmp_path)
+    [script] = tmp_path.glob("plotly-*.js")
     told = re.sub(r'<script type="text/plain" id="packed">[^<]+</script>',
-                  f'<script src="../../{_plotly_script()[0]}"></script>', solved_page.read_text())  # fmt: skip
+                  f'<script src="../../{script.name}"></script>', solved_page.read_text())  # fmt: skip
     page.write_text(told)
     assert len(told) < 0.6e6
     check_in_browser(page, 400, "dark", tmp_path)
 
 
 def test_a_page_takes_no_script_of_somebody_else(tmp_path):
-    page = tmp_path / "runs" / "one" / "report.html"
-    page.parent.mkdir(parents=True)
-    (tmp_path / _plotly_script()[0]).write_text("steal()")
-    assert _shared_script(page) == ""
+    data, folder = ReportData("run", "", KNOWN), tmp_path / "runs" / "one"
+    folder.mkdir(parents=True)
     write_shared_plotly_script(tmp_path)
-    assert _shared_script(page) == f"../../{_plotly_script()[0]}"
+    [script] = tmp_path.glob("plotly-*.js")
+    script.write_text("steal()")
+    assert "<script src=" not in written(data, folder)
+    write_shared_plotly_script(tmp_path)
+    assert f'<script src="../../{script.name}">' in written(data, folder)
 
 
 @pytest.mark.slow

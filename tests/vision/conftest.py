@@ -92,8 +92,12 @@ def tracked(system, run, recording, shape):
         )
         made.sequence.stamps[list(late)] += 0.15
         found = track_object(scene, recording, made.sequence, options)
-        were = np.array([shape.point_positions_at_configuration(made.true_configuration_at(t)) for t in found.t])
-        return SimpleNamespace(made=made, track=found, errors=np.linalg.norm(found.position - were, axis=2))
+
+        def truth(times):
+            return np.array([shape.point_positions_at_configuration(made.true_configuration_at(t)) for t in times])
+
+        errors = np.linalg.norm(found.position - truth(found.t), axis=2)
+        return SimpleNamespace(made=made, track=found, truth=truth, errors=errors)
 
     return make
 

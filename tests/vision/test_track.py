@@ -38,7 +38,7 @@ def test_points_at_two_metres(clean):
     assert clean.errors.max() < 15 * MILLIMETRE
     assert all((frame.cpu_seconds > 0) == (frame.shape_fit is not None) for frame in clean.track.frame_reports)
     # errors are within the stated standard deviations
-    truth = np.array([clean.track._place(clean.made.true_configuration_at(t)) for t in clean.track.t])
+    truth = clean.truth(clean.track.t)
     relative = (clean.track.position - truth) / clean.track.std
     assert np.mean(relative**2) < 1.5
     assert np.abs(relative).max() < 4
@@ -87,7 +87,8 @@ def test_a_displaced_camera_is_put_right(system, recording, clean):
     pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
     found = track_object(SceneDescription(system, "package:baxter"), recording, replace(sequence, camera_pose=pose))
     assert "sees the arm" in found.camera_calibration.message
-    errors = found.position - np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])
+    columns = [system.point_frames.index(name) for name in found.point_names]
+    errors = found.position - clean.truth(found.t)[:, columns]
     assert np.nanmean((errors / found.std) ** 2) < 1.5
     assert np.nanmax(np.linalg.norm(errors, axis=2)) < 15 * MILLIMETRE
     assert np.allclose(found.to_point_group().camera_pose, sequence.camera_pose, atol=0.02)
@@ -132,7 +133,7 @@ def test_the_spline_passes_through_the_good_frames(clean, system):
     for k, t in enumerate(found.t):
         assert np.allclose(found.point_positions_at_time(t), found.position[k], atol=1e-9)
     between = 0.5 * (found.t[4] + found.t[5])
-    truth = found._place(clean.made.true_configuration_at(between))
+    [truth] = clean.truth([between])
     assert np.linalg.norm(found.point_positions_at_time(between) - truth, axis=1).max() < 0.05
     assert np.array_equal(found.configuration_at_time(found.t[-1] + 5.0), found.configuration_at_time(found.t[-1]))
 
