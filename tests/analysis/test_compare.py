@@ -15,11 +15,7 @@ from small_problems import pendulum_step, taken
 from yid_ocp.analysis import compare as module
 from yid_ocp.analysis import estimation
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, compare_methods
-from yid_ocp.analysis.estimation import (
-    channels_worse_than_naive_prediction,
-    choose_fit_with_or_without_shape_memory,
-    prediction_errors_units_and_fit_errors,
-)
+from yid_ocp.analysis.estimation import choose_fit_with_or_without_shape_memory, prediction_errors_units_and_fit_errors
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -463,13 +459,13 @@ ENTRY = {
 
 def test_a_channel_is_worse_than_a_guess_where_the_best_one_is_clearly_nearer():
     units = {"points.a": "m", "points.b": "m"}
-    [found] = channels_worse_than_naive_prediction([ENTRY], units)
+    [found] = estimation.channels_worse_than_naive_prediction([ENTRY], units)
     assert found == {
         **{"recording": "run", "channel": "points.a", "unit": "m"},
         **{"baseline": "stays", "guess": pytest.approx(0.01), "rmse": pytest.approx(0.02)},
     }
     better = ENTRY | {"rmse": {"points.a": 0.0101, "points.b": 0.01}}
-    assert channels_worse_than_naive_prediction([better], units) == []
+    assert estimation.channels_worse_than_naive_prediction([better], units) == []
 
 
 @pytest.mark.parametrize(("start", "window"), [("equilibrium", -1.0), ("fitted_to_points", 0.1)])

@@ -10,13 +10,7 @@ from made_models import Formula, estimate, solution
 from made_recordings import holding_pendulum
 
 from yid_ocp.analysis import identifiability as module
-from yid_ocp.analysis.identifiability import (
-    _orthogonal_part,
-    free_starts_and_grasps,
-    identifiability,
-    system_with_grasp_offset_effects,
-    unknown_vector_from_solution,
-)
+from yid_ocp.analysis.identifiability import identifiability, unknown_vector_from_solution
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError
 from yid_ocp.inference.uncertainty import percent_number_text
@@ -138,7 +132,7 @@ def test_a_nuisance_takes_what_it_explains_whatever_its_unit(size):
 def test_the_part_that_a_direction_explains_does_not_depend_on_its_length(size):
     columns = np.array([[1.0, 0.0], [2.0, 1.0], [2.0, -1.0]])
     explained = size * np.array([[1.0, 2.0], [2.0, 4.0], [2.0, 4.0]])
-    np.testing.assert_allclose(_orthogonal_part(columns, explained), [[0, 0], [0, 1], [0, -1]], atol=1e-12)
+    np.testing.assert_allclose(module._orthogonal_part(columns, explained), [[0, 0], [0, 1], [0, -1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +164,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):
     base = identifiability(held_tube)
-    system = system_with_grasp_offset_effects(held_tube.system)
+    system = module.system_with_grasp_offset_effects(held_tube.system)
     step = compile_step(system, held_tube.step.time_step, use_compiler=False)
     recordings = [episode.recording for episode in held_tube.episodes]
     problem = EstimationProblem(step, recordings, held_tube.free, held_tube.options)
@@ -183,8 +177,8 @@ def test_where_the_grasp_sits_is_a_nuisance(held_tube):
     assert loose.parameters["T1.bend"].std > 1.5 * base.parameters["T1.bend"].std
     one_free = EstimationProblem(step, recordings, (*held_tube.free, "grasp_offset@hand.dy"), held_tube.options)
     added = ("grasp_offset@hand.dx", "grasp_offset@hand.dz")
-    assert free_starts_and_grasps(one_free, "assumed", 2e-3).options.prior_stds == dict.fromkeys(added, 2e-3)
-    assert free_starts_and_grasps(one_free, "assumed", None) is one_free
+    assert module.free_starts_and_grasps(one_free, "assumed", 2e-3).options.prior_stds == dict.fromkeys(added, 2e-3)
+    assert module.free_starts_and_grasps(one_free, "assumed", None) is one_free
 
 
 def test_every_grasp_without_an_offset_gets_one(urdf_folder):
@@ -193,7 +187,7 @@ def test_every_grasp_without_an_offset_gets_one(urdf_folder):
     system = replace(system, grasps=(*system.grasps, Grasp("other", "lower", "T1_1_tip")))
     for there in ((), (("grasp_compliance", "hand"),), (("grasp_offset", "other"), ("grasp_compliance", "other"))):
         made = system.with_effects([make_effect(kind, place, system) for kind, place in there])
-        found = [(e.kind, e.location) for e in system_with_grasp_offset_effects(made).effects]
+        found = [(e.kind, e.location) for e in module.system_with_grasp_offset_effects(made).effects]
         missing = [place for place in ("hand", "other") if ("grasp_offset", place) not in there]
         assert found == [*there, *(("grasp_offset", place) for place in missing)]
 

@@ -10,11 +10,7 @@ import pytest
 from heard import Heard
 
 from yid_ocp.analysis import experiment_design
-from yid_ocp.analysis.experiment_design import (
-    SETUP_CHANGE_DESCRIPTIONS,
-    ExperimentVariantSensitivityBuilder,
-    UnchangedExperiment,
-)
+from yid_ocp.analysis.experiment_design import ExperimentVariantSensitivityBuilder, UnchangedExperiment
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import ChangedExperimentResult, evaluate_experiment_change_sets, what_if
 from yid_ocp.data.recording import PointGroup
@@ -105,7 +101,7 @@ def test_changes_that_apply(short_run, held_tube):
     for found in names.values():
         for name, change in found.items():
             kind, _, what = name.partition(":")
-            assert change.setup_change == (name if name in SETUP_CHANGE_DESCRIPTIONS else "")
+            assert change.setup_change == (name if name in experiment_design.SETUP_CHANGE_DESCRIPTIONS else "")
             assert change.camera_frame == (what if kind == "camera" else "")
             assert change.arm_frame == (what if kind == "arm" else "")
             assert change.camera_rate == (float(what) if kind == "rate" else None)

@@ -20,12 +20,7 @@ from recording_examples import assert_same, changed, example, finite, joints_of,
 
 from yid_ocp.data import recording_hdf5
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
-from yid_ocp.data.recording_hdf5 import (
-    create_hdf5_atomically,
-    open_hdf5_after_read_check,
-    read_recording,
-    write_recording,
-)
+from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recording, write_recording
 from yid_ocp.errors import DataError, OutputError
 
 ROOT = Path(__file__).parents[2]
@@ -256,7 +251,7 @@ needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="files are tried
 @pytest.fixture
 def plain_file(tmp_path):
     path = tmp_path / "file.h5"
-    with create_hdf5_atomically(path) as new:
+    with recording_hdf5.create_hdf5_atomically(path) as new:
         new.attrs["format"] = "test"
         new.create_dataset("a/values", data=np.arange(3.0))
     return path
@@ -274,7 +269,10 @@ def test_a_full_disk_is_an_error_and_not_the_end(tmp_path, monkeypatch):
     """The library would write when it closes the file, and end the process when it cannot."""
     monkeypatch.setattr("yid_ocp.files.secrets.token_hex", lambda _: "x")
     (tmp_path / ".full.h5.x.tmp").symlink_to("/dev/full")
-    with pytest.raises(OutputError, match="No space left"), create_hdf5_atomically(tmp_path / "full.h5") as new:
+    with (
+        pytest.raises(OutputError, match="No space left"),
+        recording_hdf5.create_hdf5_atomically(tmp_path / "full.h5") as new,
+    ):
         new.create_dataset("a", data=np.zeros(1000))
     assert not (tmp_path / "full.h5").exists()
 

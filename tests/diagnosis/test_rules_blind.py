@@ -15,15 +15,7 @@ from factories import amplitude, cases, effect, shape, signature
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import blind as module
-from yid_ocp.diagnosis.blind import (
-    MAX_DRAWS_PER_CASE,
-    BlindCaseGenerator,
-    CaseGroundTruth,
-    PlannedBlindCase,
-    SyntheticRecordingConditions,
-    plan_blind_cases,
-    scale_parameters_to_more_links,
-)
+from yid_ocp.diagnosis.blind import BlindCaseGenerator, PlannedBlindCase, SyntheticRecordingConditions, plan_blind_cases
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.problem import ProblemOptions
@@ -187,10 +179,10 @@ def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn):
     drawn.made.clear()
     assert of_category(drawn(failures=3), "null")[1].truth != told.truth
     drawn.made.clear()
-    of_category(drawn(failures=MAX_DRAWS_PER_CASE - 1), "null")
+    of_category(drawn(failures=module.MAX_DRAWS_PER_CASE - 1), "null")
     drawn.made.clear()
     with pytest.raises(ModelError, match=r"none of 64 random motions(.|\n)*case_\d+ of one(.|\n)*another --seed"):
-        of_category(drawn(failures=MAX_DRAWS_PER_CASE), "null")
+        of_category(drawn(failures=module.MAX_DRAWS_PER_CASE), "null")
 
 
 def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
@@ -199,7 +191,7 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     first = [ensemble.draw_recordings_and_ground_truth(entry)[1] for entry in wanted]
     made = list(drawn.made)
     assert drawn().draw_recordings_and_ground_truth(wanted[3])[1] == first[3]
-    assert CaseGroundTruth.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
+    assert module.CaseGroundTruth.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
     assert first[3].experiment == "one"
     assert len({json.dumps(entry.truth) for entry in first}) == 4
     # no two recordings share their motion or their noise
@@ -403,4 +395,4 @@ def test_a_finer_chain_has_springs_and_dampers_as_many_times_as_strong():
     finer = chain({"T1": 8, "T2": 3}, **{"T1.bend": 20.0, "T1.twist": 5.0, "T2.bend": 6.0})
     truth = {"T1.bend": 12.0, "T1.twist": 3.0, "T2.bend": 7.0, "T2.damping": 2.0}
     scaled = {"T1.bend": 24.0, "T1.damping": 1.0, "T1.twist_damping": 0.5}
-    assert scale_parameters_to_more_links(nominal, finer, truth) == truth | scaled
+    assert module.scale_parameters_to_more_links(nominal, finer, truth) == truth | scaled

@@ -10,12 +10,7 @@ from factories import added, amplitude, cases, effect, finding, fit, loss, place
 
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.blind import CaseGroundTruth, UnlabelledCase, labels_json_and_sha256, read_labels_checking_sha256
-from yid_ocp.diagnosis.blind_scores import (
-    blind_case_score_summary,
-    diagnosis_evidence_to_dict,
-    rejudge_diagnosis_evidence,
-    score_blind_case,
-)
+from yid_ocp.diagnosis.blind_scores import blind_case_score_summary, rejudge_diagnosis_evidence, score_blind_case
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import EffectSearchRecord
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -322,7 +317,7 @@ def diagnosed(decrease=180.0, there=0.5):
 
 def again(finding, **limits):
     """Verdict and effects of what was kept of a diagnosis, by other thresholds."""
-    data = json.loads(json.dumps(diagnosis_evidence_to_dict(finding), allow_nan=False))
+    data = json.loads(json.dumps(blind_scores.diagnosis_evidence_to_dict(finding), allow_nan=False))
     found = rejudge_diagnosis_evidence(data, limits)
     return found["verdict"], [f"{e['kind']}@{e['location']}" for e in found["effects"]]
 
@@ -346,14 +341,14 @@ def test_what_was_kept_of_a_case_is_judged_by_other_thresholds(made, limits, ver
 
 def test_a_case_keeps_its_own_thresholds_as_far_as_there_still_are_such():
     asked = Thresholds(min_explained_fraction=0.5)
-    made = diagnosis_evidence_to_dict(replace(diagnosed(decrease=120.0), thresholds=asked))
+    made = blind_scores.diagnosis_evidence_to_dict(replace(diagnosed(decrease=120.0), thresholds=asked))
     assert rejudge_diagnosis_evidence(made, {})["verdict"] == "effect"
     made["thresholds"] = {"min_explained_fraction": 0.8, "one_that_is_gone": 3.0}
     assert rejudge_diagnosis_evidence(made, {})["verdict"] == "unknown"
 
 
 def test_a_case_of_an_earlier_version_is_refused():
-    made = diagnosis_evidence_to_dict(diagnosed()) | {"format": "yid-evidence/1"}
+    made = blind_scores.diagnosis_evidence_to_dict(diagnosed()) | {"format": "yid-evidence/1"}
     with pytest.raises(DataError, match="'yid-evidence/1'"):
         rejudge_diagnosis_evidence(made, {})
 
@@ -377,7 +372,7 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
     few = replace(second.screening, candidate_scores=second.screening.candidate_scores[:2])
     second = replace(second, screening=few)
     for i, made in enumerate((first, second)):
-        value = {"seconds": 9.0, "result": made.to_dict(), "evidence": diagnosis_evidence_to_dict(made)}
+        value = {"seconds": 9.0, "result": made.to_dict(), "evidence": blind_scores.diagnosis_evidence_to_dict(made)}
         (tmp_path / f"answers/{i}.json").write_text(json.dumps({"name": f"case_{i}", "value": value}))
     said = rescore_blind(tmp_path, tmp_path / "same").result
     assert (said["not_judged"], said["rescored"]["changed"], said["detection"]["3"]["right"]) == (0, [], 1.0)

@@ -15,14 +15,7 @@ from heard import Heard
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult
-from yid_ocp.diagnosis.select import (
-    _near_best_models,
-    _pairs_to_refit,
-    bic_difference,
-    held_out_chi2_decrease_and_std_error,
-    held_out_gap_closure,
-    select_effects,
-)
+from yid_ocp.diagnosis.select import held_out_chi2_decrease_and_std_error, held_out_gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 LIMITS = Thresholds()
@@ -110,7 +103,7 @@ def labels(fits):
 
 def nearest(fits, limits=LIMITS, nominal=None):
     """Labels of the models that do as well as the best; little is explained unless a nominal model says more."""
-    return labels(found for found, _ in _near_best_models(nominal or fit((), loss(1.0, 1.0)), fits, limits))
+    return labels(found for found, _ in select._near_best_models(nominal or fit((), loss(1.0, 1.0)), fits, limits))
 
 
 @cases(
@@ -455,11 +448,11 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
         (0.01, 0.0)
     )
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
-    assert bic_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
+    assert select.bic_difference(offset, spring) == pytest.approx(4.0 - math.log(100.0))
     assert nearest([spring, offset]) == ["offset@elbow", "spring@elbow"]
     # uncertain parameters predict badly; a fit to all recordings would change them
     updated = replace(spring, held_out_loss=replace(spring.held_out_loss, updated_chi2=150.0))
-    assert bic_difference(updated, spring) == pytest.approx(150.0 - spring.held_out_loss.total_chi2)
+    assert select.bic_difference(updated, spring) == pytest.approx(150.0 - spring.held_out_loss.total_chi2)
     assert nearest([spring, replace(offset, cost=101.5)]) == ["spring@elbow", "offset@elbow"]
     # up to odds of 150 to 1, half as sure as the difference
     assert nearest([spring, replace(offset, cost=111.2)]) == ["spring@elbow", "offset@elbow"]
@@ -572,7 +565,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     def to_refit(count):
         joint = SimpleNamespace(rank_candidate_pairs=lambda among: asked.append(among) or iter(promised))
         search = RefitContext(None, Thresholds(n_refit_pairs=count), Heard())
-        return _pairs_to_refit(search, replace(found, joint_score_model=joint), kinds["a"])
+        return select._pairs_to_refit(search, replace(found, joint_score_model=joint), kinds["a"])
 
     chosen = to_refit(3)
     assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]

@@ -10,12 +10,7 @@ from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recor
 
 from yid_ocp.inference import kalman, whitening
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
-from yid_ocp.inference.whitening import (
-    estimate_episode_torque_bias,
-    max_torque_bias_change_in_stds,
-    problem_with_whitening_at,
-    torque_biases_and_stds_per_recording,
-)
+from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
@@ -209,9 +204,9 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
     again = problem_with_whitening_at(weighted, problem.initial_unknowns)
     np.testing.assert_allclose(again.episodes[0].input_errors.torque_bias, value)
-    moved = max_torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
+    moved = whitening.max_torque_bias_change_in_stds(weighted.whitening_filters, again.whitening_filters)
     assert moved == pytest.approx(value[0] / BIAS)
-    assert max_torque_bias_change_in_stds(weighted.whitening_filters, [None]) == 0.0
+    assert whitening.max_torque_bias_change_in_stds(weighted.whitening_filters, [None]) == 0.0
     ((settled, _),) = torque_biases_and_stds_per_recording(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
     assert torque_biases_and_stds_per_recording(problem, problem.initial_unknowns) == [None]
@@ -223,7 +218,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
     x, error = problem.initial_unknowns, 1e-3
     weighted = problem_with_whitening_at(problem, x)
-    [episode], [whitening] = weighted.episodes, weighted.whitening_filters
+    [episode], [own] = weighted.episodes, weighted.whitening_filters
     group = episode.recording.joints
     wrong = replace(episode.recording, joints=replace(group, effort=group.effort + error))
     again = EstimationProblem(problem.step, [wrong], problem.free, problem.options).episodes[0]
@@ -231,8 +226,8 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     found = []
     for each in (episode, other):
         result = weighted.predictor.predict_episode(each, *problem.unpack_episode_unknowns(x, 0), False)
-        found.append(estimate_episode_torque_bias(each, result, whitening)[0])
-    seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
+        found.append(whitening.estimate_episode_torque_bias(each, result, own)[0])
+    seen = 1 - (own.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05
     assert (found[1] - found[0]) / error == pytest.approx(seen, rel=0.01)
 

@@ -15,19 +15,8 @@ from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.inference import smoother, smoother_model
-from yid_ocp.inference.smoother import (
-    gap_locations_by_smoother_evidence,
-    interval_edges_names_and_z_scores,
-    smooth_unknown_forces_and_biases,
-)
-from yid_ocp.inference.smoother_model import (
-    ResidualStateSpaceModel,
-    SmoothedUnknownGroup,
-    _generalized_forces_per_newton,
-    _IntervalModel,
-    _segment_weights,
-    residual_models_with_smoother_unknowns,
-)
+from yid_ocp.inference.smoother import gap_locations_by_smoother_evidence, smooth_unknown_forces_and_biases
+from yid_ocp.inference.smoother_model import ResidualStateSpaceModel, SmoothedUnknownGroup, _IntervalModel
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
@@ -351,7 +340,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
     problem = problem_of(driven, recording, feedback)
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x)
-    model = residual_models_with_smoother_unknowns(problem, x, evaluation)[0]
+    model = smoother_model.residual_models_with_smoother_unknowns(problem, x, evaluation)[0]
     column = model.unknown_names.index("elbow")
     size = 1e-4 / model.reference_std[column]
     state, moved = np.zeros(len(model.initial_state_std)), []
@@ -396,7 +385,7 @@ def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     middle = (trace.interval_edges[:-1] >= 0.9) & (trace.interval_edges[1:] <= 1.25)
     size = trace.reference_std[column] * trace.posterior_mean[middle, column]
     assert np.abs(size).mean() == pytest.approx(push, rel=0.35)
-    edges, names, values = interval_edges_names_and_z_scores(found)
+    edges, names, values = smoother.interval_edges_names_and_z_scores(found)
     assert values.shape == (len(edges) - 1, len(names))
     assert np.isfinite(values[:, names.index(name)]).any()
 
@@ -426,7 +415,7 @@ THETA = np.array([parameter.value for parameter in SYSTEM.parameters])
 
 def test_a_push_is_what_virtual_work_says_by_the_weight_of_its_segment():
     q = 0.3 * np.random.default_rng(3).standard_normal((2, SYSTEM.n_coordinates))
-    found = _generalized_forces_per_newton(SYSTEM, THETA, q, ("T1", "T3"))
+    found = smoother_model._generalized_forces_per_newton(SYSTEM, THETA, q, ("T1", "T3"))
     assert found.shape == (2, SYSTEM.n_coordinates, 6)
     symbol = ca.SX.sym("q", SYSTEM.n_coordinates)
     at = ca.vertcat(*(forward_kinematics(SYSTEM.mechanism, symbol).frame_position(f"{s}:75%") for s in ("T1", "T3")))
@@ -437,5 +426,5 @@ def test_a_push_is_what_virtual_work_says_by_the_weight_of_its_segment():
             step[i] = 1e-6
             moved = (np.array(place(row + step, THETA)) - np.array(place(row - step, THETA))).ravel() / 2e-6
             assert found[k, i] == pytest.approx(moved, abs=1e-8)
-    found = _segment_weights(SYSTEM, THETA)
+    found = smoother_model._segment_weights(SYSTEM, THETA)
     assert found == pytest.approx({"T1": 9.81 * 0.064, "T2": 9.81 * 0.015, "T3": 9.81 * 0.016})

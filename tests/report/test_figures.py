@@ -19,12 +19,7 @@ from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.report import animation, figures
-from yid_ocp.report.animation import (
-    ConfigurationTrajectory,
-    animation_of_trajectories,
-    animations_to_dict,
-    measured_motion_animation,
-)
+from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, animations_to_dict
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.vision.surface_meshes import load_robot_meshes_by_joint
@@ -112,10 +107,10 @@ def test_a_recording_alone_is_a_scene_where_it_has_places(single_arm):
     t = np.array([0.0, 0.1, 0.2])
     points = PointGroup("camera", ("w_T1",), t, np.ones((3, 1, 3)))
     theta = single_arm.parameters.vector()
-    alone = measured_motion_animation("a", single_arm, theta, Recording(None, (points,), name="a"))
+    alone = animation.measured_motion_animation("a", single_arm, theta, Recording(None, (points,), name="a"))
     assert [motion.name for motion in alone.motions] == ["measured"]
     other = JointGroup(("elsewhere",), t, np.zeros((3, 1)))
-    assert measured_motion_animation("a", single_arm, theta, Recording(other, (), name="a")) is None
+    assert animation.measured_motion_animation("a", single_arm, theta, Recording(other, (), name="a")) is None
 
 
 @pytest.fixture(scope="module")
