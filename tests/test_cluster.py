@@ -91,7 +91,7 @@ def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path):
     if found[0].error or found[2].error:  # on a busy machine Dask blames a task that waits at a worker that ends
         found = run_tasks(deadly, tasks_of_three, tmp_path, scheduler.config)
     assert [entry.value for entry in found] == [0, None, 2]
-    assert found[1].error == "every worker that tried it ended abruptly"
+    assert "ended abruptly" in found[1].error
     try:
         scheduler.cluster.wait_for_workers(2, timeout=30)
     except TimeoutError:  # one that could not be started again in time, on a busy machine, is replaced

@@ -118,7 +118,8 @@ def test_where_two_processes_differ_is_said():
     found = software_fingerprint_differences(here, {**here, "casadi": "1.0", "code": "f" * 64})
     assert found == [casadi, code]
     del here["numpy"]
-    assert software_fingerprint_differences({**here, "numpy": "2"}, here) == ["numpy unknown instead of 2"]
+    [missing] = software_fingerprint_differences({**here, "numpy": "2"}, here)
+    assert all(fact in missing for fact in ("numpy", "unknown", " 2"))
 
 
 OPENERS = {"open", "read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "read_csv"}

@@ -195,7 +195,8 @@ def test_a_failing_task_is_recorded_tried_again_and_the_others_go_on(tmp_path, t
     found = run_tasks(fragile, tasks_of(5, broken=str(broken)), folder, threads)
     assert [entry.value for entry in found] == [0, 1, 2, None, 4]
     assert [entry.error for entry in found] == ["", "", "", "ZeroDivisionError: no 3", ""]
-    assert [record.getMessage() for record in caplog.records] == ["task 3 failed: ZeroDivisionError: no 3"]
+    [warned] = caplog.messages
+    assert all(fact in warned for fact in ("task 3", "ZeroDivisionError", "no 3"))
     (file,) = folder.glob("*.error.json")
     kept = json.loads(file.read_text())
     assert (kept["name"], kept["error"]) == ("task 3", "ZeroDivisionError: no 3")
@@ -293,7 +294,7 @@ def test_no_workers_and_workers_in_two_places_are_refused():
 def test_a_task_that_ends_its_process_takes_no_other_with_it(tmp_path, caplog):
     found = run_tasks(lethal, tasks_of(5, deadly=1), tmp_path)
     assert [entry.value for entry in found] == [0, None, 20, 30, 40]
-    assert [record.getMessage() for record in caplog.records] == ["task 1 failed: its process ended abruptly"]
+    assert [("task 1" in text, "abruptly" in text) for text in caplog.messages] == [(True, True)]
 
 
 SLEEPERS = """

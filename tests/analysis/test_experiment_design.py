@@ -143,7 +143,7 @@ def test_a_segment_has_a_tip_a_middle_and_a_marker(links, middle):
     assert [sight.name for sight in (*there, marker)] == ["w_T1", *middle, "T1_marker"]
     assert not any(sight.is_arm_measurable for sight in (*there, marker))
     assert all(sight.added_frame is None for sight in there)
-    assert marker.description == "a marker 3 cm off the axis at the end of T1"
+    assert all(fact in marker.description for fact in ("marker", "3 cm", "end of T1"))
 
 
 def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(urdf_folder):
@@ -166,7 +166,8 @@ def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
     *moving, marker = measurable_points(system)
     there = [name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0]
     assert [sight.name for sight in moving] == there
-    assert (marker.name, marker.description) == ("turn_marker", "a marker 3 cm off the axis of turn")
+    assert marker.name == "turn_marker"
+    assert all(fact in marker.description for fact in ("marker", "3 cm", "axis of turn"))
     wanted = MARKER_DISTANCE * np.array(beside) / np.linalg.norm(beside)
     np.testing.assert_allclose(places(system, [marker.added_frame], np.zeros(2))[0], wanted, atol=1e-12)
 
@@ -249,7 +250,7 @@ def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
     builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(swung(), np.array([np.nan, 0.1])))
     found = builder.position_sensitivities_of_variant(frozenset())
-    assert found == "elbow.stiffness = nan is not a finite number"
+    assert all(fact in found for fact in ("elbow.stiffness", "nan"))
 
 
 def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung):
@@ -261,7 +262,7 @@ def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung
     np.testing.assert_allclose(stated, 4 * blind, rtol=1e-9)
     assert made.problem.system.prescribed == ("shoulder",)
     assert builder.position_sensitivities_of_variant(frozenset({"torque"})) is made
-    assert heard.stages == ["working out joint torques as a measurement, the arms' motion as known"]
+    assert ["joint torques" in stage for stage in heard.stages] == [True]
 
 
 def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):

@@ -148,7 +148,8 @@ def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuis
     wide = Formula(lambda x: [30 * (x["a"] / 2 - 1) + 5 * x[name] for name in nuisances], start, bounds=FREE)
     monkeypatch.setattr(module, "free_starts_and_grasps", lambda *_: wide)
     [hidden] = identifiability(Formula(lambda x: [30 * (x["a"] / 2 - 1)], {"a": 2.0})).directions
-    assert (hidden.words, hidden.verdict) == (f"a cannot be separated from {words}", "not_identifiable")
+    assert hidden.verdict == "not_identifiable"
+    assert hidden.words.partition("a cannot be separated from ")[2] == words
 
 
 def test_a_combination_that_a_nuisance_hides_is_said_so():
@@ -212,9 +213,12 @@ def test_directions_are_sorted_and_say_how_well_they_are_seen():
     assert [d.singular_value for d in directions] == pytest.approx([3.0, 30.0])
     assert [d.std_relative for d in directions] == pytest.approx([1 / 3, 1 / 30])
     assert [d.verdict for d in directions] == ["weak", "identifiable"]
-    assert [d.words for d in directions] == ["b is determined only weakly (± 33 %)", "a is determined (± 3.3 %)"]
+    weak, sure = (d.words for d in directions)
+    assert all(fact in weak for fact in ("b is determined", "weakly", "± 33 %"))
+    assert ("a is determined" in sure, "weakly" in sure, "± 3.3 %" in sure) == (True, False, True)
     assert directions[0].components == {"a": pytest.approx(0.0), "b": pytest.approx(1.0)}
-    assert identifiability(Formula(two(30.0, 10.0), START)).directions[0].words == "b is determined (± 10 %)"
+    sure = identifiability(Formula(two(30.0, 10.0), START)).directions[0].words
+    assert ("weakly" in sure, "b is determined" in sure, "± 10 %" in sure) == (False, True, True)
 
 
 @pytest.mark.parametrize(
@@ -294,7 +298,7 @@ def test_a_plain_combination_has_its_direction_and_holds_at_a_finite_change(func
     if words is None:
         assert said.startswith("a and b are determined only together: ")
     else:
-        assert said == f"a and b are determined only as {words}"
+        assert said.partition("a and b are determined only as ")[2] == words
 
 
 def test_the_combination_that_moves_the_data_least_is_named_where_it_can_be_rolled_out():

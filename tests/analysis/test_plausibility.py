@@ -361,7 +361,7 @@ def test_clocks_that_are_far_apart(arms, runs):
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
     (doubt,) = forward_kinematics_issues(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
-    assert ("with times +0.4 s" in doubt.what, doubt.advice) == (True, "subtract 0.4 s from their times")
+    assert ("+0.4 s" in doubt.what, "subtract 0.4 s" in doubt.advice) == (True, True)
     (doubt,) = forward_kinematics_issues(arms[1], stamped(runs[1], drift=0.05), usual)
     assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_drift", pytest.approx(1.392, rel=2e-3))
     assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
@@ -444,7 +444,7 @@ def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
 def test_two_points_on_either_side_of_the_root_are_too_far_apart_for_the_branches_between_them(arms, runs):
     recording = with_points(runs[1], "points_camera", lambda p: p + np.array([[0.0, 0.6, 0.0], [0.0, -0.6, 0.0]]))
     (doubt,) = point_distance_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
-    assert doubt.what == "w_T1 from w_T3 is 1.81 m, but only 1.14 m along the object"
+    assert re.search(r"w_T1\b.*\bw_T3\b.*\b1\.81 m\b.*\b1\.14 m along", doubt.what)
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -141,7 +141,7 @@ def test_where_the_rollout_fails_the_end_is_open_and_said(limit, side):
     assert (lower if limit > 0 else upper) == pytest.approx(3 - 10 * HALF * np.sign(limit), rel=0.02)
     [note] = found.notes
     begin, _, barrier = note.rpartition(" ")
-    assert begin == f"the model cannot be rolled out {side}"
+    assert ("cannot be rolled out" in begin, side in begin) == (True, True)
     assert abs(float(barrier)) - abs(limit) == pytest.approx(0.005, abs=0.006)
     assert len(problem.asked) < 24
 

@@ -127,7 +127,8 @@ def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
 def test_an_entry_names_or_counts_its_variables_and_says_where_it_vanishes(symbols):
     entry = symbols.equation_or_derivative_by_name("constraint[hand.x], T1.bend")
     assert entry.is_identically_zero
-    assert entry.text_lines == ["d constraint[hand.x] / d T1.bend = 0 for every state"]
+    [line] = entry.text_lines
+    assert line.startswith("d constraint[hand.x] / d T1.bend = 0 ")
     stiffness = symbols.equation_or_derivative_by_name("del[elbow], elbow.stiffness")
     assert stiffness.variable_names == ("q0[elbow]", "elbow.rest", "h", "q1[elbow]")
     assert "8 of q0" in symbols.equation_or_derivative_by_name("del[T1_0_z]").variable_names

@@ -106,7 +106,7 @@ def test_changes_that_apply(short_run, held_tube):
             assert change.arm_frame == (what if kind == "arm" else "")
             assert change.camera_rate == (float(what) if kind == "rate" else None)
     assert names["tube"]["arm:T1_marker"].description.endswith("at the end of T1, seen by the arm")
-    assert names["tube"]["rate:30"].description == "the camera at 30 Hz without gaps"
+    assert "camera at 30 Hz" in names["tube"]["rate:30"].description
 
 
 def told(sets):

@@ -187,7 +187,8 @@ def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
 
     monkeypatch.setattr("yid_ocp.workflow.check.run_and_return_exit_code", noted)
     for _ in range(2):
-        assert cli("check", pendulum).err == "notice: a coupling is not modelled\nnotice: another thing\n"
+        [first, second] = cli("check", pendulum).err.splitlines()
+        assert ("a coupling is not modelled" in first, "another thing" in second) == (True, True)
 
 
 @pytest.mark.parametrize(

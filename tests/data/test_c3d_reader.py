@@ -42,12 +42,9 @@ def test_markers_of_a_file(tmp_path: Path) -> None:
     assert np.allclose(points.t, np.arange(6) / 200)
     assert np.allclose(points.position, 1e-3 * written, equal_nan=True)
     assert np.argwhere(np.isnan(points.position).all(axis=2)).tolist() == [[2, 1], [4, 0]]
-    assert sorted(recording.notes) == [
-        "*3 was left out (without label)",
-        "LKneeAngles was left out (result of a body model)",
-        "force was left out (an analog channel)",
-        "gone was left out (never seen)",
-    ]
+    why = {"*3": "label", "LKneeAngles": "body model", "force": "analog", "gone": "never seen"}
+    assert [note.split()[0] for note in sorted(recording.notes)] == list(why)
+    assert all(word in note for word, note in zip(why.values(), sorted(recording.notes), strict=True))
 
 
 def test_markers_are_named_and_chosen_and_keep_subjects_where_names_would_be_the_same(tmp_path: Path) -> None:
@@ -63,7 +60,7 @@ def test_the_preview_lists_markers_and_the_rest(tmp_path: Path) -> None:
     write_c3d(tmp_path / "run.c3d")
     contents = preview_file(tmp_path / "run.c3d")
     assert [source.imported_as for source in contents.sources[:2]] == ["point base", "point tip"]
-    assert contents.sources[1].note == "seen in 83% of the frames"
+    assert "83%" in contents.sources[1].note
     assert contents.sources[0].mean_rate == pytest.approx(200.0)
     assert read_any(tmp_path / "run.c3d", **contents.reader_options).point_names == ("base", "tip")
 

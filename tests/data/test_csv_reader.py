@@ -240,7 +240,8 @@ def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
     assert refused(path, "'fast'").where.endswith("line 3")
     recording = read_any(path, skip_bad_lines=True)
     assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
-    assert recording.notes == ("3 of 8 lines were left out: not rows of numbers (line 3, 5, 6)",)
+    [note] = recording.notes
+    assert all(fact in note for fact in ("3 of 8 lines", "left out", "line 3, 5, 6")), note
     mostly = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,slow\n")
     refused(mostly, "2 of 3 lines are not rows of 2 numbers", skip_bad_lines=True)
 
@@ -266,7 +267,7 @@ def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
     contents = preview_file(path)
     assert contents.reader_options["units"] == {"position": "deg", "points": "mm", "t": "ms"}
     assert contents.reader_options["skip_bad_lines"] is True
-    assert contents.notes[0] == "1 of 9 lines are not rows of numbers"
+    assert contents.notes[0].startswith("1 of 9 lines ")
     joints = joints_of(read_any(path, **contents.reader_options))
     assert joints.t[1] == pytest.approx(0.01)
     assert joints.position[0, 0] == pytest.approx(math.pi / 2)

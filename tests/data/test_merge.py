@@ -44,7 +44,8 @@ def test_a_shared_clock_is_left_as_it_is_and_said() -> None:
     merged = merge_recordings([camera(), ROBOT])
     assert np.array_equal(merged.joints.t, T)
     assert np.array_equal(merged.points[0].t, FRAMES)
-    assert merged.notes == ("robot and camera are assumed to have one clock: their times overlap by 18.99 s",)
+    [note] = merged.notes
+    assert all(fact in note for fact in ("robot and camera", "one clock", "18.99 s")), note
 
 
 @pytest.mark.parametrize("late", [0.08, 1.5])

@@ -246,7 +246,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     group = ["base@x", "friction@elbow", "offset@elbow", "third@x"]
     assert by_kind["friction"] == (group, ["base", "friction"], {"k": 2.0, A: 0.7}, "store", name, LIMITS)
     assert by_kind["offset"][2] == {"k": 3.0}
-    assert heard.stages == ["refitting base@x with each of 3 effects"]
+    assert [("base@x" in stage, "3 effects" in stage) for stage in heard.stages] == [(True, True)]
     both = [(f"base@x and {label}", "1.234") for label in ("friction@elbow", "offset@elbow")]
     assert (heard.table[0], sorted(heard.table[1:])) == (("effects", "held-out chi2/n"), both)
     assert sorted(text for done, _, text in heard.parts if done) == [

@@ -229,13 +229,13 @@ def test_costs_and_derivatives_that_are_not_finite_are_failures(make, monkeypatc
     problem = make(free=("elbow.rest",), prior_stds={"elbow.rest": 1e-200})
     failing = problem.evaluate(problem.initial_unknowns + 0.01)
     assert (failing.ok, failing.cost, failing.jacobian) == (False, math.inf, None)
-    assert failing.message == "the cost is not finite"
+    assert "cost is not finite" in failing.message
     problem = make(free=("elbow.rest",))
     steep = SimpleNamespace(residual_and_jacobian=lambda x: (np.zeros(1), np.full((1, 1), np.inf)))
     monkeypatch.setattr(problem, "priors", steep)
     failing = problem.evaluate(problem.initial_unknowns)
     assert (failing.ok, failing.cost, failing.jacobian) == (False, math.inf, None)
-    assert failing.message == "the derivatives are not finite"
+    assert "derivatives are not finite" in failing.message
     assert problem.evaluate(problem.initial_unknowns, derivatives=False).ok
 
 

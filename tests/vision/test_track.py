@@ -176,7 +176,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     duplicate, missing, late = (reports[3 + len(bad) + k] for k in range(3))
     assert "a duplicate" in duplicate
     assert "not a number" in missing
-    assert late == "no joint angles were recorded at its time"
+    assert "no joint angles" in late
     assert sum(found.frame_drop_reason_counts.values()) == len(bad) + 3
 
 

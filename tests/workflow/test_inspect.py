@@ -38,7 +38,7 @@ def test_a_recording_whose_start_is_fitted(carried_out, written, tmp_path):
     entries = ("--entry", "del[T1_0_y]", "--entry", "del[T1_0_y], T1.bend")
     done = carried_out("inspect", written(HANGING), *entries)
     result = done.result
-    assert result["linearisation"]["at"] == "the start that was fitted to the first points of aside"
+    assert all(fact in result["linearisation"]["at"] for fact in ("start", "fitted", "aside"))
     with h5py.File(tmp_path / "run" / "linearisation.h5") as file:
         assert abs(file["state"][1]) == pytest.approx(0.125, abs=0.01)
     # about a motion nothing is said of what is seen, but the recordings tell

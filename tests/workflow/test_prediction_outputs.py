@@ -146,7 +146,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
         ("e0", "-0.10 ± 0.01", "", "± 0.3"),
     ]
     many = {f"run {i}": {"s0": offset(0.1)} for i in range(6)}
-    assert torque_offset_table_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
+    assert torque_offset_table_rows({"torque_offsets": many})[-1][0].startswith("2 more recordings ")
     assert len(torque_offset_table_rows({"torque_offsets": {}})) == len(torque_offset_table_rows({})) == 1
 
 
@@ -216,7 +216,7 @@ def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
     (doubt,) = estimation._worse_than_baseline_issues([said], UNITS)
-    assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
+    assert all(fact in doubt.what for fact in ("model", "0.2 m (rms)", "'stays'", "0.1 m"))
     assert doubt.limit_violation_ratio == pytest.approx(0.2 / 0.105)
 
 

@@ -90,7 +90,7 @@ def test_strict_stops_a_run_in_doubt(printed, damaged, tmp_path, left_nothing, c
 def test_check_lists_what_is_in_doubt(carried_out, damaged):
     done = carried_out("check", damaged(noisy))
     assert "more noise than stated" in done.out
-    assert done.out.splitlines()[-2] == "a run is possible; see the issues"
+    assert "a run is possible" in done.out.splitlines()[-2]
 
 
 def test_times_that_are_not_seconds_stop_a_run_at_once(printed, damaged, tmp_path, left_nothing):
