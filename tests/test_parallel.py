@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
@@ -168,15 +169,12 @@ def test_results_depend_on_the_function_and_on_the_sources_that_are_named(tmp_pa
 
 
 def test_a_worker_of_other_sources_does_nothing(tmp_path, threads, monkeypatch):
-    here, perform, patched = software_fingerprint(), parallel_tasks._perform, "yid_ocp.parallel.resumable_tasks."
+    here, asker = software_fingerprint(), threading.current_thread()
 
-    def performed(job):
-        with monkeypatch.context() as patch:
-            patch.setattr(f"{patched}software_fingerprint", lambda: here)
-            return perform(job)
+    def fingerprint():
+        return {**here, "code": "a" * 64} if threading.current_thread() is asker else here
 
-    monkeypatch.setattr(f"{patched}software_fingerprint", lambda: {**here, "code": "a" * 64})
-    monkeypatch.setattr(f"{patched}_perform", performed)
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", fingerprint)
     (found,) = run_tasks(counted, tasks_of(1, calls=str(tmp_path / "calls")), tmp_path / "results", threads)
     assert f"is of another version: code {here['code'][:12]} instead of aaaaaaaaaaaa" in found.error
     assert not (tmp_path / "calls").exists()

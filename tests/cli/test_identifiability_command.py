@@ -2,13 +2,14 @@
 
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 
+from yid_ocp.analysis import identifiability as fisher
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import ParallelWorkError, SolverError
 from yid_ocp.parallel import InlineExecutor
-from yid_ocp.workflow import identifiability as identifiability_command
 from yid_ocp.workflow.build import build_system, system_with_second_arm_holding_object
 from yid_ocp.workflow.identifiability import IdentifiabilityOptions, run_identifiability
 
@@ -159,31 +160,32 @@ def test_workers_find_what_one_process_does(run, tmp_path):
 
 
 def test_an_interrupted_run_goes_on(run, tmp_path, monkeypatch):
-    names, done = [], identifiability_command._profile_likelihood_task
+    done, asked = fisher.identifiability, Mock(side_effect=[None, KeyboardInterrupt])
 
-    def twice(name, **arguments):
-        if len(names) == 1:
-            raise KeyboardInterrupt
-        names.append(name)
-        return done(name=name, **arguments)
+    def twice(problem, solution, intervals=(), **more):
+        if intervals:
+            asked(intervals)
+        return done(problem, solution, intervals=intervals, **more)
 
-    twice.__module__, twice.__qualname__ = done.__module__, done.__qualname__
-    monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", twice)
+    monkeypatch.setattr(fisher, "identifiability", twice)
     with pytest.raises(KeyboardInterrupt):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
     assert len(list((tmp_path / "run.partial" / "tasks").glob("*.json"))) == 1
-    monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", done)
+    monkeypatch.setattr(fisher, "identifiability", done)
     outcome = run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
     assert set(outcome.result["profiles"]) == {"spring_1.stiffness", "spring_2.stiffness"}
     assert not (tmp_path / "run.partial").exists()
 
 
 def test_a_part_that_fails_is_said(run, tmp_path, monkeypatch):
-    def failing(name, **arguments):
-        raise SolverError(f"no {name}", hint="mend it")
+    done = fisher.identifiability
 
-    failing.__module__, failing.__qualname__ = "yid_ocp.workflow.identifiability", "profiled"
-    monkeypatch.setattr(identifiability_command, "_profile_likelihood_task", failing)
+    def failing(problem, solution, intervals=(), **more):
+        if intervals:
+            raise SolverError(f"no {intervals[0]}", hint="mend it")
+        return done(problem, solution, **more)
+
+    monkeypatch.setattr(fisher, "identifiability", failing)
     words = r"2 of 2 tasks failed; the first failure is that of spring_1.stiffness, SolverError: no s(.|\n)*mend it"
     with pytest.raises(ParallelWorkError, match=words):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())

@@ -326,6 +326,6 @@ def test_the_trial_has_a_limit_on_its_memory(plain_file):
 def test_a_file_that_ends_the_library_or_never_ends_does_not_end_us(plain_file, monkeypatch, done, said):
     if done is signal.pause:
         monkeypatch.setattr(recording_hdf5, "_READ_TIMEOUT", 0.3)
-    monkeypatch.setattr(recording_hdf5, "_foreign", lambda group: done())
+    monkeypatch.setattr(h5py, "File", lambda *_: done())
     with pytest.raises(DataError, match=said), open_hdf5_after_read_check(plain_file):
         pass

@@ -8,8 +8,6 @@ import logging
 import math
 import re
 import shlex
-from importlib import metadata
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -19,7 +17,6 @@ from yid_ocp.effects import EFFECTS
 from yid_ocp.errors import ConfigError, OutputError, ParallelWorkError
 from yid_ocp.files import file_sha256, write_text
 from yid_ocp.report.sections import REPORT_SECTIONS
-from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.run_folder import atomic_run_folder, software_and_plugin_versions
 
@@ -275,24 +272,22 @@ def test_a_file_that_is_missing_or_changed(kinds, pendulum) -> None:
 
 
 def test_distributions_are_found_by_their_entry_point(kinds, pendulum, monkeypatch) -> None:
-    (pendulum.parent / "constant_effect.py").write_text(EFFECT.format(kind="constant"))
-    monkeypatch.syspath_prepend(str(pendulum.parent))
-    entry = metadata.EntryPoint("constant", "constant_effect", "yid_ocp.effects")
-    found = replace_dist(entry, SimpleNamespace(name="my-effects", version="1.2"))
-    monkeypatch.setattr(run_inputs, "_installed", lambda: [found])
+    def install(name, module):
+        info = pendulum.parent / name / "my_effects-1.2.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-effects\nVersion: 1.2\n")
+        (info / "entry_points.txt").write_text(f"[yid_ocp.effects]\n{name} = {module}\n")
+        monkeypatch.syspath_prepend(str(info.parent))
+        return info.parent
+
+    (install("constant", "constant_effect") / "constant_effect.py").write_text(EFFECT.format(kind="constant"))
     assert software_and_plugin_versions()["entry point constant"] == "my-effects 1.2"
     build_system(load_config(pendulum))
     assert "constant" in EFFECTS
     build_system(load_config(pendulum))  # as if a script had imported it before
-    broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", "yid_ocp.effects"), found.dist)
-    monkeypatch.setattr(run_inputs, "_installed", lambda: [broken])
+    install("gone", "no_such_module")
     with pytest.raises(ConfigError, match=r"entry point gone raised ModuleNotFoundError(.|\n)*my-effects 1.2"):
         build_system(load_config(pendulum))
-
-
-def replace_dist(entry, dist):
-    """What `importlib.metadata` does when it finds an entry point of a distribution."""
-    return entry._for(dist)
 
 
 def test_a_diagnosis_names_it_and_its_command_repeats_the_result(kinds, rubbing, tmp_path, carried_out) -> None:

@@ -32,7 +32,7 @@ def load_plugins(run: RunSettings) -> None:
     Raises `ConfigError` if a plug-in is missing, raises an error, registers nothing, uses a registered name, or changed
     after this process ran it. Nothing of this plug-in is then registered.
     """
-    for entry in _installed():
+    for entry in _installed(*sys.path):
         where, imported = f"{entry.value} of {_distribution(entry)}", entry.module in sys.modules
         with _registering(f"entry point {entry.name}", where, "update that package, or remove it", known=imported):
             entry.load()
@@ -52,7 +52,7 @@ def load_plugins(run: RunSettings) -> None:
 
 def installed_plugin_versions() -> dict[str, str]:
     """Return the package and version of each installed plugin (entry point group `yid_ocp.effects`)."""
-    return {f"entry point {entry.name}": _distribution(entry) for entry in _installed()}
+    return {f"entry point {entry.name}": _distribution(entry) for entry in _installed(*sys.path)}
 
 
 def _distribution(entry: metadata.EntryPoint) -> str:
@@ -60,8 +60,8 @@ def _distribution(entry: metadata.EntryPoint) -> str:
 
 
 @functools.cache
-def _installed() -> Sequence[metadata.EntryPoint]:
-    """Return the entry points of installed plug-ins. They are cached, because the search takes 5 ms."""
+def _installed(*_folders: str) -> Sequence[metadata.EntryPoint]:
+    """Return the entry points of installed plug-ins, cached by Python's search path, because the search takes 5 ms."""
     return sorted(metadata.entry_points(group=_ENTRY_POINT_GROUP), key=lambda entry: entry.name)
 
 
