@@ -11,13 +11,7 @@ from made_series import series
 from small_problems import PENDULUM, H, pendulum_step, taken
 
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.screening import (
-    _covariance_of_scores,
-    _newey_west_covariance,
-    _shape_grid,
-    linearize_candidates,
-    screen_candidates,
-)
+from yid_ocp.diagnosis.screening import _covariance_of_scores, _shape_grid, linearize_candidates, screen_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.inference import null_test
 from yid_ocp.inference.null_test import channels_with_residual_indices, encoder_noise_residual_covariance_factor
@@ -171,21 +165,6 @@ def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
     np.testing.assert_array_equal(found, found.T)
 
 
-@pytest.mark.parametrize("count", [1, 4, 9, 17])
-def test_the_robust_covariance_is_that_of_bartlett(count):
-    rng = np.random.default_rng(count)
-    columns, residual = rng.standard_normal((count + 5, 2)), rng.standard_normal(count + 5)
-    rows = np.arange(2, count + 2)
-    u = columns[rows] * residual[rows, None]
-    length = int(math.sqrt(count)) + 1
-    expected = np.zeros((2, 2))
-    for i in range(count):
-        for j in range(count):
-            expected += max(0.0, 1 - abs(i - j) / length) * np.outer(u[i], u[j])
-    found = _newey_west_covariance(columns, residual, [series(rows)])
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
-
-
 @cases(
     "columns, noise, expected, size, seen",
     {
@@ -233,17 +212,20 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
         assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
 
 
-def test_a_score_is_that_of_the_lagrange_multiplier_test():
-    x, r = np.array([1.0, 2.0, -1.0, 0.5]), np.array([-2.0, -5.0, 4.0, 1.0])
-    found = only(TWO_SIDED, x, r, noise=1e-9)
-    step = -float(x @ r) / float(x @ x)
-    left = r + x * step
-    assert found.predicted_values == {"offset@elbow.a": pytest.approx(step)}
+@pytest.mark.parametrize(("of", "count"), [(TWO_SIDED, 1), (TWO_SIDED, 4), (PAIR, 4), (PAIR, 9), (PAIR, 17)])
+def test_a_score_is_that_of_the_lagrange_multiplier_test(of, count):
+    names, rows, rng = of.amplitude_parameter_names, range(2, count + 2), np.random.default_rng(count)
+    x, r = rng.standard_normal((count + 5, len(names))), rng.standard_normal(count + 5)
+    [found] = scored(point(r, signature(of, x, 1e-9 * np.eye(len(names)))), rows)
+    step = -np.linalg.solve(x.T @ x, x.T @ r)
+    left = r + x @ step
+    assert found.predicted_values == pytest.approx(dict(zip(names, step, strict=True)))
     assert found.predicted_chi2_decrease == pytest.approx(float(r @ r - left @ left))
-    # scattering as what would be left with the step done
-    covariance = float(_newey_west_covariance(x[:, None], left, [series(range(4))])[0, 0])
-    assert found.lm_statistic == pytest.approx(float(x @ r) ** 2 / covariance)
-    assert found.p_value == pytest.approx(float(CHI2.sf(found.lm_statistic, 1)))
+    # scattering as what would be left with the step done, by Bartlett's weights
+    u, apart = (x * left[:, None])[2 : count + 2], np.abs(np.subtract.outer(rows, rows))
+    covariance = u.T @ np.maximum(0.0, 1 - apart / (int(math.sqrt(count)) + 1)) @ u
+    assert found.lm_statistic == pytest.approx(float((x.T @ r) @ np.linalg.solve(covariance, x.T @ r)))
+    assert found.p_value == pytest.approx(float(CHI2.sf(found.lm_statistic, len(names))))
 
 
 def test_stated_priors_scatter_as_stated_where_they_decide_a_score():

@@ -12,7 +12,6 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.report.diagnosis_summaries import _planning_command
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.plan import discrimination_plan_settings, identified_parameters_with_covariance, run_plan
@@ -181,7 +180,10 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     found = {"effects_to_discriminate": list(PAIR), "parameter_run_folder": str(folder)}
     assert section == {"goal": "information", **found}
     assert discrimination_plan_settings([], folder) is None
-    command = _planning_command(section)
+    result = {"summary": "", "verdict": "unknown", "next_plan": section, "seconds": {}, "which": []}
+    result |= {"unused_efforts": False, "gap": {"before": {"rmse": {}, "unit": {}}}}
+    lines = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT["yid-diagnosis/2"](result))
+    [command] = [line.strip() for line in lines if "yid-ocp plan" in line]
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
     overrides = [f"plan.effects_to_discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run_folder={folder}"]
     assert all(f"'{text}'" in command or text in command for text in overrides)

@@ -13,7 +13,6 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.objects.base import ClampPosePointNames
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
-    _smoothed_point_path,
     prescribed_coordinates_at_nodes,
     recorded_signal_kinds,
     smoothed_joint_efforts,
@@ -189,8 +188,9 @@ def clamped(origin, towards, t=None):
     return recording(None, seen(["o", "d"], t, np.stack([origin, towards], axis=1)))
 
 
-def path_of(made, grid):
-    return prescribed_coordinates_at_nodes(made, moving(*AXES), grid, PLAIN, (ClampPosePointNames("end", "o", "d"),))
+def path_of(made, grid, low_pass=None, towards="d"):
+    clamps = (ClampPosePointNames("end", "o", towards),)
+    return prescribed_coordinates_at_nodes(made, moving(*AXES), grid, low_pass or PLAIN, clamps)
 
 
 AXES = tuple(f"end_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
@@ -227,21 +227,21 @@ def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
     hidden = np.tile([0.0, 0.0, 1.0], (5, 1))
     hidden[1, 2] = math.nan
     made = clamped(origin, hidden)
-    np.testing.assert_allclose(_smoothed_point_path(made, "d", grid, PLAIN), np.tile([0.0, 0.0, 1.0], (5, 1)))
+    np.testing.assert_allclose(path_of(made, grid), np.zeros((5, 6)), atol=1e-12)
     hidden[2] = math.nan
     with pytest.raises(DataError, match="'d' is seen in 3 frames"):
         path_of(clamped(origin, hidden), grid)
     with pytest.raises(DataError, match="'x' is not recorded"):
-        _smoothed_point_path(made, "x", grid, PLAIN)
+        path_of(made, grid, towards="x")
 
 
 def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
     t = 0.01 * np.arange(300)
     line = np.stack([t, 2 * t, 0 * t], axis=1) + 0.1 * np.sin(2 * np.pi * 45 * t)[:, None]
-    made = recording(None, seen(["o"], t, line[:, None]))
-    found = _smoothed_point_path(made, "o", TimeGrid(0.5, 0.1, 20), ZeroPhaseLowPassFilter(5.0))
+    made = clamped(line, line + np.array([0.0, 0.0, 1.0]), t)
+    found = path_of(made, TimeGrid(0.5, 0.1, 20), ZeroPhaseLowPassFilter(5.0))[:, :3]
     np.testing.assert_allclose(found, np.outer(TimeGrid(0.5, 0.1, 20).node_times, [1.0, 2.0, 0.0]), atol=2e-3)
-    held = _smoothed_point_path(made, "o", TimeGrid(2.9, 0.1, 3), PLAIN)
+    held = path_of(made, TimeGrid(2.9, 0.1, 3))
     np.testing.assert_allclose(held[2], held[3])
 
 
