@@ -237,7 +237,7 @@ def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
 
 def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
     t = 0.01 * np.arange(300)
-    line = np.stack([t, 2 * t, 0 * t], axis=1) + 0.1 * np.sin(2 * np.pi * 45 * t)[:, None]
+    line = np.stack([t, 2 * t, 0 * t], axis=1) + 0.1 * np.cos(2 * np.pi * 45 * t)[:, None]
     made = clamped(line, line + np.array([0.0, 0.0, 1.0]), t)
     found = path_of(made, TimeGrid(0.5, 0.1, 20), ZeroPhaseLowPassFilter(5.0))[:, :3]
     np.testing.assert_allclose(found, np.outer(TimeGrid(0.5, 0.1, 20).node_times, [1.0, 2.0, 0.0]), atol=2e-3)
