@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
@@ -33,6 +34,7 @@ from yid_ocp.data import read_recording
 from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
@@ -181,10 +183,18 @@ def swing(t, size=1.0, rate=2.0):
     return angle * np.sin(phase), angle * rate * np.cos(phase), -angle * rate**2 * np.sin(phase)
 
 
+def needed(drives, q, v, a):
+    """Efforts (N, k) of rigid bodies, as the Lagrangian has them."""
+    tree, (x, w, u) = drives.system.mechanism_with_values(), (ca.SX.sym(name, 2) for name in "xwu")
+    terms = lagrangian_first_derivatives(forward_kinematics(tree, x), w, drives.system.gravity)
+    effort = ca.jtimes(terms.lagrangian_by_v, x, w) + ca.jtimes(terms.lagrangian_by_v, w, u) - terms.lagrangian_by_q
+    return np.array(ca.Function("needed", [x, w, u], [effort]).map(len(q))(q.T, v.T, a.T)).T
+
+
 def swung(drives, change=lambda e: e, size=1.0, rate=2.0, behind=0.0, noise=0.0, length=12.0, seed=0, **more):
     """Two drives that swing, with the efforts that they need, changed, and noise."""
     t = np.arange(0.0, length, 0.005)
-    effort = change(drives._inverse_dynamics(*swing(t - behind, size, rate)))
+    effort = change(needed(drives, *swing(t - behind, size, rate)))
     effort = effort + noise * np.random.default_rng(seed).standard_normal(effort.shape)
     return Recording(JointGroup(drives.joint_names, t, swing(t, size, rate)[0], effort=effort, **more), name="run")
 
@@ -615,7 +625,7 @@ SLOW = {"rate": 0.12, "noise": 0.05, "effort_std": 0.05, "length": 30.0}
 @pytest.mark.parametrize(("rate", "said"), [(0.12, True), (3.0, False), (6.0, False)])
 def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
     q, v, a = swing(np.arange(0.0, 30.0, 0.005), 0.03, rate)
-    moving = drives._inverse_dynamics(q, v, a) - drives._inverse_dynamics(q, 0 * v, 0 * a)
+    moving = needed(drives, q, v, a) - needed(drives, q, 0 * v, 0 * a)
     # beside friction of 4 % of the largest effort per rad/s
     seen = np.linalg.norm(np.hypot(moving, 6 * 0.04 * v) / 0.05)
     for seed in range(3):
