@@ -10,7 +10,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,7 +20,6 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.display import Progress
 from yid_ocp.errors import ParallelWorkError
 from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, run_tasks
-from yid_ocp.parallel.resumable_tasks import _dask_executor as connected
 from yid_ocp.version import software_fingerprint
 from yid_ocp.workflow.blind import run_blind
 
@@ -114,17 +113,14 @@ def test_a_worker_of_another_version_is_refused(scheduler, monkeypatch, other, w
 
 
 def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
-    elsewhere = SimpleNamespace(__module__="nowhere.to_be_found")
-    missing = "ModuleNotFoundError: No module named 'nowhere'"
-    with pytest.raises(ParallelWorkError, match=missing), connected(scheduler.address, elsewhere, tmp_path):
-        pass
+    elsewhere, tasks = FunctionType(squared.__code__, {}), [Task("", {"number": 3})]
+    elsewhere.__module__ = "nowhere.to_be_found"
+    with pytest.raises(ParallelWorkError, match="ModuleNotFoundError: No module named 'nowhere'"):
+        run_tasks(elsewhere, tasks, tmp_path, scheduler.config)
     unseen = nullcontext(SimpleNamespace(name=str(tmp_path / "unseen")))
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.tempfile.NamedTemporaryFile", lambda **_: unseen)
-    with (
-        pytest.raises(ParallelWorkError, match=f"does not see {tmp_path}"),
-        connected(scheduler.address, squared, tmp_path),
-    ):
-        pass
+    with pytest.raises(ParallelWorkError, match=f"does not see {tmp_path}"):
+        run_tasks(squared, tasks, tmp_path, scheduler.config)
 
 
 def test_workers_of_several_threads_are_refused(distributed):
@@ -158,7 +154,9 @@ def test_a_scheduler_file_will_do(scheduler, tmp_path):
 
 
 @pytest.mark.parametrize(("failures", "refused"), [(2, False), (3, True)])
-def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, distributed, monkeypatch, failures, refused):
+def test_an_event_loop_that_has_no_time_to_start_is_tried_again(
+    scheduler, distributed, monkeypatch, tmp_path, failures, refused
+):
     """Dask asserts that it runs after ten seconds."""
     real, asked = distributed.Client, []
 
@@ -169,8 +167,8 @@ def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, distr
 
     monkeypatch.setattr(distributed, "Client", busy)
     answer = pytest.raises(ParallelWorkError, match="event loop of Dask did not start") if refused else nullcontext()
-    with answer, connected(scheduler.address) as (executor, _):
-        assert executor.submit(abs, -3).result(timeout=60) == 3
+    with answer:
+        assert run_tasks(deadly, [Task("", {"number": 3})], tmp_path, scheduler.config)[0].value == 3
     assert len(asked) == 3
 
 
