@@ -33,7 +33,6 @@ from yid_ocp.parallel import (
     run_tasks,
 )
 from yid_ocp.parallel import resumable_tasks as parallel_tasks
-from yid_ocp.parallel.threads_and_processes import _max_threads as threads_of_process
 from yid_ocp.version import software_fingerprint
 
 
@@ -75,8 +74,12 @@ def strange(number: int) -> Any:
 
 
 def process_name_and_threads(number: int) -> tuple[str, int]:
+    def thread(item: int) -> int:
+        time.sleep(0.01)
+        return threading.get_ident()
+
     del number
-    return multiprocessing.current_process().name, threads_of_process()
+    return multiprocessing.current_process().name, len(set(map_in_threads(thread, range(8))))
 
 
 def tasks_of(count: int, **arguments: Any) -> list[Task]:
