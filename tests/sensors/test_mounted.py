@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -23,9 +24,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
-from yid_ocp.sensors import sensor_function_with_jacobians
-from yid_ocp.sensors.mounted import _Accelerometer, _Gyroscope
-from yid_ocp.sensors.wrist import _WristForceSensor, _WristTorqueSensor
+from yid_ocp.sensors import SENSOR_READERS, sensor_function_with_jacobians
 from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import load_problem
 
@@ -53,7 +52,7 @@ JOINTS = [
 ]
 PARTS = "".join([*(LINK.format(*body) for body in BODIES), *(JOINT.format(*joint) for joint in JOINTS)])
 ARM, START = ("shoulder", "elbow"), {"shoulder": 0.8, "elbow": 0.6}
-KINDS = {"force": _WristForceSensor, "torque": _WristTorqueSensor, "gyro": _Gyroscope, "accelerometer": _Accelerometer}
+KINDS = {"force": "wrist", "torque": "wrist", "gyro": "imu", "accelerometer": "imu"}
 QUANTITIES = {"force": "force", "torque": "torque", "gyro": "angular_velocity", "accelerometer": "specific_force"}
 STDS = {"force_std": 0.1, "torque_std": 0.01}
 
@@ -81,8 +80,13 @@ def test_a_sensor_reads_what_mujoco_reads(urdf: Path) -> None:
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     order = [model.joint(name).qposadr[0] for name in system.mechanism.joint_names]
     for frame in ("wrist", "tool"):
-        for kind, sensor in KINDS.items():
-            read = sensor_function_with_jacobians(system, sensor((frame,), (1.0,), (frame,), "any"), ())
+        for kind, group in KINDS.items():
+            zeros = {QUANTITIES[kind]: np.zeros((3, 1, 3))}
+            recorded = SimpleNamespace(name="r", channel_groups=[SensorChannelGroup(group, (frame,), range(3), zeros)])
+            around = SimpleNamespace(system=system, recording=recorded, sensor_usage=lambda key: SensorOptions(std=1.0))
+            around.node_times = np.arange(3.0)
+            [mounted] = SENSOR_READERS[f"{group}.{QUANTITIES[kind]}"](around)
+            read = sensor_function_with_jacobians(system, mounted.sensor, ())
             data.qpos[:], data.qvel[:], data.qfrc_applied[:] = rng.uniform(-1, 1, (3, 4)) * [[1], [2], [2]]
             mujoco.mj_forward(model, data)
             at = {"q": data.qpos[order], "v": data.qvel[order], "a": data.qacc[order]}
