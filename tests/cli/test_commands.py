@@ -166,7 +166,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
         "exit_code": 2,
     }
     assert "did you mean 'max_iterations'?" in wrong.err
-    assert json.loads(cli("solve", "--json", "--sett", "a").out)["what"] == "there is no option '--sett'"
+    assert json.loads(cli("solve", "--json", "--sett", "a").out)["what"].endswith("no option '--sett'")
     assert cli("solve", "--sett", "a").out == ""
     broken, command = Mock(side_effect=ZeroDivisionError("no good")), "yid_ocp.workflow.check.run_and_return_exit_code"
     monkeypatch.setattr(command, broken)
