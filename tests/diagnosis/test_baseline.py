@@ -38,11 +38,11 @@ problem: {time_step: 0.01, initial_state: estimated, initial_configuration_prior
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
 output: {write_report: false, discretisation_check: none}
 """
-NOISE, LOAD = 1e-4, 0.05
+NOISE, LOAD, SOFTER = 1e-4, 0.05, 0.016
 TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}
 
 
-def swing(folder, name, seed, effects="[]"):
+def swing(folder, name, seed, effects="[]", **changed):
     """A recording of 1.6 s of the beam let go from 0.1 rad a joint, and its file."""
     t = np.arange(161) * 0.01
     empty = Recording(None, (PointGroup("points", ("w_beam",), t, np.zeros((161, 1, 3)), NOISE),))
@@ -50,7 +50,7 @@ def swing(folder, name, seed, effects="[]"):
     (folder / "beam.yaml").write_text(BEAM, encoding="utf-8")
     problem = build_problem(load_config(folder / "beam.yaml", (f"model.effects={effects}",)))
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
-    values = problem.unknowns.named_values(problem.pack_unknowns({**TRUTH, **start}))
+    values = problem.unknowns.named_values(problem.pack_unknowns({**TRUTH, **changed, **start}))
     theta, offset = problem.unpack_episode_unknowns(problem.pack_unknowns(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
@@ -64,6 +64,7 @@ def beam(tmp_path_factory):
     folder = tmp_path_factory.mktemp("beam")
     swing(folder, "loaded", 2, f"[{{kind: point_mass, location: w_beam, values: {{mass: {LOAD}}}}}]")
     swing(folder, "again", 3)
+    swing(folder, "softer", 4, **{"beam.bend": SOFTER})
     swing(folder, "bare", 1)
     run_solve(load_config(folder / "beam.yaml"), folder / "old")
     return folder
@@ -87,6 +88,13 @@ def test_a_load_is_what_differs_and_taking_it_away_predicts_the_first_day(beam, 
         assert errors["counterfactual"] < 1.5 * np.sqrt(3) * NOISE < errors["without_diagnosis"]
     assert "Recordings made without the effects (bare) are predicted to" in result["summary"]
     assert set(result["model"]["covariance"]["names"]) == {*TRUTH, "point_mass@w_beam.mass"}
+
+
+def test_a_parameter_that_has_left_the_baseline_is_estimated_without_it(beam, tmp_path):
+    outcome = diagnosed(beam, "softer", tmp_path / "new")
+    [shift] = outcome.output.baseline_comparison.significant_parameter_shifts
+    assert (outcome.result["verdict"], shift.name) == ("no_gap", "beam.bend")
+    assert abs(shift.current_value - SOFTER) < 4 * shift.current_std
 
 
 def test_nothing_differs_where_nothing_changed(beam, tmp_path):

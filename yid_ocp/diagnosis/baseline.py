@@ -60,9 +60,9 @@ class ParameterShiftsSinceBaseline:
 
     @property
     def significant_parameter_shifts(self) -> tuple[_ParameterShift, ...]:
-        """The parameters that have changed significantly, with the smallest p-value first."""
+        """The parameters that have changed significantly, with the largest shift in standard deviations first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
-        return tuple(sorted(changed, key=lambda entry: entry.p_value))
+        return tuple(sorted(changed, key=lambda entry: -abs(entry.z_score or 0.0)))
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the parameter changes to a dictionary, the entry `baseline` of `yid-diagnosis/2`."""
@@ -122,19 +122,21 @@ class EarlierRunsBaseline:
         plain = _plain_variance(fit)
         weighted = dict(zip(prior.parameter_names, np.diag(prior.covariance), strict=True))
         every = zip(baseline.parameter_names, baseline.values, baseline.std, strict=True)
-        known_before, shifts = [entry for entry in every if entry[0] in weighted], []
+        known_before, shifts = [entry for entry in every if entry[0] in fit.values], []
         for name, value, std in known_before:
-            # in units of noise alone, all variances of a problem are smaller by one factor
-            now, c0 = fit.values[name], float(std) ** 2
-            c = plain[name] * c0 / float(weighted[name])
-            counted = max(1.0, fit.std[name] ** 2 / c) if c > 0 and math.isfinite(fit.std[name]) else 1.0
-            weight = 1 - c / c0
+            now, own, c0 = fit.values[name], fit.std[name], float(std) ** 2
+            # without a prior both estimates are independent
+            weight, variance = float(math.isfinite(own)), c0 + own**2
+            if name in weighted:
+                # in units of noise alone, all variances of a problem are smaller by one factor
+                c = plain[name] * c0 / float(weighted[name])
+                weight, counted = 1 - c / c0, max(1.0, own**2 / c) if c > 0 and math.isfinite(own) else 1.0
+                variance = (c0 + (counted - 1) * c) * weight
             score, p = None, 1.0
             if weight > _MIN_INFORMED_FRACTION:
-                variance = c0 * weight + (counted - 1) * c * weight
                 score = (now - float(value)) / math.sqrt(variance)
                 p = float(2 * scipy.special.ndtr(-abs(score)))
-            known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, fit.std[name])
+            known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, own)
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
@@ -142,6 +144,11 @@ class EarlierRunsBaseline:
         """Return whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
         found = self.parameter_shifts_of_fit(fit, limits)
         return found is not None and bool(found.significant_parameter_shifts)
+
+    def parameters_that_left_priors(self, fit: RefittedModel, limits: Thresholds) -> list[str]:
+        """List the significantly changed parameters of `fit` that earlier runs still hold, most changed first."""
+        found, held = self.parameter_shifts_of_fit(fit, limits), fit.problem.options.multivariate_prior.parameter_names
+        return [entry.name for entry in found.significant_parameter_shifts if entry.name in held] if found else []
 
     def predict_counterfactual_errors(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress

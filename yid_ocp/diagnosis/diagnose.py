@@ -17,7 +17,7 @@ from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_st
 from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis import hypotheses
+from yid_ocp.diagnosis import hypotheses, select
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
@@ -25,7 +25,6 @@ from yid_ocp.diagnosis.gap_law import find_gap_law
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
-    EffectSearchRecord,
     HeldOutPredictions,
     NominalSolutionAndRefitStore,
     RefitContext,
@@ -186,7 +185,7 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) ->
 def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     h, search = seen.nominal.problem.step.time_step / 2, seen.with_events
     search.progress.begin_stage(f"{why}: going on at {h:g} s")
-    search = replace(search, problem=search.problem.with_time_step(h), record=EffectSearchRecord(), rounds=[])
+    search = search.restarted_with(search.problem.with_time_step(h), search.store)
     return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
 
 
@@ -211,10 +210,38 @@ def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examin
     if problem is None:
         return None
     seen.search.progress.begin_stage(f"going on with the noise beside {hypotheses.join_effect_labels(fit.effects)}")
-    # stored and recorded results are of the noise before
-    search = replace(seen.with_events, problem=problem, store=NO_REFIT_STORE, record=EffectSearchRecord(), rounds=[])
-    told = seen.truncated, seen.is_corrected_for_links, seen.removed
+    return _examined_with(seen, problem)
+
+
+def _examined_with(seen: _Examined, problem: AllCandidatesProblem) -> _Examined:
+    """The nominal model, examined again with other noise or priors."""
+    search, told = seen.with_events.restarted_with(problem), (seen.truncated, seen.is_corrected_for_links, seen.removed)
     return _examined(search, _fitted_nominal_model(search, seen.nominal.values), *told)
+
+
+def _without_priors_of(problem: AllCandidatesProblem, released: Sequence[str]) -> AllCandidatesProblem:
+    prior = problem.problem.options.multivariate_prior
+    kept = prior.restricted_to([name for name in prior.parameter_names if name not in released])
+    return replace(problem, problem=problem.problem.with_replaced_multivariate_prior(kept))
+
+
+def _with_changed_parameters(seen: _Examined, judged: Judgement, earlier: EarlierRunsBaseline) -> _Examined | None:
+    """The nominal model, examined again without the priors of parameters that have left the earlier runs.
+
+    None if it does not explain the recordings, or decidedly worse than rejected or not decidedly better than accepted
+    effects.
+    """
+    search, fit, released = seen.search, seen.nominal, list[str]()
+    while left := earlier.parameters_that_left_priors(fit, search.thresholds):
+        released.append(left[0])
+        search.progress.begin_stage(f"trying a change of {' and '.join(released)}", 1.0, 8.5)
+        fit = _fitted_nominal_model(search.restarted_with(_without_priors_of(search.problem, released)), fit.values)
+    best = [seen.nominal, *(entry.refitted_model for entry in judged.selected_effects)][-1]
+    limits, most = search.thresholds, 1.0 if judged.verdict == "unknown" else -1.0
+    if not released or select.relative_bic_difference(fit, best, len(released), limits) > most:
+        return None
+    anew = _examined_with(seen, _without_priors_of(seen.with_events.problem, released))
+    return None if anew.evidence.residual_exceeds_noise(limits) else anew
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
@@ -246,8 +273,7 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return None
     search.progress.begin_stage("twice the links lower chi2: going on without their error")
-    # stored and recorded results are of the uncorrected data
-    search = replace(search, problem=problem, store=NO_REFIT_STORE, record=EffectSearchRecord(), rounds=[])
+    search = search.restarted_with(problem)
     nominal = _fitted_nominal_model(search, refitted.values)
     return _examined(search, nominal, seen.truncated, True, seen.removed + 2 * (fit.cost - refitted.cost))
 
@@ -342,8 +368,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_from_baseline(nominal, limits))
     judged = judge(search, evidence)
     # after the deadline a search that begins anew would find nothing
-    anew = _examined_anew(seen, judged) if time.perf_counter() < search.deadline else None
-    if anew is not None:
+    is_early = time.perf_counter() < search.deadline
+    if is_early and (anew := _with_changed_parameters(seen, judged, earlier) or _examined_anew(seen, judged)):
         return _diagnosed(problem, anew, earlier)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()

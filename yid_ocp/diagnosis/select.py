@@ -107,6 +107,12 @@ def bic_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
 
 
+def relative_bic_difference(fit: RefitStatistics, other: RefitStatistics, more: int, limits: Thresholds) -> float:
+    """Compute the BIC of `fit`, which has `more` parameters beside its effects', minus that of `other`; ±1 decides."""
+    difference = bic_difference(fit, other) + more * math.log(max(fit.residual_count, 1))
+    return difference / (2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor)
+
+
 def _near_best_models(
     nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> list[tuple[RefitStatistics, float]]:
