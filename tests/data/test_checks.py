@@ -31,7 +31,7 @@ def made(seed: int = 1, duration: float = 8.0, rate: float = 100.0, **more) -> R
     effort = 5 * np.sin(0.7 * wave * t[:, None]) + 0.05 * rng.standard_normal(angle.shape)
     position = angle + STD * rng.standard_normal(angle.shape)
     velocity = rate_of + 5e-3 * rng.standard_normal(angle.shape)
-    stds = {"position_std": STD, "effort_std": 0.05}
+    stds = {"position_std": np.full(3, STD), "effort_std": 0.05}
     joints = JointGroup(NAMES, t, position, velocity=velocity, effort=effort, **stds, **more)
     at = np.arange(0.2, duration, 0.3)
     seen = np.stack([np.sin(at), np.cos(at), 0 * at], axis=1)[:, None, :]

@@ -87,6 +87,7 @@ def test_a_solve_says_what_is_not_found():
     good = "the model explains the recordings to within their noise (chi2 per degree of freedom is 1.03)"
     assert lines[-2] == good
     assert all(fact in lines[-1] for fact in ("converged", "done", "4 iterations", "1.0 s"))
+    assert any(line.startswith("Recorded torques") for line in told("yid-solve/1", solved(unused_efforts=True)))
     assert not any("p_fixed" in line for line in lines)
     poor = {"p": parameter("not_trusted", 9.0) | {"upper": 9.0}}
     for name, side, bound, result in (

@@ -105,7 +105,10 @@ def folder_of(path, values=(0.02, 5e-5), std=(2e-4, 1e-6), correlation=0.5, **mo
 
 
 def test_a_baseline_is_a_joint_prior_about_its_values(run, tmp_path):
-    known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
+    shift = {"beam.bend": {"links": 9.0}, "beam.damping": {"links": None, "encoder_noise": 4e-6}}
+    known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5), discretisation=shift))
+    # of two runs, only the shift by encoder noise differs
+    assert known.std == pytest.approx([2e-4, np.hypot(1e-6, 8e-6)])
     problem, _ = problem_with_priors_and_baseline(build_problem(run), known)
     at = [problem.unknown_names.index(name) for name in ("beam.bend", "beam.damping")]
     assert problem.initial_unknowns[at] == pytest.approx([0.018, 4e-5])

@@ -68,8 +68,8 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         usual = float(np.mean(elsewhere)) if len(elsewhere) >= count // 4 else 1.0
         # if the channel changes in nine of ten samples, a repetition of this length is not chance
         evidence = (count / QUALITY_LIMITS.min_stuck_samples) if usual < 0.1 else 0.0
-        stated = joints is not None and quantity == "position" and bool(np.all(joints.position_std or 0))
-        if count == len(same) and stated:
+        stated = None if joints is None or quantity != "position" else joints.position_std
+        if count == len(same) and stated is not None and np.all(stated):
             evidence = count / QUALITY_LIMITS.min_stuck_samples
         if turned > unseen:
             evidence = max(evidence, turned / unseen)

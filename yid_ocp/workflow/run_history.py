@@ -61,8 +61,8 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         values = np.array([float(parameters[name]["value"]) for name in names])
         matrix = np.array(known["matrix"], float).reshape(len(names), len(names))
         # noise that moves an object differs from run to run; errors of links and time step are the same in all runs
-        shifts = (result.get("discretisation", {}).get(name, {}).get("encoder_noise", 0.0) for name in names)
-        spread = 2 * np.array([float(shift) for shift in shifts])
+        shifts = [result.get("discretisation", {}).get(name, {}).get("encoder_noise") or 0.0 for name in names]
+        spread = 2 * np.array(shifts, float)
         matrix += np.outer(spread, spread)
         units = {name: str(parameters[name]["unit"]) for name in names}
         explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
