@@ -152,7 +152,7 @@ def _places(result: DiagnosisResult) -> str:
     rest = 1 - sum(place.gap_share for place in where)
     named += [f"other places ({100 * rest:.0f} %)"] * (rest >= 0.005)
     side = _GAP_ORIGIN_PHRASES.get(result.smoother_result.plant_or_sensor_origin, "")
-    return f"It lies in {' and '.join(named)}{side}."
+    return f"It lies in {', '.join(named)}{side}."
 
 
 def _causes(result: DiagnosisResult) -> list[str]:
