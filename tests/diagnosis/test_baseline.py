@@ -86,7 +86,7 @@ def test_a_load_is_what_differs_and_taking_it_away_predicts_the_first_day(beam, 
         errors = result["counterfactual"][part]["rmse"]["points.w_beam"]
         # no more than noise in three coordinates is left
         assert errors["counterfactual"] < 1.5 * np.sqrt(3) * NOISE < errors["without_diagnosis"]
-    assert "Recordings made without the effects (bare) are predicted to" in result["summary"]
+    assert "Recordings made without the effects (bare) are predicted with an error of" in result["summary"]
     assert set(result["model"]["covariance"]["names"]) == {*TRUTH, "point_mass@w_beam.mass"}
 
 

@@ -153,7 +153,7 @@ class EarlierRunsBaseline:
     def predict_counterfactual_errors(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> CounterfactualPredictionErrors | None:
-        """Return prediction errors that test the effects of `last`, for example before and after a repair.
+        """Predict recordings made without the effects of `last`, and those with them, with and without these effects.
 
         Reference recordings are predicted by `last` without its effects, and the diagnosed recordings by the parameters
         of the earlier runs with these effects. Without earlier runs, these parameters are estimated on the reference

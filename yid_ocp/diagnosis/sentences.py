@@ -70,7 +70,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     notes = (
         (stated != used, f"{step} (set problem.time_step: {used} for other commands)."),
         (result.is_corrected_for_links, links),
-        (result.is_split_in_blocks, "No recording could be held out, so alternate blocks of the recordings were."),
+        (result.is_split_in_blocks, "No recording could be held out, so every second block of time is held out."),
     )
     text += _applying(notes)
     events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
@@ -173,9 +173,9 @@ def _causes(result: DiagnosisResult) -> list[str]:
     explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
     reasons = {
-        "": f"The probability that the cause is named here is {100 * result.probability:.0f} %.",
+        "": f"This names the cause with a probability of {100 * result.probability:.0f} %.",
         "none": "None of the effects that were tried explains it well enough.",
-        "little": f"This explains {explained:.3g} % of the gap in the fitted motions; {enough:.3g} % is needed.",
+        "little": f"This explains {explained:.3g} % of the gap in the fitted motions; a cause needs {enough:.3g} %.",
         "stand_in": f"This only imitates the cause, because it changes with the recordings: {'; '.join(apart)}.",
     }
     return [*text, reasons[result.unknown_reason], _several_places(result)]
@@ -213,7 +213,7 @@ def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     values, odd, neutral = [], "", effect.neutral_values
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
         known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
-        values.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
+        values.append(f"{name} {known if math.isfinite(r.std) else '= unknown'}")
     for name in fit.implausible_parameters(effect, limits):
         low, high = effect.prior_ranges[name]
         odd = f" (far outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
@@ -231,7 +231,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
     what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
     said = "is within noise and the uncertainty of the parameters"
     if result.remaining_test.p_value < result.thresholds.significance_level:
-        said = f"exceeds noise: {', '.join([*worst.values(), *mostly])}"
+        said = f"exceeds noise by {', '.join([*worst.values(), *mostly])}"
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_parameters_before_and_after.items()
@@ -262,7 +262,8 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         if part.failure_message:
             text.append(f"{made} could not be predicted ({part.failure_message}).")
             continue
-        text.append(f"{made} are predicted to {errors} (rms) {how} them, and to {plain} without a diagnosis.")
+        errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by that before the diagnosis"
+        text.append(f"{made} are predicted with an error of {errors}.")
         if not part.is_improved_by_counterfactual:
-            text.append("That is no better, so the effect may be a substitute for another cause.")
+            text.append("The effects do not lower this error, so they may be a substitute for another cause.")
     return text

@@ -134,7 +134,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 @dataclass(frozen=True)
 class JointMotionAndTorqueWithSensitivities:
-    """The angles and torques of the driven joints over the steps of a recording, with derivatives (..., d).
+    """The angles and torques of the driven joints over a recording, with their derivatives in d directions (..., d).
 
     The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
     """

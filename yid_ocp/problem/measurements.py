@@ -276,7 +276,7 @@ def huber_loss_and_sqrt_weights(residual: Array, scale: float) -> tuple[float, A
 
 
 def whiten_against_sensor_biases(slopes: Array, columns: Array) -> Array:
-    """Whiten a residual and its derivatives, already in units of noise, against constant sensor errors as well.
+    """Add constant sensor errors of known variance to the noise by which a residual and its derivatives are whitened.
 
     The first column of `columns` (r, c) is the residual, all other columns are its derivatives. `slopes` (r, m) are the
     derivatives of whitened measurements with respect to m constant errors, each in units of its standard deviation.
@@ -304,7 +304,7 @@ def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[Sensor
 def subtract_estimated_bias_and_clock_errors(
     samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
 ) -> tuple[SensorMeasurements, ...]:
-    """Estimate constant errors and clock offsets from predictions (M, k), one per sensor, and subtract them."""
+    """Subtract from measurements the constant errors and clock offsets that predictions (M, k), one a sensor, show."""
     slopes = whitened_measurement_sensitivities_to_sensor_errors(samples)
     if not slopes.shape[1]:
         return tuple(samples)

@@ -278,7 +278,7 @@ def second_difference_acceleration(q: Array, nodes: IntArray, time_step: float) 
 
 
 def second_difference_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Return the transpose of `second_difference_acceleration` times `pull` (len(nodes), n), for all `count` nodes."""
+    """Apply the transpose of the map `second_difference_acceleration` to `pull` (len(nodes), n). Returns (count, n)."""
     middle, result = _inner_nodes(nodes, count), np.zeros((count, pull.shape[1]))
     for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
         np.add.at(result, middle + shift, factor / time_step**2 * pull)

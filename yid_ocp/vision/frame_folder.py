@@ -223,7 +223,7 @@ def read_frame_folder(
     frame = head.get("frame", "camera")
     if frame not in ("camera", "world"):
         said = unknown_name_error_arguments(str(frame), ("camera", "world"))
-        raise DataError(f"the frame of the clouds is '{frame}'", where=f"{where}: frame", **said)
+        raise DataError(f"'{frame}' is no coordinate frame of clouds", where=f"{where}: frame", **said)
     intrinsics = _intrinsics(head.get("intrinsics"), where)
     names, times = _read_stamps(path / STAMP_FILE)
     _check_kinds(names, path, intrinsics)
@@ -313,7 +313,8 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
     if not isinstance(coefficients, (list, tuple)) or not all(type(k) in (int, float) for k in coefficients):
-        raise DataError(f"the coefficients are {coefficients!r}", where=f"{where}: intrinsics", allowed="[number, ...]")
+        what = f"the lens' coefficients {coefficients!r} are no list of numbers"
+        raise DataError(what, where=f"{where}: intrinsics", allowed="[number, ...]")
     model, distortion = str(entry.get("model", "plumb_bob")), tuple(float(k) for k in coefficients)
     return frames.CameraIntrinsics(int(width), int(height), fx, fy, cx, cy, model, distortion)
 

@@ -235,7 +235,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
 def require_recordings_not_in_baseline(
     run: RunSettings, problem: EstimationProblem, runs: Sequence[RunEstimates], without: Sequence[Recording]
 ) -> None:
-    """Raise `ConfigError` if a recording of the run is also one of the baseline or reference recordings `without`."""
+    """Raise `ConfigError` if a recording of the run is in `without`: those of the baseline or the reference."""
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:

@@ -246,7 +246,7 @@ _MAX_INTERPOLATED_PERIODS = 5.0  # longest interpolated gap in periods of its so
 def joints_on_fastest_clock(
     groups: Sequence[tuple[str, JointGroup]], where: str, hint: str
 ) -> tuple[JointGroup, tuple[str, ...]]:
-    """Merge joint groups of several named sources on the fastest clock. Returns the group and notes.
+    """Merge joint groups of named sources at the times of the one with the highest rate. Returns group and notes.
 
     Values of the other sources are interpolated linearly. A time is omitted if a source has a gap of more than five of
     its periods around it. Raises `DataError` (with `hint`) if sources share a joint or no time, or differ in channels.
