@@ -98,7 +98,8 @@ def solved(monkeypatch):
         failed = problem.cost(values) is None
         (made.failed if failed else made.runs).append(values)
         status = Status.FAILED if failed else Status.STALLED
-        return SimpleNamespace(x=np.asarray(x), message="done", status=status, equilibrium_guesses="there")
+        usual = {"message": "done", "equilibrium_guesses": "there", "evaluation": None}
+        return SimpleNamespace(x=np.asarray(x), status=status, **usual)
 
     def held_out(problem, x, evaluation, spread):
         assert spread is problem.held_out_spread
