@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def test_depth_images_and_their_lens(open3d, tmp_path, lens):
     again = read_frames(folder)
     assert again.intrinsics == camera
     assert np.allclose(again.load_cloud(0), sequence.load_cloud(0), atol=1e-9)
-    changed(folder, intrinsics={**again.intrinsics.__dict__, "coefficients": ["far"]})
+    changed(folder, intrinsics={**asdict(again.intrinsics), "coefficients": ["far"]})
     with pytest.raises(DataError, match="no list of numbers"):
         read_frames(folder)
     changed(folder, intrinsics=None)

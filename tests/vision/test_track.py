@@ -135,7 +135,7 @@ def test_the_spline_passes_through_the_good_frames(clean, system):
     between = 0.5 * (found.t[4] + found.t[5])
     [truth] = clean.truth([between])
     assert np.linalg.norm(found.point_positions_at_time(between) - truth, axis=1).max() < 0.05
-    assert np.array_equal(found.configuration_at_time(found.t[-1] + 5.0), found.configuration_at_time(found.t[-1]))
+    assert np.array_equal(found.point_positions_at_time(found.t[-1] + 5.0), found.point_positions_at_time(found.t[-1]))
 
 
 def unreadable():

@@ -375,8 +375,7 @@ class ExperimentVariantSensitivityBuilder:
         start = problem.predictor.initial_state_and_derivative(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise failed_rollout_error(start.failure_message)
-        q, parameters = ca.SX.sym("q", n), problem.system.parameters
-        kinematics = forward_kinematics(problem.system.mechanism, q)
+        (q, kinematics), parameters = problem.system.symbols_and_kinematics, problem.system.parameters
         turned = []
         for grasp in system.grasps:
             holder, held = (kinematics.frame_pose(name).rotation for name in (grasp.holder_frame, grasp.held_frame))

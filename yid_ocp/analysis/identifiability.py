@@ -406,10 +406,9 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     column = (view.by_alone @ vector)[:, None]
     for words, prefix in (("the unknown initial state", "start."), ("the position of the grasp", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
-        if at:
-            remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
-            if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
-                return words
+        remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
+        if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
+            return words
     return "the unknown initial state and the position of the grasp"
 
 

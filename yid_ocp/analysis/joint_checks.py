@@ -159,12 +159,10 @@ def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMot
     low_pass = ZeroPhaseLowPassFilter(min(_MOTION_BANDWIDTH_HZ, 0.2 / step))
     course = scipy.interpolate.CubicSpline(t, low_pass(t, joints.position[:, columns]), axis=0)
     end = max(5, min(len(t) // 10, round(0.3 / step)))
-    kept = slice(end, len(t) - end, max(1, len(t) // _MAX_MOTION_SAMPLES))
-    at = t[kept]
+    at = t[end : len(t) - end : max(1, len(t) // _MAX_MOTION_SAMPLES)]
     effort = None
     if joints.effort is not None and not np.isnan(joints.effort[:, columns]).any():
-        smooth = low_pass(t, joints.effort[:, columns])
-        effort = np.stack([np.interp(at, t, column) for column in smooth.T], axis=1)
+        effort = np.stack([np.interp(at, t, column) for column in low_pass(t, joints.effort[:, columns]).T], axis=1)
     return _SmoothedMotion(at, course(at), course(at, 1), course(at, 2), effort)
 
 

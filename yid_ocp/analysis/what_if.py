@@ -161,8 +161,7 @@ def _smallest(
         # at most one camera rate and one other motion
         able = [own for own in sets if sum(change.camera_rate is not None for change in own) <= 1]
         able = [own for own in able if sum(change.setup_change in ("motion", "travel") for change in own) <= 1]
-        found = outcomes.of_all(able)
-        if complete := [outcome for outcome in found if outcome._is_complete]:
+        if complete := [outcome for outcome in outcomes.of_all(able) if outcome._is_complete]:
             return complete
     return []
 
@@ -216,8 +215,7 @@ class _Outcomes:
     def of_all(self, sets: Sequence[Sequence[ExperimentChange]]) -> list[ChangedExperimentResult]:
         """Return the results of several sets of changes, each computed only once."""
         keys = [frozenset(change.name for change in changes) for changes in sets]
-        new = {key: changes for key, changes in zip(keys, sets, strict=True) if key not in self.known}
-        if new:
+        if new := {key: changes for key, changes in zip(keys, sets, strict=True) if key not in self.known}:
             self.known |= dict(zip(new, self.judge(list(new.values()), self.inflation), strict=True))
         return [self.known[key] for key in keys]
 

@@ -5,6 +5,5 @@ from yid_ocp.data.recording import JointGroup as JointGroup
 from yid_ocp.data.recording import PointGroup as PointGroup
 from yid_ocp.data.recording import Recording as Recording
 from yid_ocp.data.recording import SensorChannelGroup as SensorChannelGroup
-from yid_ocp.data.recording import validated_recording as validated_recording
 from yid_ocp.data.recording_hdf5 import read_recording as read_recording
 from yid_ocp.data.recording_hdf5 import write_recording as write_recording

@@ -66,11 +66,10 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         count = end - begin
         elsewhere = np.delete(same, np.concatenate([np.arange(*run[:2]) for run in (longest, *rests)]))
         usual = float(np.mean(elsewhere)) if len(elsewhere) >= count // 4 else 1.0
-        # if the channel changes in nine of ten samples, a repetition of this length is not chance
-        evidence = (count / QUALITY_LIMITS.min_stuck_samples) if usual < 0.1 else 0.0
         stated = None if joints is None or quantity != "position" else joints.position_std
-        if count == len(same) and stated is not None and np.all(stated):
-            evidence = count / QUALITY_LIMITS.min_stuck_samples
+        # if the channel changes in nine of ten samples, a repetition of this length is not chance
+        is_unlikely = usual < 0.1 or (count == len(same) and stated is not None and bool(np.all(stated)))
+        evidence = count / QUALITY_LIMITS.min_stuck_samples if is_unlikely else 0.0
         if turned > unseen:
             evidence = max(evidence, turned / unseen)
         if quantity == "effort" and values[begin] in (0.0, np.max(values), np.min(values)):
@@ -120,8 +119,7 @@ def _stated(recording: Recording, choice: SensorOptionsFunction, group: str, cha
         if isinstance(said, Mapping):
             return float(said.get(name, 0.0))
         recorded = getattr(joints, CHANNEL_KINDS[f"joints.{quantity}"].std_attribute_names[0])
-        given = recorded if said is None else said
-        given = 0.0 if given is None else given
+        given = next((std for std in (said, recorded) if std is not None), 0.0)
         if quantity == "position" and said is None and joints.position_resolution is not None:
             given = np.hypot(given, joints.position_resolution / math.sqrt(12))
         return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])

@@ -81,8 +81,7 @@ def _times(recording: Recording, driving: Sequence[str]) -> Array:
     if recording.joints is not None:
         return recording.joints.t
     for group in recording.points:
-        columns = [group.names.index(name) for name in driving if name in group.names]
-        if columns:
+        if columns := [group.names.index(name) for name in driving if name in group.names]:
             return group.t[np.isfinite(group.position[:, columns]).all(axis=(1, 2))]
     return recording.points[0].t
 

@@ -12,7 +12,6 @@ from pkgutil import iter_modules
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS as EFFECTS
 from yid_ocp.effects.base import EffectBase as EffectBase
-from yid_ocp.effects.base import ParameterDefinition as ParameterDefinition
 from yid_ocp.errors import ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 

@@ -328,11 +328,7 @@ class _CurrentLimit(_ServoChange):
 
     equation = "torque = kt clip(torque/kt, limit)"
     possible_locations = _published_motor_joints
-
-    @classmethod
-    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of the internal parameter limit^-16. Reports show `limit` [A], at least `_MIN_LIMIT_CURRENT`."""
-        return (_limit_definition(_MIN_LIMIT_CURRENT, "A", "largest current"),)
+    declared_parameters = (_limit_definition(_MIN_LIMIT_CURRENT, "A", "largest current"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         return {"current_limit_tightness": servo.current_limit_tightness + self["tightness"]}

@@ -12,7 +12,6 @@ import numpy as np
 
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
 from yid_ocp.model.flexible import ElasticJoint
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
@@ -93,6 +92,7 @@ class EffectBase(Effect):
     possible_locations: ClassVar[Callable[[System], Collection[str]]]
     candidate_locations: ClassVar[Callable[[System], Collection[str]] | None] = None
     declared_parameters: ClassVar[tuple[ParameterDefinition, ...]] = ()  # put at a location by `parameter_definitions`
+    declared_internal_coordinate_names: ClassVar[tuple[str, ...]] = ()  # the same at every location
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
@@ -101,8 +101,8 @@ class EffectBase(Effect):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Return the names of the effect's own states, in addition to the joints' motion. Default: no states."""
-        return ()
+        """Return the names of the effect's own states, in addition to the joints' motion."""
+        return cls.declared_internal_coordinate_names
 
     @property
     def max_abs_initial_internal_coordinates(self) -> Mapping[str, float]:
@@ -316,8 +316,7 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
 
 def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Positions of frames in some random configurations, shape (configurations, 3) each [m]."""
-    q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
+    q, kinematics = system.symbols_and_kinematics
     places = ca.horzcat(*(kinematics.frame_position(name) for name in names))
     function = ca.Function("places", [q, system.parameters.symbols], [places])
     rng, theta = np.random.default_rng(0), system.parameters.vector()

@@ -166,11 +166,7 @@ class _JointPresliding(EffectBase):
         definition_scaled_by_effort_limits("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
         ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
     )
-
-    @classmethod
-    def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """The fraction `s` of tau_c that acts, from -1 to 1."""
-        return ("s",)
+    declared_internal_coordinate_names = ("s",)  # the fraction of tau_c that acts, from -1 to 1
 
     @property
     def max_abs_initial_internal_coordinates(self) -> Mapping[str, float]:

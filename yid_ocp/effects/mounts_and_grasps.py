@@ -163,11 +163,7 @@ class _GraspSlip(_GraspChange):
     declared_parameters = (
         ParameterDefinition("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), "creep rate per axial load"),
     )
-
-    @classmethod
-    def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """The name `offset` of the slipped distance along the tube [m]."""
-        return ("offset",)
+    declared_internal_coordinate_names = ("offset",)  # the slipped distance along the tube [m]
 
     def _changes(self, grasp: Grasp) -> dict[str, Any]:
         return {"axial_slip": grasp.axial_slip - self.internal_coordinate_symbols[f"{self.label}.offset"]}
@@ -178,6 +174,5 @@ class _GraspSlip(_GraspChange):
         at = base.grasp_names(state.system).index(self.location)
         first = sum(grasp.n_constraint_equations for grasp in grasps[:at])
         axis = state.kinematics.frame_pose(grasps[at].held_frame).rotation[:, 2]
-        load = ca.dot(axis, state.constraint_force[first : first + 3])
-        creep = state.z_rate[row] - self["slip_per_load"] * load
+        creep = state.z_rate[row] - self["slip_per_load"] * ca.dot(axis, state.constraint_force[first : first + 3])
         return EffectStepTerms(internal_equations={name: creep}, static_equations={name: state.z[row]})

@@ -12,5 +12,4 @@ from yid_ocp.model.system import Effect as Effect
 from yid_ocp.model.system import EffectStepTerms as EffectStepTerms
 from yid_ocp.model.system import Grasp as Grasp
 from yid_ocp.model.system import MidpointStateSymbols as MidpointStateSymbols
-from yid_ocp.model.system import NodeStateSymbols as NodeStateSymbols
 from yid_ocp.model.system import System as System

@@ -298,8 +298,6 @@ def _fraction(name: str, said: str) -> float:
 def merge_inertias(bodies: Iterable[Inertia]) -> Inertia | None:
     """Combine rigidly connected bodies into one body. Returns None if there are no bodies or their mass is zero."""
     entries = list(bodies)
-    if not entries:
-        return None
     mass = sum((b.mass for b in entries), ca.SX(0))
     if mass.is_zero():
         return None

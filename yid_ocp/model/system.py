@@ -388,13 +388,11 @@ class System(ReprMixin):
 
     def mechanism_with_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """Return the mechanism with a number for each parameter: its entry in `values`, or else its nominal value."""
-        key = tuple(self.parameters.vector(values).tolist())
-        found = self._last_numeric_mechanism.get(key)
-        if found is None:
-            found = replace(self.mechanism, parameters=self.parameters).with_numeric_values(values)
-            self._last_numeric_mechanism.clear()
-            self._last_numeric_mechanism[key] = found
-        return found
+        key, last = tuple(self.parameters.vector(values).tolist()), self._last_numeric_mechanism
+        if key not in last:
+            last.clear()
+            last[key] = replace(self.mechanism, parameters=self.parameters).with_numeric_values(values)
+        return last[key]
 
     @cached_property
     def _last_numeric_mechanism(self) -> dict[tuple[float, ...], Mechanism]:

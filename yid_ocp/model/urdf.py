@@ -410,8 +410,7 @@ def _walk(
                 if joint.type != "fixed":
                     motion = joint_displacement_transform(_unit_axis(joint), _locked_value(joint, locked), joint.type)
                 stack.append((joint.child, carrier, at @ joint.origin @ motion, link))
-    loose = sorted(set(links) - set(frames) - dropped)
-    if loose:
+    if loose := sorted(set(links) - set(frames) - dropped):
         what = f"link '{loose[0]}' is not connected to the root link '{root}'"
         raise ModelError(what, where=where, allowed="one tree of links", hint="connect it by a joint, or delete it")
     return joints, bodies, frames

@@ -2,7 +2,6 @@
 
 from yid_ocp.parallel.resumable_tasks import LOCAL_WORKER_CONFIG as LOCAL_WORKER_CONFIG
 from yid_ocp.parallel.resumable_tasks import Task as Task
-from yid_ocp.parallel.resumable_tasks import TaskProgressCallback as TaskProgressCallback
 from yid_ocp.parallel.resumable_tasks import TaskResult as TaskResult
 from yid_ocp.parallel.resumable_tasks import WorkerConfig as WorkerConfig
 from yid_ocp.parallel.resumable_tasks import require_task_values as require_task_values

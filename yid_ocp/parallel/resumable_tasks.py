@@ -144,8 +144,7 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
         return [entry.value for entry in results]
     first, _, rest = failed[0].error.partition("\n")
     what = f"{len(failed)} of {len(results)} tasks failed; the first failure is that of {failed[0].name}, {first}"
-    ours = {kind.__name__ for kind in YidError.__subclasses__()}
-    if first.partition(":")[0] in ours:
+    if first.partition(":")[0] in {kind.__name__ for kind in YidError.__subclasses__()}:
         told = dict(line.strip().partition(": ")[::2] for line in rest.splitlines())  # as `YidError.__str__` writes it
         where = f"task '{failed[0].name}': {told.get('where', 'its arguments')}"
         hint = f"{told.get('try', 'correct this cause')}; then run the same command, which repeats failed tasks"

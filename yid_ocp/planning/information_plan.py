@@ -195,8 +195,7 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
             hint = "set plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
     values, _ = limits.constraints_and_jacobian(mover.simulate_path(still), still)
-    broken = limits.worst_value_and_bound_by_violated_limit(values)
-    if broken:
+    if broken := limits.worst_value_and_bound_by_violated_limit(values):
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{what} of {name} is {x:.4g}, limit {bound:.4g}" for what, name, x, bound in parts)
         hint = "widen plan.limits if the robot allows it, or set another plan.start_joint_positions"

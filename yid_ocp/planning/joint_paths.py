@@ -18,7 +18,6 @@ from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
 from yid_ocp.parallel import CASADI_LOCK
@@ -116,8 +115,7 @@ class FramePositionEvaluator:
                 raise ConfigError(f"there is no frame '{name}'", where=where, **said)
         self.names = tuple(names)
         with CASADI_LOCK:
-            q, theta = ca.SX.sym("q", system.n_coordinates), ca.vertcat(*(entry.symbol for entry in system.parameters))
-            kinematics = forward_kinematics(system.mechanism, q)
+            (q, kinematics), theta = system.symbols_and_kinematics, system.parameters.symbols
             at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in names))
             slope = ca.densify(ca.jacobian(at, q))
             self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
@@ -320,8 +318,7 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
         if name not in system.prescribed:
             said = unknown_name_error_arguments(name, system.prescribed)
             raise ConfigError(f"'{name}' is not a joint that the plan moves", where=where, **said)
-    missing = [name for name in system.prescribed if name not in posture]
-    if missing:
+    if missing := [name for name in system.prescribed if name not in posture]:
         what, allowed = f"the position of {', '.join(missing)} is missing", "a start position of every joint that moves"
         hint = f"add the missing positions, or set {where}: null for the default start"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)

@@ -212,8 +212,7 @@ class EstimationProblem(ReprMixin):
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
         asked = [(e, *self.unpack_episode_unknowns(x, i), guess) for i, (e, guess) in enumerate(pairs)]
         results = self.predictor.predict_episodes(asked, derivatives)
-        failures = [result for result in results if isinstance(result, str)]
-        if failures:
+        if failures := [result for result in results if isinstance(result, str)]:
             return Evaluation(np.inf, np.zeros(0), None, False, failures[0], ())
         done = tuple(result for result in results if isinstance(result, EpisodePrediction))
         cost, residuals, jacobians = 0.0, [], []

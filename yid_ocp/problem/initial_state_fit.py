@@ -238,8 +238,7 @@ class InitialStateFitter:
         for group, row in task.measured:
             reading, slopes = self._reading(group.sensor)(q, theta)
             weight = group.weight[row] / task.softness
-            value = np.where(weight > 0, group.value[row], 0.0)
-            residuals.append(weight * (reading.full().ravel() - value))
+            residuals.append(weight * (reading.full().ravel() - np.where(weight > 0, group.value[row], 0.0)))
             jacobians.append(weight[:, None] * slopes.full()[:, :width])
         if m:
             gap, slopes = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)

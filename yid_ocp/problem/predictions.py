@@ -138,12 +138,10 @@ def rmse_unit_and_count_by_channel(
     squares: dict[str, list[float]] = {}
     units: dict[str, str] = {}
     for result, episode in zip(results, episodes, strict=True):
-        for predicted, samples in zip(result.predicted_outputs, episode.measurements, strict=True):
-            shape = (len(predicted), len(samples.sensor.channel_names), samples.sensor.outputs_per_channel)
-            square = np.sum((predicted - samples.value).reshape(shape) ** 2, axis=2)
-            for c, channel in enumerate(samples.sensor.channel_names):
-                squares.setdefault(channel, []).extend(square[np.isfinite(square[:, c]), c].tolist())
-                units[channel] = samples.sensor.unit
+        for own in channel_predictions(episode, result):
+            square = np.sum(own.predicted_minus_measured**2, axis=1)
+            squares.setdefault(own.channel, []).extend(square[np.isfinite(square)].tolist())
+            units[own.channel] = own.unit
     seen = ((channel, values) for channel, values in squares.items() if values)
     return {name: {"rmse": float(np.sqrt(np.mean(x))), "unit": units[name], "n": len(x)} for name, x in seen}
 

@@ -272,8 +272,7 @@ def prescribed_coordinates_at_nodes(
     course: dict[str, Array] = {}
     for clamp in clamps:
         course.update(_clamp_course(recording, clamp, grid, low_pass))
-    remaining = tuple(name for name in system.prescribed if name not in course)
-    if remaining:
+    if remaining := tuple(name for name in system.prescribed if name not in course):
         if recording.joints is None:
             what = f"joint '{remaining[0]}' is prescribed, but the recording has no joints"
             allowed, hint = "a recording with the group `joints`", "import the joints too, or give another recording"

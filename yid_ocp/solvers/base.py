@@ -119,8 +119,7 @@ class Solution(ReprMixin):
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
         words, rows = {}, [("parameter", "value", "unit", "")]
         for name, e in free.items():
-            spread = finite_or_none(e.std), e.interval
-            words[name] = value_and_uncertainty_text(e.value, *spread, verdict=e.verdict)
+            words[name] = value_and_uncertainty_text(e.value, finite_or_none(e.std), e.interval, verdict=e.verdict)
             rows.append((name, words[name], e.unit, VERDICT_TABLE_TEXTS[e.verdict]))
         told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
         count = len(free) - len(told)

@@ -347,8 +347,7 @@ class _Maker:
             data = np.zeros((count, 0), np.int64)
             term = MappedFunctionTerm(f"{label}[{name}]", driven, itself, places[label], data, weight[:0, 0])
             priors.append(ResidualTerm(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
-        offset = np.broadcast_to(places["torque_offset"], (steps, nu))
-        per_step = [places["torque_error"][of_step.ravel()], offset]
+        per_step = [places["torque_error"][of_step.ravel()], np.broadcast_to(places["torque_offset"], (steps, nu))]
         per_step += [places["angle_error"]] if "angle_error" in places else []
         return np.hstack(per_step), places.get("first_angle_error", np.zeros((1, 0), np.int64))[0], priors
 
@@ -357,9 +356,8 @@ class _Maker:
         problem, name, nx = self._problem, episode.name, self._sizes["nx"]
         loose = list(problem.predictor.estimated_initial_state_indices)
         fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_coordinate_indices, *loose}]
-        joints = problem.system.mechanism.joint_names
         rows = [
-            *(f"{part}.{joint}" for part in "qp" for joint in joints),
+            *(f"{part}.{joint}" for part in "qp" for joint in problem.system.mechanism.joint_names),
             *problem.system.effect_internal_coordinate_symbols,
         ]
         first = ca.SX.sym("x0", nx)

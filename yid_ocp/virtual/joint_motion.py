@@ -214,8 +214,7 @@ def grasping_joint_angles(
     holding = {j for holder in holders for j in tree.ancestor_joint_indices(holder)}
     sought = [j for j, joint in enumerate(tree.joints) if j in holding and joint.name not in elastic]
     if sought:
-        gap = _gap_function(system, tree, value, offsets or {}, sought)
-        posture = _reached(system, tree, posture, sought, gap)
+        posture = _reached(system, tree, posture, sought, _gap_function(system, tree, value, offsets or {}, sought))
     wanted = sorted(set(sought) | set(system.actuated_coordinate_indices))
     return {tree.joints[j].name: float(posture[j]) for j in wanted}
 

@@ -160,7 +160,11 @@ def simulate_in_mujoco(
     mujoco = import_mujoco()
     model = mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
-    with _at_work(mujoco, model, injected):
+    with contextlib.ExitStack() as held:
+        if injected is not None:
+            injected.edit_model(model)
+            mujoco.set_mjcb_passive(injected.add_forces)
+            held.callback(mujoco.set_mjcb_passive, None)
         scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
         start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
         scene.data.qpos[:] = model.qpos_spring
@@ -201,20 +205,6 @@ class MujocoModelAndState:
         sites = [model.site(name).id for name in system.point_frames]
         moved = order[list(system.actuated_coordinate_indices or system.prescribed_coordinate_indices)]
         return MujocoModelAndState(mujoco, model, mujoco.MjData(model), order, moved, sites)
-
-
-@contextlib.contextmanager
-def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | None) -> Iterator[None]:
-    """Activate injected terms inside MuJoCo for the duration of the block."""
-    if injected is None:
-        yield
-        return
-    injected.edit_model(model)
-    mujoco.set_mjcb_passive(injected.add_forces)
-    try:
-        yield
-    finally:
-        mujoco.set_mjcb_passive(None)
 
 
 def settle_and_return_holding_torques(scene: MujocoModelAndState, damping: Array) -> Array:

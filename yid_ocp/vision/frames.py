@@ -19,7 +19,7 @@ import ctypes
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from types import ModuleType
 
 import numpy as np
@@ -76,10 +76,15 @@ class CameraIntrinsics:
         """Whether the lens has distortion."""
         return any(self.coefficients)
 
-    @property
+    @cached_property
     def pixel_rays_at_unit_depth(self) -> Array:
         """The ray (height, width, 3) of every pixel in the camera's frame, with z = 1. NaN outside the lens model."""
-        return _rays(self)
+        u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
+        made = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
+        if self.has_distortion:
+            made[..., 0], made[..., 1] = _straightened(self, made[..., 0].copy(), made[..., 1].copy())
+        made.setflags(write=False)
+        return made
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
         """Convert a depth image (height, width) to points (N, 3) [m] in the camera's frame, row by row.
@@ -110,16 +115,6 @@ class CameraIntrinsics:
         factor = above / (1 + square * (k4 + square * (k5 + square * k6)))
         beside_x, beside_y = p2 * (square + 2 * x**2), p1 * (square + 2 * y**2)
         return x * factor + 2 * p1 * x * y + beside_x, y * factor + beside_y + 2 * p2 * x * y
-
-
-@lru_cache(maxsize=4)
-def _rays(lens: CameraIntrinsics) -> Array:
-    u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
-    made = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(u.shape)], axis=-1)
-    if lens.has_distortion:
-        made[..., 0], made[..., 1] = _straightened(lens, made[..., 0].copy(), made[..., 1].copy())
-    made.setflags(write=False)
-    return made
 
 
 def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[Array, Array]:

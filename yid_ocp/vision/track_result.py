@@ -80,15 +80,14 @@ class TrackResult:
     root_note: str  # how the root end was chosen; empty if the model defines it
     _place: Callable[[Array], Array]  # from a configuration to the positions of the tracked points
 
-    def configuration_at_time(self, t: float) -> Array:
-        """Return the configuration (n,) at time `t` [s] by a cubic spline through good frames; constant beyond them."""
-        if len(self.t) < 2:
-            return self.configurations[0].copy()
-        return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
-
     def point_positions_at_time(self, t: float) -> Array:
-        """Return the positions (np, 3) [m] of the tracked points at any time, from `configuration_at_time`."""
-        return self._place(self.configuration_at_time(t))
+        """Return positions (np, 3) [m] of the tracked points at `t` [s]. Beyond the good frames they are constant.
+
+        The configurations of the good frames are interpolated by a cubic spline.
+        """
+        if len(self.t) < 2:
+            return self._place(self.configurations[0])
+        return self._place(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
 
     @property
     def frame_drop_reason_counts(self) -> dict[str, int]:

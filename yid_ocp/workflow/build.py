@@ -27,7 +27,7 @@ from yid_ocp.effects.friction import (
 from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
+from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System
 from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
 from yid_ocp.model.objects.base import CableTopology
@@ -429,8 +429,7 @@ def marker_positions_from_reference_pose(
         where = ("model", "frames", names[0], "use_recorded_straight_position")
         hint, allowed = f"set model.frames.{names[0]}.xyz instead", "an object whose mount is fixed in the world"
         raise run.config_error(what, *where, allowed=allowed, hint=hint)
-    q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
+    q, kinematics = system.symbols_and_kinematics
     poses = [kinematics.frame_pose(name).homogeneous_matrix() for name in names]
     function = ca.Function("straight", [q, system.parameters.symbols], [ca.horzcat(*poses)])
     theta = system.parameters.vector({f"{name}.{axis}": 0.0 for name in names for axis in _AXES})

@@ -143,8 +143,7 @@ def build_problem(
     if not free:
         choice = unknown_name_error_arguments("", system.parameters.names, "set parameters.NAME.free: true")
         raise run.config_error("no parameter is free", "parameters", **choice)
-    same = sorted(set(run.recordings.estimate) & set(run.recordings.held_out))
-    if same:
+    if same := sorted(set(run.recordings.estimate) & set(run.recordings.held_out)):
         what, hint = f"{same[0]} is listed for estimation and as held out", "remove it from one of the two lists"
         raise run.config_error(what, "recordings", "held_out", allowed="every recording in one list", hint=hint)
     estimate, held_out = read_recordings_of_role(run), read_recordings_of_role(run, "held_out")

@@ -396,8 +396,7 @@ def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
     held = np.vstack([mean, mean[-1:]])
     names, kinds = ([*map(str, group.attrs[key])] for key in ("unknowns", "kinds"))
     kept = np.array(group["prior"]) > 0
-    forces = [i for i, kind in enumerate(kinds) if kind == "force" and kept[i]]
-    if forces:
+    if forces := [i for i, kind in enumerate(kinds) if kind == "force" and kept[i]]:
         told = [names[i] for i in forces]
         yield RosTopicTimeSeries("/unknown/joint_states", "joints", edges, {"effort": held[:, forces]}, told)
     for kind, form in _UNKNOWN_SHAPES.items():

@@ -75,8 +75,7 @@ def _run_inspect(
         picture = folder.path / "sparsity.png"
         draw_sparsity_patterns(picture, [[patterns[name] for name in row] for row in _PATTERN_LAYOUT])
         write_text(folder.path / "equations.txt", "\n".join(symbols.text_lines()) + "\n")
-        asked = point.theta, step.time_step
-        files = () if export is None else export_step_functions(symbols, Path(export), *asked)
+        files = () if export is None else export_step_functions(symbols, Path(export), point.theta, step.time_step)
         dependences = _dependence(step, symbols, problem, point, rows)
         driven, prescribed = step.system.driven, step.system.prescribed
         roles = dict.fromkeys(driven, "driven") | dict.fromkeys(prescribed, "prescribed")

@@ -106,12 +106,11 @@ def estimate_texts_by_format(
     labels = {n: n.replace("_", r"\_") for n in found}
     told = {n: f"{e.value:.4g}" + ("" if uncounted_errors is None else f" ± {e.std:.2g}") for n, e in found.items()}
     rows = [rf"{labels[n]} & ${told[n]}$ & {e.unit} \\".replace("±", r"\pm") for n, e in found.items()]
-    initial = [f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items()]
     return {
         "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in found.items()],
         "uncounted_errors": ["of discretisation"] if uncounted_errors is None else list(uncounted_errors),
         "joints": joints,
-        "yaml": [*model_yaml, "parameters:", *initial],
+        "yaml": [*model_yaml, "parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
         "export": shlex.join(["yid-ocp", *command]),

@@ -146,8 +146,7 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
             hint = f"compare model.{differing} with {Path(folder) / 'config.yaml'}"
             raise run.config_error(what, *where, allowed=_SAME_MODEL, hint=hint)
         found.append(own)
-    dependent = _dependent(run.diagnosis.baseline_run_folders)
-    if dependent:
+    if dependent := _dependent(run.diagnosis.baseline_run_folders):
         allowed, hint = "runs that are not a baseline of each other", "give the later run only"
         raise run.config_error(dependent, "diagnosis", "baseline_run_folders", allowed=allowed, hint=hint)
     return tuple(found)
@@ -165,8 +164,7 @@ def _dependent(folders: Sequence[str | Path]) -> str:
 
 def require_runs_of_one_model(folders: Sequence[Path]) -> None:
     """Check that all run folders have the same model and none is the baseline of another. Raises `ConfigError`."""
-    dependent = _dependent(folders)
-    if dependent:
+    if dependent := _dependent(folders):
         allowed, hint = "runs that are no baseline of each other", "diagnose without --baseline, or leave one run out"
         raise ConfigError(dependent, where="arguments of `report`", allowed=allowed, hint=hint)
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
@@ -244,8 +242,7 @@ def require_recordings_not_in_baseline(
             if not runs or run.recordings.without_effect:
                 where = ("recordings", "without_effect")
                 what = f"the recording {episode.name} is also a reference recording"
-            hint = "leave it out of one of the two"
-            raise run.config_error(what, *where, allowed="other recordings", hint=hint)
+            raise run.config_error(what, *where, allowed="other recordings", hint="leave it out of one of the two")
 
 
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
@@ -259,8 +256,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     if len(paths) < 2:
         what, hint = "fewer than two runs are given", "add run folders, for example of other days"
         raise ConfigError(what, where="arguments of `report`", allowed="two or more run folders", hint=hint)
-    twice = [str(path) for i, path in enumerate(paths) if path.resolve() in [p.resolve() for p in paths[:i]]]
-    if twice:
+    if twice := [str(path) for i, path in enumerate(paths) if path.resolve() in [p.resolve() for p in paths[:i]]]:
         what, hint = "the run is given twice", "leave one of them out"
         raise ConfigError(what, where=twice[0], allowed="every run once", hint=hint)
     if len(paths) == 2 and _have_same_recordings(paths):

@@ -232,8 +232,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     for message in (message for message in bag.states if message.source in states):
         for joint in message.content.name:
             owners.setdefault(joint, set()).add(message.source)
-    shared = {topic for topics in owners.values() if len(topics) > 1 for topic in topics}
-    if shared:
+    if shared := {topic for topics in owners.values() if len(topics) > 1 for topic in topics}:
         options["joint_topics"] = [states[0], *(topic for topic in states[1:] if topic not in shared)]
         notes.append(f"{', '.join(sorted(shared))} have joints in common: choose one of these topics")
     elif len(states) > 1:

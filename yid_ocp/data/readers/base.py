@@ -180,8 +180,7 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
 def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
     """Raise `DataError` if `chosen` maps two data sources to the same point name."""
     names = list(chosen.values())
-    shared = [source for source, name in chosen.items() if names.count(name) > 1]
-    if shared:
+    if shared := [source for source, name in chosen.items() if names.count(name) > 1]:
         what = f"points have the same name: {', '.join(f'{source} as {chosen[source]}' for source in shared)}"
         hint = ",".join(f"{source}=NAME{i + 1}" for i, source in enumerate(shared[:4])) + ",..." * (len(shared) > 4)
         raise DataError(what, where=where, allowed="one name for each point", hint=f"rename them: --points {hint}")
@@ -268,8 +267,7 @@ def joints_on_fastest_clock(
 
     channels: dict[str, Any] = {channel: joined(channel) for channel in clock.values_by_channel}
     notes = []
-    moved = [source for source, group in groups if not np.isin(t, group.t).all()]
-    if moved:
+    if moved := [source for source, group in groups if not np.isin(t, group.t).all()]:
         notes.append(f"joint states of {', '.join(moved)} were interpolated to the times of {name}")
     if len(t) < len(clock.t):
         notes.append(f"{len(clock.t) - len(t)} of {len(clock.t)} samples of {name} were omitted in gaps of others")
@@ -295,7 +293,6 @@ def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str, hint: 
             raise DataError(what, where=where, allowed="every joint in one source only", hint=hint)
     every = {channel for _, group in groups for channel in group.values_by_channel}
     for source, group in groups:
-        lacking = sorted(every - set(group.values_by_channel))
-        if lacking:
+        if lacking := sorted(every - set(group.values_by_channel)):
             what, allowed = f"{source} has no {lacking[0]}, but another source has it", "equal channels in all sources"
             raise DataError(what, where=where, allowed=allowed, hint=hint)

@@ -61,11 +61,10 @@ class _SegmentGeometry:
         factor = 1 if self.values_given_as_rigidities else n
         lengths, index = self.link_lengths, self.parent_link_index
         same = "mass radius parent values_given_as_rigidities clamped_at_base joint_axes cross_section_size"
-        options = attributes_to_dict(self, f"{same} has_length_parameter_per_link")
         return FlexibleSegment(
             name,
             self.length if self.length is not None else float(sum(lengths or ())),
-            **options,
+            **attributes_to_dict(self, f"{same} has_length_parameter_per_link"),
             links=self.links * n,
             link_lengths=None if lengths is None else [length / n for length in lengths for _ in range(n)],
             parent_link_index=None if index is None else (index + 1) * n - 1,  # a child stays where it is on its parent
