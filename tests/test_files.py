@@ -115,8 +115,7 @@ def test_where_two_processes_differ_is_said():
     assert here["code"] == package_source_hash()
     assert software_fingerprint_differences(here, software_fingerprint()) == []
     casadi, code = (f"casadi 1.0 instead of {here['casadi']}", f"code {'f' * 12} instead of {here['code'][:12]}")
-    found = software_fingerprint_differences(here, {**here, "casadi": "1.0", "code": "f" * 64})
-    assert found == [casadi, code]
+    assert software_fingerprint_differences(here, {**here, "casadi": "1.0", "code": "f" * 64}) == [casadi, code]
     del here["numpy"]
     [missing] = software_fingerprint_differences({**here, "numpy": "2"}, here)
     assert all(fact in missing for fact in ("numpy", "unknown", " 2"))

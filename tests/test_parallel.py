@@ -347,8 +347,7 @@ def test_an_interrupted_or_killed_run_leaves_its_results_and_no_process(tmp_path
     process.send_signal(how)
     assert process.wait(timeout=20) == (130 if how == signal.SIGINT else -signal.SIGKILL)
     assert wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 20)
-    names = [json.loads(path.read_text())["name"] for path in (tmp_path / "results").glob("*.json")]
-    assert names == ["0.0"]
+    assert [json.loads(path.read_text())["name"] for path in (tmp_path / "results").glob("*.json")] == ["0.0"]
 
 
 class Answers:

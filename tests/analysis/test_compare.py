@@ -290,8 +290,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
 def test_a_method_is_stopped_after_its_share_of_the_budget(repository):
     """At its last iterate, which its column shows; nothing more is tried, and `solve` answers all the same."""
     problem = load_problem(repository / "configs" / "springs_series_joint.yaml")
-    found = compare_methods(problem, [SteepestDescent(), GaussNewton()], total_time_budget=1e-9)
-    for run in found.method_results:
+    for run in compare_methods(problem, [SteepestDescent(), GaussNewton()], total_time_budget=1e-9).method_results:
         assert run.solution.status == Status.ITERATION_LIMIT
         assert run.solution.message.startswith("stopped after ")
         assert "compare.total_time_budget" in run.solution.message

@@ -70,8 +70,7 @@ def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     along = np.array(rotation_from_rpy(*turned))[:, 2]
     found, _, _ = judged(hanging(gravity=9.81 * along, turned=turned))
     twist, bend = found["T1.twist"], found["T1.bend"]
-    rows = tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
-    assert twist.rows == rows
+    assert twist.rows == tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
     assert twist.observable_rows == ()
     assert twist.most_sensitive_sensor == ""
     assert (twist.max_change_from_rest < 1e-6, twist.seconds) == (True, pytest.approx(0.6))

@@ -277,8 +277,7 @@ def test_inspect(carried_out, pendulum, tmp_path):
     assert ("shoulder.mass" in table, "elbow.mass" in table) == (False, True)
     assert len(result["dependence"]["elbow.mass"]["rows"]) == 4
     assert result["dependence"]["elbow.mass"]["along"] is None
-    lines = (folder / "equations.txt").read_text().splitlines()
-    assert any(line.startswith("del[elbow]: ") for line in lines)
+    assert any(line.startswith("del[elbow]: ") for line in (folder / "equations.txt").read_text().splitlines())
     with h5py.File(folder / "linearisation.h5") as file:
         assert file["A"].shape == (4, 4)
         assert file["B_theta"].shape == (4, len(result["parameters"]))

@@ -403,8 +403,7 @@ def test_read_any_refuses_what_it_does_not_know(tmp_path: Path) -> None:
 
 def test_every_file_of_the_folder_registers_a_format() -> None:
     files = {entry.name for entry in iter_modules(readers.__path__)} - {"base"}
-    registered = {READERS[name].__module__.rpartition(".")[2] for name in READERS}
-    assert files == registered - {"recording_hdf5"}
+    assert files == {READERS[name].__module__.rpartition(".")[2] for name in READERS} - {"recording_hdf5"}
 
 
 def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -407,8 +407,7 @@ def test_cameras_see_points_elsewhere() -> None:
 
     def seen(kind: str, **values: float) -> np.ndarray:
         effect = make_effect(kind, "camera", system, values)
-        other = PointSensor("points_mocap", ("w_T1",), ("w_T1",))
-        assert read(system, [effect], other) == pytest.approx(true)
+        assert read(system, [effect], PointSensor("points_mocap", ("w_T1",), ("w_T1",))) == pytest.approx(true)
         return read(system, [effect], eye)
 
     assert seen("camera_translation", x=0.01, z=-0.02) - true == pytest.approx([0.01, 0.0, -0.02])

@@ -94,8 +94,7 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     assert keeps_inputs(plain)
     assert keeps_inputs(full.with_free_parameters_without_recompiling(["T1.bend", "kelvin_voigt@T3.tau"]))
     # the momentum that an LQR filter follows depends on an arm's damping and on how fast the clock runs
-    damped = problem(bench, (), feedback=feedback, free=("left_a.damping",))
-    assert keeps_inputs(damped) is (feedback != "lqr")
+    assert keeps_inputs(problem(bench, (), feedback=feedback, free=("left_a.damping",))) is (feedback != "lqr")
     timed = full.with_free_parameters_without_recompiling(["T1.bend", "clock_scale@clock.scale"])
     assert keeps_inputs(timed) is (feedback != "lqr")
     for name in ("effort_delay@left.delay", "effort_lag@left_c.time_constant", "camera_latency@camera.delay"):
@@ -307,8 +306,7 @@ def largest(difference, reference) -> float:
 @pytest.mark.parametrize("mode", ["driven", "prescribed"])
 def test_at_neutral_parameters_they_change_nothing(mode, benches, all_effects, sensors) -> None:
     bench = benches[mode]
-    effects = all_effects(bench.system)
-    plain, full = bench.run(bench.plain), bench.run(bench.step(*effects))
+    plain, full = bench.run(bench.plain), bench.run(bench.step(*all_effects(bench.system)))
     assert full.rollout.status.is_converged
     assert full.rollout.status.newton_iterations <= 1.5 * plain.rollout.status.newton_iterations
     assert largest(bench.nominal_part(full) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
@@ -332,7 +330,6 @@ def test_the_clock_of_any_group_of_points_may_be_late_or_early(driven):
     bare = replace(driven.system, point_frames=())
     assert make_effect("camera_latency", "points_mocap", bare).label == "camera_latency@points_mocap"
     assert float(ca.DM(late.added_channel_delay("points_arm.w_T2", False))) == 0
-    symbol = late.added_channel_delay("points_mocap.w_T2", False)
-    assert ca.is_equal(symbol, late["delay"])
+    assert ca.is_equal(late.added_channel_delay("points_mocap.w_T2", False), late["delay"])
     with pytest.raises(ModelError, match="camera_latency is not possible at 'mocap'"):
         make_effect("camera_latency", "mocap", driven.system)

@@ -209,6 +209,5 @@ def test_a_turn_about_a_coordinate_axis_keeps_exact_zeros():
 
 def test_entries_next_to_0_and_1_are_meant_to_be_these():
     matrix = np.array([[1 - 1e-12, 1e-12, -1 + 1e-12], [1 + 1e-10, 0.5, -1e-10]])
-    rounded = snap_near_integer_entries(matrix)
-    np.testing.assert_array_equal(rounded, [[1.0, 0.0, -1.0], [1 + 1e-10, 0.5, -1e-10]])
+    np.testing.assert_array_equal(snap_near_integer_entries(matrix), [[1.0, 0.0, -1.0], [1 + 1e-10, 0.5, -1e-10]])
     assert matrix[0, 0] != 1.0

@@ -46,8 +46,7 @@ def test_configuration_order_of_the_paper(dual_arm):
 
 def test_forces_and_energy(robot):
     cable = flexible_object([FlexibleSegment("C", 0.5, 0.1, 0.01, links=1, bend=2.0, twist=3.0, damping=0.1)])
-    objects = [(cable, "tool", None)]
-    system = System.build(robot, objects=objects, driven=["swing", "spin"], damping={"slide": 0.7})
+    system = System.build(robot, objects=[(cable, "tool", None)], driven=["swing", "spin"], damping={"slide": 0.7})
     theta, n = system.parameters.vector(), system.n_coordinates
     x, u = ca.SX.sym("x", n), ca.SX.sym("u", 2)
     outputs = [system.viscous_force(x), system.input_force(u, x, x), system.elastic_energy(x)]

@@ -110,8 +110,7 @@ def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_p
     assert known.parameter_names == ("elbow.stiffness",)
     assert known.covariance.tolist() == [[0.0625]]
     assert source["parameters"] == {"elbow.stiffness": 4.0}
-    outcome = run_plan(run, tmp_path / "out")
-    assert max(outcome.result["std"]) > 1e-4
+    assert max(run_plan(run, tmp_path / "out").result["std"]) > 1e-4
     # what is not known is not counted, and said
     run = load_config(config, [f"plan.parameter_run_folder={solved(tmp_path / 'unsure', 4.0, np.inf)}"])
     _, known, source = identified_parameters_with_covariance(run, step)

@@ -67,8 +67,7 @@ def test_known_joints_stay_where_they_are_known_to_be(urdf_folder):
     found = solved(pendulum_step(urdf_folder, driven=("shoulder",)), [at(0, [0.5, -0.4])], posture=[0.5])
     np.testing.assert_allclose(found.state[:2], [0.5, -0.4], atol=1e-4)
     prescribed = pendulum_step(urdf_folder, prescribed=("shoulder",))
-    path = 0.5 + 0.1 * np.arange(30.0)[:, None]
-    later = solved(prescribed, [at(2, [0.7, -0.4])], posture=[0.5], path=path)
+    later = solved(prescribed, [at(2, [0.7, -0.4])], posture=[0.5], path=0.5 + 0.1 * np.arange(30.0)[:, None])
     np.testing.assert_allclose(later.state[1], -0.4, atol=1e-4)
     assert later.state[0] == 0.5, "the path's first value, whenever the points were seen"
 
@@ -81,8 +80,7 @@ def test_a_joint_without_a_spring_is_held_a_little(urdf_folder):
 
 def test_two_frames_give_a_velocity_and_the_start_before_the_first(step, momentum):
     q, v = np.array([0.6, -0.9]), np.array([0.8, -1.5])
-    frames = at([1, 2], [q + v * H, q + 2 * v * H], std=1e-4)
-    found = solved(step, [frames], window=0.02)
+    found = solved(step, [at([1, 2], [q + v * H, q + 2 * v * H], std=1e-4)], window=0.02)
     np.testing.assert_allclose(found.state[:2], q, atol=2e-3)
     np.testing.assert_allclose(found.state[2:], momentum_at(step, momentum, q, v), rtol=2e-2)
 

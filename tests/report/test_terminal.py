@@ -126,8 +126,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert first in lines[:6]
     assert "the model does not explain the recordings, so agreement of methods does not confirm the values" in lines
     assert line_of(lines, "a  ").split()[-2:] == ["in", "doubt"]
-    judgement = information(parameters={"a": judged("not_trusted")}, fit=BAD)
-    assert told("yid-identifiability/1", judgement)[0] == first
+    assert told("yid-identifiability/1", information(parameters={"a": judged("not_trusted")}, fit=BAD))[0] == first
 
 
 @pytest.mark.parametrize(

@@ -113,8 +113,7 @@ def moved(urdf_folder):
         t = H * np.arange(N_STEPS + 1)
         path = np.stack([0.6 * np.sin(2.1 * t), 0.9 + 0.3 * np.sin(3.3 * t + 0.4)], axis=1)
         theta = system.parameters.vector({f"{kind}@elbow.{name}": value for name, value in truth.items()})
-        sizes = step.sizes
-        begin = np.concatenate([path[0], np.zeros(sizes["nx"] - 2)])
+        begin = np.concatenate([path[0], np.zeros(step.sizes["nx"] - 2)])
         effort = simulate(step, theta, begin, N_STEPS, np.zeros((N_STEPS, 0)), path).effort
         noise = np.random.default_rng(seed).normal(scale=STD, size=(N_STEPS + 1, 2))
         recorded = np.vstack([effort, effort[-1]]) + noise

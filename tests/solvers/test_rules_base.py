@@ -188,8 +188,7 @@ def test_a_solver_that_needs_no_rollout_is_not_given_shorter_horizons(needs):
     solver = Steps([[1.0]], [[1.0]], [[1.0]], [[1.0]], [[1.0]])
     solver.needs_rollout = needs
     solution = fit_problem(MadeUp(reaching(lambda x: 0.7), weighting="paper", count=10), solver)
-    whole = [duration for _, duration in solver.runs if duration == 10.0]
-    assert len(whole) == 4
+    assert len([duration for _, duration in solver.runs if duration == 10.0]) == 4
     assert (len(solver.runs) > 4) is needs
     assert isinstance(solution, Solution)
 
@@ -293,8 +292,7 @@ def test_a_search_can_be_stopped_between_weights():
         if entry.note.startswith("weights 3"):
             raise base.StopSearch("enough")
 
-    problem = Disturbed(linear(np.eye(1), [-9.5]))
-    solution = fit_problem(problem, Carrying([[1.0]]), callback=stop)
+    solution = fit_problem(Disturbed(linear(np.eye(1), [-9.5])), Carrying([[1.0]]), callback=stop)
     assert (solution.x.tolist(), solution.message) == ([2.0], "enough")
 
 

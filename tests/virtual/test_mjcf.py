@@ -200,8 +200,7 @@ def test_recorded_torques_become_those_that_act(system: System) -> None:
     for kind in ("effort_gain", "effort_offset", "effort_lag"):
         location, values, _ = OTHERS[kind]
         system = with_effect(system, kind, location, values)
-    late = with_effect(system, "effort_delay", "gripper", {"delay": 0.02})
-    for changed, delay in ((system, 0.0), (late, 0.02)):
+    for changed, delay in ((system, 0.0), (with_effect(system, "effort_delay", "gripper", {"delay": 0.02}), 0.02)):
         model = mujoco_model_from_mjcf_text(mujoco_xml(changed, time_step=1e-3, actuators=True))
         data = mujoco.MjData(model)
         at, found = model.joint("elbow").id, []

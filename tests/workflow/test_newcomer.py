@@ -180,8 +180,7 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
     recording = UR5.simulate(desk, 3, 0.7, links=8)
     bag = write_mcap(recording, desk)
     assert main(["init", "package:ur5", str(bag), *UR5_NUMBERS, "--out", "cable.yaml", "--quiet"]) == 0
-    run = load_config("cable.yaml")
-    places = {name: said.parent_frame for name, said in run.model.frames.items()}
+    places = {name: said.parent_frame for name, said in load_config("cable.yaml").model.frames.items()}
     assert places == {"middle": "cable:50%", "tip": "w_cable"}
     problem = load_problem("cable.yaml", ["problem.use_compiler=false"])
     where = {f"{name}.{axis}": 0.0 for name in places for axis in "xyz"}
