@@ -302,8 +302,7 @@ def _by_lateness(
     problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction
 ) -> Array:
     """Return the derivative (M, k) of whitened prediction minus measurement by the lateness [s] of the time stamps."""
-    shared, _ = problem.unpack_episode_unknowns(x, i)
-    theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
+    theta = problem.theta_of_episode(x, i)
     state = result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameter_names)))
     steps = np.ones(samples.value.shape[1])

@@ -240,8 +240,7 @@ def _half_step_error(problem: EstimationProblem, fine: EstimationProblem, x: Arr
     if not (before.ok and after.ok) or rows[0].measurements != rows[1].measurements:
         return None
     left = before.residual[rows[0].data]
-    change = after.residual[rows[1].data] - left
-    return float(np.sqrt(np.mean(change**2)) / max(1.0, np.sqrt(np.mean(left**2))))
+    return float(np.sqrt(np.mean((after.residual[rows[1].data] - left) ** 2)) / max(1.0, np.sqrt(np.mean(left**2))))
 
 
 @dataclass(frozen=True)
@@ -293,10 +292,8 @@ def parameter_shifts_at_finer_discretisation(
             continue
         progress.begin_stage(f"trying {words}", 2.5, 2.7)
         try:
-            refined = _refined_problem(problem, key)
-            own = _gauss_newton_step_in_finer_model(
-                refined, problem, x, at_x, model_difference_only=model_difference_only
-            )
+            problems = _refined_problem(problem, key), problem
+            own = _gauss_newton_step_in_finer_model(*problems, x, at_x, model_difference_only=model_difference_only)
         except YidError as error:
             own = error.what
         if isinstance(own, str):
@@ -558,8 +555,8 @@ def alternating_error_growth_of_worst_recording(problem: EstimationProblem, x: A
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)
     for i, episode in enumerate(problem.episodes):
-        shared, offset = problem.unpack_episode_unknowns(x, i)
-        theta = predictor.theta_with_episode_values(episode, shared)
+        theta, offset = problem.unpack_episode_unknowns(x, i)
+        theta = predictor.theta_with_episode_values(episode, theta)
         begin = predictor.initial_state_and_derivative(episode, theta, offset, ())
         if begin.failure_message:
             continue

@@ -396,8 +396,7 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
                 what = f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals; `yid-ocp diagnose` can find what the model lacks"
-                sensor, _, channel = group.partition(".")
-                at = (entry["recording"], sensor, channel)
+                at = (entry["recording"], *group.partition(".")[::2])
                 what = f"{what} {guess:.3g} {unit}"
                 found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))
     return found

@@ -164,8 +164,7 @@ def measured_and_predicted_friction_torques(
         assert joints is not None
         low_pass = ZeroPhaseLowPassFilter(problem.options.path_cutoff)
         path = smoothed_joint_angles_at_nodes(joints, driven, episode.grid, episode.name, low_pass)
-        theta, _ = problem.unpack_episode_unknowns(solution.x, i)
-        theta = problem.predictor.theta_with_episode_values(episode, theta)
+        theta = problem.theta_of_episode(solution.x, i)
         inputs = problem.predictor.corrected_inputs(episode, theta, ())
         shift = inputs.driven_angles - episode.measured_driven_angles
         q = np.zeros_like(path)

@@ -248,12 +248,8 @@ def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_
     angle = joint.coordinate_unit
     rate, words = "N m s/rad" if angle == "rad" else "N s/m", f"servo of {joint.name}"
     known = {
-        "integral": ("1/s", math.inf, f"integral over proportional gain, {words}"),
-        "derivative": (rate, math.inf, f"torque against the rate within the duty's limit, {words}"),
-        "dead_band": (angle, _MAX_DEAD_BAND, f"error that is ignored, {words}"),
+        "integral": ("1/s", 0.0, math.inf, f"integral over proportional gain, {words}"),
+        "derivative": (rate, 0.0, math.inf, f"torque against the rate within the duty's limit, {words}"),
+        "dead_band": (angle, 0.0, _MAX_DEAD_BAND, f"error that is ignored, {words}"),
     }
-    made = {}
-    for term in dict.fromkeys(terms):
-        unit, upper, text = known[term]
-        made[term] = Parameter(f"{joint.name}.servo_{term}", 0.0, unit, 0.0, upper, text)
-    return made
+    return {term: Parameter(f"{joint.name}.servo_{term}", 0.0, *known[term]) for term in dict.fromkeys(terms)}

@@ -325,8 +325,8 @@ class System(ReprMixin):
         """Return a copy with added effects. Their parameters are appended to theta in the given order."""
         system = self
         for effect in effects:
-            system = replace(system, parameters=system.parameters.with_added(effect.parameters))
-            system = effect.apply_to_system(system)
+            added = system.parameters.with_added(effect.parameters)
+            system = effect.apply_to_system(replace(system, parameters=added))
             system = replace(system, effects=(*system.effects, effect))
         return system
 

@@ -196,7 +196,7 @@ class Episode:
     @property
     def has_biases_treated_as_noise(self) -> bool:
         """Whether a sensor or its clock has a constant error of unknown size, which is treated as noise."""
-        return any(samples.has_uncertain_biases_or_clock for samples in self.measurements)
+        return any(np.any(own.bias_std > 0) or own.change_by_clock is not None for own in self.measurements)
 
     @property
     def name(self) -> str:

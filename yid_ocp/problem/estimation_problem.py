@@ -195,6 +195,10 @@ class EstimationProblem(ReprMixin):
         """Extract theta and the initial state offset of the episode with index `episode` from the unknown vector."""
         return self.unknowns.unpack_episode_unknowns(x, episode, self.theta, self.system)
 
+    def theta_of_episode(self, x: ArrayLike, i: int) -> Array:
+        """Return theta at `x` with the values that are known for episode `i` or fitted with its initial state."""
+        return self.predictor.theta_with_episode_values(self.episodes[i], self.unpack_episode_unknowns(x, i)[0])
+
     def pack_unknowns(self, values: Mapping[str, float]) -> Array:
         """Return a copy (nx,) of the initial unknown vector with the named `values`, clipped to the bounds."""
         start = zip(self.unknown_names, self.initial_unknowns, strict=True)

@@ -95,11 +95,6 @@ class SensorMeasurements:
     smoothing_filter: SmoothingFilter | None = None  # of the values, if their noise is autocorrelated by it
 
     @property
-    def has_uncertain_biases_or_clock(self) -> bool:
-        """Whether an output has a constant error of unknown size, or the clock has an offset of unknown size."""
-        return bool(np.any(self.bias_std > 0)) or self.change_by_clock is not None
-
-    @property
     def output_changes_per_bias_and_clock_std(self) -> Array:
         """The change (M, k, m) of the outputs that one std of each constant error or of the clock offset causes."""
         own = self.bias_std * np.eye(len(self.bias_std))[self.bias_std > 0]

@@ -69,8 +69,7 @@ def guess_unknowns_and_node_states(
         moved = np.where(problem.positive_unknowns_mask, np.clip(factor * x, lower, upper), x)
         begins, states, multipliers, total = [], [], [], 0.0
         for i, episode in enumerate(problem.episodes):
-            shared, _ = problem.unpack_episode_unknowns(moved, i)
-            theta = problem.predictor.theta_with_episode_values(episode, shared)
+            theta = problem.theta_of_episode(moved, i)
             begins.append(problem.predictor.initial_state_and_derivative(episode, theta))
             found: list[tuple[Array, Array]] = []
             if not begins[-1].failure_message:
@@ -93,8 +92,7 @@ def guess_unknowns_and_node_states(
 
 def mean_square_of_non_effort_residuals(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
     """Return the mean square whitened residual of recording `i` for a trajectory (N + 1, nx). Efforts are not used."""
-    shared, _ = problem.unpack_episode_unknowns(x, i)
-    theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
+    theta = problem.theta_of_episode(x, i)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameter_names)))
     parts = [np.zeros(1)]
     for samples in problem.episodes[i].measurements:

@@ -353,10 +353,8 @@ class _ShootingIntervals:
                 raise SolverError(message, where=where, allowed=allowed, hint=hint)
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are searched near those of the problem's initial values, at any point
-        x = problem.initial_unknowns
-        predictor, own = problem.predictor, enumerate(problem.episodes)
-        thetas = (predictor.theta_with_episode_values(e, problem.unpack_episode_unknowns(x, i)[0]) for i, e in own)
-        starts = map(predictor.initial_state_and_derivative, problem.episodes, thetas)
+        thetas = (problem.theta_of_episode(problem.initial_unknowns, i) for i in range(len(problem.episodes)))
+        starts = map(problem.predictor.initial_state_and_derivative, problem.episodes, thetas)
         found = [None if start.failure_message else start.equilibrium for start in starts]
         n = problem.step.sizes["n"]
         self.equilibrium_guesses = tuple(None if rest is None else rest.state[:n] for rest in found)
@@ -371,8 +369,7 @@ class _ShootingIntervals:
         return x, list(found.node_states)
 
     def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        shared, _ = self.problem.unpack_episode_unknowns(x, i)
-        theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], shared)
+        theta = self.problem.theta_of_episode(x, i)
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
         return mean_square_of_non_effort_residuals(self.problem, i, trajectory, x)

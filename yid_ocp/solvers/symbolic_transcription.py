@@ -117,8 +117,7 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
         if rows:
             blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
             first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
-            theta = predictor.theta_with_episode_values(episode, problem.unpack_episode_unknowns(x, i)[0])
-            begin = predictor.initial_state_and_derivative(episode, theta, guess=first[:n])
+            begin = predictor.initial_state_and_derivative(episode, problem.theta_of_episode(x, i), guess=first[:n])
             x[columns[own:]] = (first - begin.state)[rows]
     return x
 
@@ -275,8 +274,7 @@ class _Maker:
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
-        shared, _ = problem.unpack_episode_unknowns(found.x, i)
-        theta = problem.predictor.theta_with_episode_values(episode, shared)
+        theta = problem.theta_of_episode(found.x, i)
         rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (known := begin.equilibrium) is not None:
             rest = np.concatenate([known.state[sought], known.state[2 * n :], known.constraint_reactions])

@@ -420,14 +420,10 @@ def replay_mismatch_by_channel(
         allowed = f"the angles of {', '.join(moved) or 'one joint or more'}"
         raise ModelError(what, where=f"recording '{recording.name}': joints", allowed=allowed, hint=hint)
     columns = [joints.names.index(name) for name in moved]
-    if system.servos and joints.position_command is None:
-        what = "the position servos of the model need commanded positions, which the recording lacks"
-        where, allowed = f"recording '{recording.name}': joints/position_command", "recorded position commands"
-        raise ModelError(what, where=where, allowed=allowed, hint="import the commands too")
-    if system.driven and not system.servos and joints.effort is None:
-        what = "the driven joints of the model need efforts, which the recording lacks"
-        where, allowed = f"recording '{recording.name}': joints/effort", "recorded efforts"
-        raise ModelError(what, where=where, allowed=allowed, hint="import the efforts too")
+    quantity, words = ("position_command", "commanded positions") if system.servos else ("effort", "efforts")
+    if system.driven and getattr(joints, quantity) is None:
+        what, where = f"the driven joints of the model need {words}", f"recording '{recording.name}': joints/{quantity}"
+        raise ModelError(what, where=where, allowed=f"recorded {words}", hint=f"import the {words} too")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
     effort = None if joints.effort is None else joints.effort[:, columns]
     scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)

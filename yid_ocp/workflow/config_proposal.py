@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.channel_checks import mean_sample_rate, noise_or_quantization_std
+from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period, noise_or_quantization_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, unknown_name_error_arguments
@@ -164,7 +164,6 @@ def propose_config_choices(
         start = min(group.t[0] for group in recording.joint_and_point_groups)
         if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
             moving = f"{mover} of {recording.name} moves at the start, which is estimated along"
-    period = float(np.median(np.diff(recorded.t))) if len(recorded.t) > 1 else _MAX_TIME_STEP
     return ProposedConfigChoices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
@@ -178,7 +177,7 @@ def propose_config_choices(
         moving or "all recordings begin at rest",
         _places(tree, first, branches, holder, standing) | _sensor_places(tree, first, holder),
         _noise(first, recorded, joints),
-        _time_step(period),
+        _time_step(median_sample_period(recorded.t) or _MAX_TIME_STEP),
         select_path_cutoff(recordings, joints if branches and mode == "prescribed" else ()),
         {group.name: _clock(group) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
@@ -306,7 +305,7 @@ def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: fl
 
 def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
     """Return the absolute slope of each channel's line over a window, and its std; zeros for fewer than 4 samples."""
-    period = float(np.median(np.diff(t))) if len(t) > 1 else math.inf
+    period = median_sample_period(t) or math.inf
     # the first five frames of a slow camera do not show whether its points started at rest
     window = max(window, min(5 * period, 2 * window))
     rows = (t >= time - 1e-9) & (t <= time + window)

@@ -281,15 +281,13 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, or an unknown user's home
         what = f"this cannot be a run folder: {os_error_reason(error)}"
         raise OutputError(what, where=str(out)[:200], hint="choose a writable folder with --out") from error
-    if filled:
-        hint = "choose another name with --out, or leave it out for a numbered one"
-        raise OutputError("the run folder exists and is not empty", where=str(target), allowed=allowed, hint=hint)
-    if is_link:
-        hint = "give the folder that the link points to, or choose another --out"
-        raise OutputError("the run folder is a symbolic link", where=str(target), allowed=allowed, hint=hint)
-    if is_file:
-        hint = "choose another --out"
-        raise OutputError("the run folder is an existing file", where=str(target), allowed=allowed, hint=hint)
+    for found, what, hint in (
+        (filled, "exists and is not empty", "choose another name with --out, or leave it out for a numbered one"),
+        (is_link, "is a symbolic link", "give the folder that the link points to, or choose another --out"),
+        (is_file, "is an existing file", "choose another --out"),
+    ):
+        if found:
+            raise OutputError(f"the run folder {what}", where=str(target), allowed=allowed, hint=hint)
     return [target]
 
 
