@@ -347,12 +347,8 @@ def _rms_by_channel(sensor: Sensor, square: Array) -> tuple[dict[str, float], Ar
     """Return rms values by channel with finite samples, and the sums (M, channels) of squared outputs (M, outputs)."""
     # a slow camera may have no frame, for which reshape cannot infer an axis
     summed = square.reshape(len(square), len(sensor.channel_names), sensor.outputs_per_channel).sum(axis=2)
-    found = {}
-    for c, channel in enumerate(sensor.channel_names):
-        seen = summed[np.isfinite(summed[:, c]), c]
-        if len(seen):
-            found[channel] = float(np.sqrt(np.mean(seen)))
-    return found, summed
+    seen = ((name, own[np.isfinite(own)]) for name, own in zip(sensor.channel_names, summed.T, strict=True))
+    return {name: float(np.sqrt(np.mean(own))) for name, own in seen if len(own)}, summed
 
 
 def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) -> tuple[str, float, float] | None:

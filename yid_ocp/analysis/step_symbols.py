@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -62,9 +63,7 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[str]) -> _FormulaText:
     """Convert scalar symbolic expressions to text. They contain no symbols but `variables` (k, 1), named by `names`."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
-    uses = [0] * len(nodes)
-    for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
-        uses[used] += 1
+    uses = Counter(itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results))
     written: list[tuple[str, int]] = []
     shared: list[tuple[str, str]] = []
     for i, (op, parts, value) in enumerate(nodes):

@@ -167,12 +167,10 @@ def _criterion(
     parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
     if not rivals:
         return DOptimalityCriterion(tuple(i for i, name in enumerate(columns) if name in chosen), parameters)
-    places, sizes = [], []
-    for effect in rivals:
-        own = tuple(columns.index(name) for name in effect.amplitude_parameter_names)
-        places.append(own)
-        sizes.append(_size(effect) / experiment.scales_of_estimated_unknowns[list(own)][:, None])
-    return EffectDiscriminationCriterion(tuple(places), tuple(sizes), parameters)
+    places = tuple(tuple(map(columns.index, effect.amplitude_parameter_names)) for effect in rivals)
+    scales = (experiment.scales_of_estimated_unknowns[list(own)][:, None] for own in places)
+    sizes = tuple(_size(effect) / scale for effect, scale in zip(rivals, scales, strict=True))
+    return EffectDiscriminationCriterion(places, sizes, parameters)
 
 
 def _size(effect: EffectBase) -> Array:

@@ -194,10 +194,9 @@ class UnknownVectorLayout:
     ) -> tuple[Array, Array]:
         """Return a copy of `theta` with one recording's values from `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_affecting_recording(recording)]
-        result = theta.copy()
-        for name, value in zip(self.free_parameter_names, own, strict=False):
-            result[system.parameters.index(name)] = value
-        return result, own[len(self.free_parameter_names) :]
+        result, count = theta.copy(), len(self.free_parameter_names)
+        result[[system.parameters.index(name) for name in self.free_parameter_names]] = own[:count]
+        return result, own[count:]
 
     def pack_same_for_all_recordings(self, value_by_name: Callable[[str], float], start: Array) -> Array:
         """Return the unknown vector (nx,) in which all recordings have the same local parameters and state offset."""

@@ -227,8 +227,7 @@ class _Maker:
         system = problem.system
         free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
         theta = ca.SX(fixed)
-        for k, name in enumerate(self._names):
-            theta[system.parameters.index(name)] = free[k]
+        theta[[system.parameters.index(name) for name in self._names]] = free
         self._freed = _FreeParameterSymbols(self._names, free, fixed, theta)
         self._stage = one_step_nlp_constraints(self._step.equations, self._step.time_step)
         self._stages: dict[tuple[bool, bool], _DrivenStage] = {}

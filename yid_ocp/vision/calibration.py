@@ -148,7 +148,6 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
 
 
 _MIN_FRAMES, _MAX_START_FRAMES = 3, 6  # of a calibration, and of the frames that try initial states
-_MAX_STARTS = 4
 _GOOD_START_FRACTION = 0.9  # fraction of the arm that matches: no further initial states are tried
 _STAGE_REACHES = (0.08, 0.06, 0.045)  # reach of nearest surfaces, from stage to stage [m]
 _RAY_REACH = 0.035  # along the camera's rays [m]
@@ -337,7 +336,7 @@ class _Calibrator:
         for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
             few.append(StampedCloud(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)))
-        tried = candidate_camera_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
+        tried = candidate_camera_states(self.arm, few, self.told, self.clock.search_half_width)
         if not tried:
             raise _UntoldError("the arm is hardly in view", "turn the camera so that it sees more of the arm")
         best, most = tried[0], -1.0

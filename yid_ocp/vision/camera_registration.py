@@ -52,6 +52,7 @@ _SIDEWAYS_CELLS, _FORWARD_CELLS, _CELL_STRIDE = 12, 10, 2  # cells to either sid
 _CLOCK_STEP = 0.08  # between starts of the clock [s]
 _MAX_START_DISTANCE = 0.06  # how near to the cloud a start must bring the surface [m]
 _HIDDEN_SAMPLE_COST = 0.5  # relative cost of a sample out of view; a sample in view without a near point costs one
+_MAX_STARTS = 4
 _MIN_START_SEPARATION = 0.08  # starts nearer together are one [m]
 _MIN_INCIDENCE_COSINE = 0.3  # cosine of ray and normal below which a point is not used
 _VELOCITY_TIME_STEP = 0.01  # over which velocities are taken [s]
@@ -283,12 +284,12 @@ def _at_least(least: Array, matrix: Array) -> Array:
 
 
 def candidate_camera_states(
-    arm: MovingArmSurface, frames: Sequence[StampedCloud], specified: CameraState, search: float, count: int
+    arm: MovingArmSurface, frames: Sequence[StampedCloud], specified: CameraState, search: float
 ) -> list[CameraState]:
     """Find candidate camera states that place the arm's visible surface on the clouds, best first.
 
-    Returns at most `count` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets differ from that of the
-    specified state by at most `search` [s].
+    Returns at most `_MAX_STARTS` states, at least `_MIN_START_SEPARATION` apart. Their clock offsets differ from that
+    of the specified state by at most `search` [s].
     """
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
@@ -309,7 +310,7 @@ def candidate_camera_states(
         apart = [np.linalg.norm(d[TRANSLATION_SLICE]) + 0.5 * abs(d[CLOCK_OFFSET_INDEX]) for d in between]
         if min(apart, default=math.inf) >= _MIN_START_SEPARATION:
             result.append(trial)
-        if len(result) == count:
+        if len(result) == _MAX_STARTS:
             break
     return result
 

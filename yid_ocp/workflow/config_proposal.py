@@ -296,18 +296,17 @@ def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: fl
         values = group.position[:, [group.names.index(name) for name in joints]]
         seen.insert(0, ("joint {}", tuple(joints), group.t, values, _JOINT_REST_SPEED))
     for words, names, t, values, rest_speed in seen:
-        speeds, noise = _speeds(t, values, time, _REST_WINDOW)
+        speeds, noise = _speeds(t, values, time)
         fast = speeds > rest_speed + 4 * noise
         if fast.any():
             return words.format(names[int(np.argmax(fast)) * len(names) // len(fast)])
     return ""
 
 
-def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
+def _speeds(t: Array, values: Array, time: float) -> tuple[Array, Array]:
     """Return the absolute slope of each channel's line over a window, and its std; zeros for fewer than 4 samples."""
-    period = median_sample_period(t) or math.inf
     # the first five frames of a slow camera do not show whether its points started at rest
-    window = max(window, min(5 * period, 2 * window))
+    window = float(np.clip(5 * (median_sample_period(t) or math.inf), _REST_WINDOW, 2 * _REST_WINDOW))
     rows = (t >= time - 1e-9) & (t <= time + window)
     zeros = np.zeros(values.shape[1])
     if rows.sum() < 4:

@@ -111,8 +111,7 @@ def identified_parameters_with_covariance(
     result, folder = _read_parameter_run(run, ("solve",))
     _require_same_effects(run, result["parameters"], parameters.names)
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
-    for name, value in found.items():
-        theta[parameters.index(name)] = value
+    theta[[parameters.index(name) for name in found]] = list(found.values())
     with open_hdf5_after_read_check(folder / "trajectories.h5") as data:
         names = [str(name) for name in data["unknowns"].attrs["names"]]
         covariance = np.array(data["unknowns/covariance"])

@@ -396,7 +396,7 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_one_of(topic, known, "joint states")
     chosen = [topic for topic in (default if topics is None else topics) if topic != command]
-    wanted = None if options.joints is None else base.parse_old_to_new_names(options.joints, "joint", where)
+    wanted = None if options.joints is None else base.parse_old_to_new_joint_names(options.joints, where)
     found, notes = [], []
     if wanted is not None:
         _check_together(bag, chosen, wanted, where)

@@ -106,17 +106,17 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
     return factors
 
 
-def parse_old_to_new_names(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
-    """Return new names by recorded name, from entries `name` or `recorded=name`. `DataError` if empty or repeated."""
+def parse_old_to_new_joint_names(entries: Iterable[str], where: str) -> dict[str, str]:
+    """Return new joint names by recorded one, from `name` or `recorded=name`. `DataError` if empty or repeated."""
     found: dict[str, str] = {}
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))
         name = name if equals else recorded
         if not recorded or not name:
-            allowed, hint = f"NAME, or RECORDED=NAME of a {noun}", "add the name, or leave the entry out"
-            raise DataError(f"the entry '{entry}' lacks the name of a {noun}", where=where, allowed=allowed, hint=hint)
+            allowed, hint = "NAME, or RECORDED=NAME of a joint", "add the name, or leave the entry out"
+            raise DataError(f"the entry '{entry}' lacks the name of a joint", where=where, allowed=allowed, hint=hint)
         if recorded in found or name in found.values():
-            what, allowed = f"the {noun} '{name}' is chosen twice", f"every {noun} once"
+            what, allowed = f"the joint '{name}' is chosen twice", "every joint once"
             raise DataError(what, where=where, allowed=allowed, hint="remove one of the two entries")
         found[recorded] = name
     return found
@@ -146,7 +146,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
     if group is not None:
         names = {name: name for name in group.names}
         if options.joints is not None:
-            names = parse_old_to_new_names(options.joints, "joint", where)
+            names = parse_old_to_new_joint_names(options.joints, where)
             require_known_names(names, group.names, "joint", where, DataError)
         at = [group.names.index(name) for name in names]
         recorded = group.values_by_channel.items()

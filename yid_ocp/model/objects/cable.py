@@ -108,8 +108,7 @@ def length_parameters_from_edges(cable: CableTopology, lengths: Mapping[tuple[st
     """Compute the values of a cable's length parameters from its edge lengths [m]."""
     values = {f"{START_CLAMP}.length": lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]]}
     for name, chain in cable.vertex_names_by_branch.items():
-        first = 1 if name == cable.parent_segment else 0
-        for i, edge in enumerate(pairwise(chain[first:])):
+        for i, edge in enumerate(pairwise(chain[1:] if name == cable.parent_segment else chain)):
             values[f"{name}.length_{i}"] = lengths[edge]
     return values
 
