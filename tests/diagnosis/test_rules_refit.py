@@ -91,14 +91,14 @@ class Memory(dict):
 @pytest.fixture
 def solved(monkeypatch):
     """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
-    made = SimpleNamespace(runs=[], failed=[], losses=[])
+    made = SimpleNamespace(runs=[], failed=[], losses=[], known=None)
 
     def run(problem, x, callback, evaluate=None):
         values = problem.named_values(x)
         failed = problem.cost(values) is None
         (made.failed if failed else made.runs).append(values)
         status = Status.FAILED if failed else Status.STALLED
-        usual = {"message": "done", "equilibrium_guesses": "there", "evaluation": None}
+        usual = {"message": "done", "equilibrium_guesses": "there", "evaluation": made.known}
         return SimpleNamespace(x=np.asarray(x), status=status, **usual)
 
     def held_out(problem, x, evaluation, spread):
@@ -148,6 +148,9 @@ def test_a_refit_is_evaluated_where_it_ended(solved):
     assert found.std == dict.fromkeys(problem.unknown_names, 0.1)
     assert (found.effects, found.solver_message) == ((FRICTION,), "done")
     assert problem.warmed == ["there"], "the shape at rest is looked for where it was"
+    solved.known = costing(3.0, 10)  # there are no filters to linearise anew
+    assert refit_with_effects(problem, [FRICTION], START).cost == 3.0
+    assert len(problem.asked) == 1
 
 
 @pytest.mark.parametrize(("largest", "drawn"), [(2.0, 2.25), (1.3, 1.25), (0.7, 0.65), (0.4, 0.35), (0.26, 0.25)])
