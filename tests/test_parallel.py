@@ -293,8 +293,7 @@ def test_no_workers_and_workers_in_two_places_are_refused():
 
 
 def test_a_task_that_ends_its_process_takes_no_other_with_it(tmp_path, caplog):
-    found = run_tasks(lethal, tasks_of(5, deadly=1), tmp_path)
-    assert [entry.value for entry in found] == [0, None, 20, 30, 40]
+    assert [entry.value for entry in run_tasks(lethal, tasks_of(5, deadly=1), tmp_path)] == [0, None, 20, 30, 40]
     assert [("task 1" in text, "abruptly" in text) for text in caplog.messages] == [(True, True)]
 
 

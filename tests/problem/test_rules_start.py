@@ -254,13 +254,14 @@ def test_errors_are_euclidean_for_points_and_plain_for_efforts():
     result = SimpleNamespace(
         predicted_outputs=(np.array([[3.0, 4, 0, 1, 0, 0], [0, 0, 1, 5, 5, 5]]), np.array([[4.0], [6.0], [9.0]]))
     )
-    found = rmse_unit_and_count_by_channel([result, result], [SimpleNamespace(measurements=(tips, loads))] * 2)
+    run = {"name": "run", "grid": SimpleNamespace(start_time=0.0, time_step=0.1)}
+    found = rmse_unit_and_count_by_channel([result, result], [SimpleNamespace(**run, measurements=(tips, loads))] * 2)
     assert found == {
         "points.a": {"rmse": pytest.approx(math.sqrt(13.0)), "unit": "m", "n": 4},
         "points.b": {"rmse": 1.0, "unit": "m", "n": 2},
         "joints.effort.j": {"rmse": pytest.approx(math.sqrt(12.5)), "unit": "N m", "n": 4},
     }
-    hidden = SimpleNamespace(measurements=(measured(efforts("j"), [0], [0.0], [[NAN]]),))
+    hidden = SimpleNamespace(**run, measurements=(measured(efforts("j"), [0], [0.0], [[NAN]]),))
     assert rmse_unit_and_count_by_channel([SimpleNamespace(predicted_outputs=(np.zeros((1, 1)),))], [hidden]) == {}
 
 
