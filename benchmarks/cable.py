@@ -39,8 +39,8 @@ from yid_ocp.model.objects.cable import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
-    measured_point_positions,
     naive_cable_predictions,
+    recorded_point_positions,
 )
 from yid_ocp.solvers import GaussNewton, fit_problem
 
@@ -131,7 +131,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
 
 def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     """Prediction errors without a model [m]."""
-    free, measured = cable.unclamped_vertex_names, measured_point_positions(recording, cable.unclamped_vertex_names)
+    free, measured = cable.unclamped_vertex_names, recorded_point_positions(recording, cable.unclamped_vertex_names)
     predictions = naive_cable_predictions(recording, cable, free, cable.clamped_vertex_names)
     return {name: _position_rmse(predicted, measured) for name, predicted in predictions.items()}
 

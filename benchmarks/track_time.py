@@ -36,7 +36,7 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.vision.frame_folder import read_frame_folder, write_frame_folder
 from yid_ocp.vision.frames import import_open3d
-from yid_ocp.vision.track import FrameTracker
+from yid_ocp.vision.track import SingleFrameTracker
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.track import _camera_scene, _simulate_recording_and_camera_frames
 
@@ -93,13 +93,13 @@ def _film(run: RunSettings, folder: Path, count: int = 0) -> Recording:
 def _speed(config: Path, folder: Path) -> tuple[str, ...]:
     run = load_config(config)
     recording = _film(run, folder)
-    tracker = FrameTracker(
+    tracker = SingleFrameTracker(
         _camera_scene(run, build_system(run)), recording, read_frame_folder(folder), run.track.options
     )
     begun = time.process_time()
     common = tracker.estimate_shared_values()
     shared, begun = time.process_time() - begun, time.process_time()
-    frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
+    frames = [tracker.process_one_frame(i, common) for i in tracker.frame_order]
     each = (time.process_time() - begun) / len(frames)
     fits = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     good = sum(frame.is_good for frame in frames)

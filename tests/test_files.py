@@ -127,7 +127,7 @@ OPENERS |= {"imread", "read_image", "read_point_cloud", "read_triangle_mesh"}
 """Functions that open a file: Python's own, and those of the libraries that the package uses."""
 GUARDS = {"check_input_file", "check_readable_in_child_process", "read_input_text"}
 OPENED_ELSEWHERE = {
-    "files.process_memory_limit": "/proc",
+    "files.limit_process_memory": "/proc",
     "files.atomic_write": "what was written",
     "version.sha256_of_source_files": "the package's own sources",
     "cli._discard_what_follows": "/dev/null",
@@ -149,7 +149,7 @@ OPENED_ELSEWHERE = {
     "solvers.nonlinear_program.available_memory_bytes": "/proc",
     **{f"vision.frame_folder._read_{suffix}": "`_read_cloud` has looked" for suffix in ("npz", "xyz", "pcd", "ply")},
     "vision.frame_folder.write_frame_folder": "writes",
-    "virtual.mjcf.file_format_elements_by_aspect": "a table that comes with the package",
+    "virtual.mjcf.elements_by_aspect_and_file_format": "a table that comes with the package",
     "workflow.run_folder.atomic_run_folder": "writes",
     "workflow.run_inputs.load_plugins": "a package that the user installed",
 }

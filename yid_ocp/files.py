@@ -61,7 +61,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 
 @contextlib.contextmanager
-def process_memory_limit() -> Iterator[None]:
+def limit_process_memory() -> Iterator[None]:
     """Limit the additional memory of this process to 1.75 GiB inside a `with` block (on Linux only).
 
     A library that needs more memory to unpack an input file gets a MemoryError. An existing limit stays unchanged.

@@ -6,7 +6,7 @@ from answer import Answer
 from cases import Trial
 
 import yid_ocp as yid
-from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
+from yid_ocp.problem.predictions import rmse_unit_count_dicts_by_channel
 
 
 def solve(trial: Trial) -> Answer:
@@ -27,7 +27,7 @@ def servo(trial: Trial) -> Answer:
     solution = yid.solve(problem)
     free = {name: entry for name, entry in solution.parameters.items() if entry.free}
     errors = [
-        next(iter(rmse_unit_and_count_by_channel([predicted], [episode]).values()))["rmse"]
+        next(iter(rmse_unit_count_dicts_by_channel([predicted], [episode]).values()))["rmse"]
         for episode, predicted in solution.checks.held_out_predictions
     ]
     ends = {name: entry.confidence_interval_ends for name, entry in free.items()}

@@ -21,7 +21,7 @@ from yid_ocp.analysis.experiment_design import (
     UnchangedExperiment,
     VariantPositionSensitivities,
     measurable_points,
-    step_with_frames_at_measurable_points,
+    step_with_frames_and_measurable_points,
 )
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
@@ -32,7 +32,7 @@ from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.servos_and_springs import JointSpringData
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
@@ -55,8 +55,8 @@ MARKER_DISTANCE = 0.03
 def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
-        (made.camera_times_and_median_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_point_group_with_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.camera_points_times_and_median_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
+        (made.arm_points_times_and_median_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -67,9 +67,9 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     std = np.full((3, 2, 3), 2e-3)
     std[0] = [9e-3, np.nan, 9e-3]
     made, episode = setting(group(std=std))
-    assert made.camera_times_and_median_std(episode)[2] == 2e-3
+    assert made.camera_points_times_and_median_std(episode)[2] == 2e-3
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
-    assert made.camera_times_and_median_std(episode)[2] == 3e-3
+    assert made.camera_points_times_and_median_std(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
     with pytest.raises(DataError, match="group 'points_camera' is neither recorded nor in the settings"):
         unknown.existing_point_observation_schedules(episode)
@@ -161,7 +161,7 @@ def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(urdf_folder):
 def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
     turn = "continuous", " ".join(map(str, axis))
     robot = chain_of_motors(tmp_path, turn=turn, slide=("prismatic", "1 0 0"))
-    springs = {"turn": RobotJointSpring(1.0), "slide": RobotJointSpring(1.0)}
+    springs = {"turn": JointSpringData(1.0), "slide": JointSpringData(1.0)}
     system = System.build(robot, springs=springs, point_frames=["hand"])
     *moving, marker = measurable_points(system)
     there = [name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0]
@@ -198,7 +198,7 @@ def swung(urdf_folder):
     """swung(**options): a pendulum, the shoulder moved as measured, the elbow springy, the tip seen by a camera."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(
-        robot, prescribed=["shoulder"], springs={"elbow": RobotJointSpring(3.0)}, damping=0.1, point_frames=["tip"]
+        robot, prescribed=["shoulder"], springs={"elbow": JointSpringData(3.0)}, damping=0.1, point_frames=["tip"]
     )
     step = compile_step(system, 0.02, use_compiler=False)
     t = 0.02 * np.arange(41)
@@ -273,7 +273,7 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
     np.testing.assert_allclose(camera.t, episode.grid.node_times)
     assert np.all(camera.std == 1.0)
     step = swung().step
-    more, seen = step_with_frames_at_measurable_points(step)
+    more, seen = step_with_frames_and_measurable_points(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel
@@ -372,7 +372,7 @@ def drawn_motion(monkeypatch):
             row[:, feedback.state_indices] -= s.state_by_torque @ gain
         return [(np.stack(rows), None)]
 
-    monkeypatch.setattr(propagation, "iterate_step_derivatives", maps)
+    monkeypatch.setattr(propagation, "rollout_step_derivatives", maps)
     monkeypatch.setattr(
         propagation, "applied_torque_derivative_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )
@@ -521,7 +521,7 @@ def test_errors_of_torques_move_points_as_rollouts_with_other_torques_do(urdf_fo
     )
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), options)
     x, [episode] = problem.initial_unknowns, problem.episodes
-    slopes, _ = propagation.point_sensitivities_and_information(problem, problem.evaluate(x), x, 0, {tip.name: 1e-6})
+    slopes, _ = propagation.point_jacobians_and_joint_information(problem, problem.evaluate(x), x, 0, {tip.name: 1e-6})
     [found] = (own[:, :, len(x) :].reshape(-1, own.shape[2] - len(x)) for own in slopes.values())
 
     def seen(change):

@@ -146,7 +146,7 @@ def test_the_part_that_a_direction_explains_does_not_depend_on_its_length(size):
 def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuisances, words):
     start = {"a": 2.0, **dict.fromkeys(nuisances, 0.0)}
     wide = Formula(lambda x: [30 * (x["a"] / 2 - 1) + 5 * x[name] for name in nuisances], start, bounds=FREE)
-    monkeypatch.setattr(module, "free_starts_and_grasps", lambda *_: wide)
+    monkeypatch.setattr(module, "with_free_starts_and_grasps", lambda *_: wide)
     [hidden] = identifiability(Formula(lambda x: [30 * (x["a"] / 2 - 1)], {"a": 2.0})).directions
     assert hidden.verdict == "not_identifiable"
     assert hidden.words.partition("a cannot be separated from ")[2] == words
@@ -178,8 +178,10 @@ def test_where_the_grasp_sits_is_a_nuisance(held_tube):
     assert loose.parameters["T1.bend"].std > 1.5 * base.parameters["T1.bend"].std
     one_free = EstimationProblem(step, recordings, (*held_tube.free, "grasp_offset@hand.dy"), held_tube.options)
     added = ("grasp_offset@hand.dx", "grasp_offset@hand.dz")
-    assert module.free_starts_and_grasps(one_free, "assumed", 2e-3).options.prior_stds == dict.fromkeys(added, 2e-3)
-    assert module.free_starts_and_grasps(one_free, "assumed", None) is one_free
+    assert module.with_free_starts_and_grasps(one_free, "assumed", 2e-3).options.prior_stds == dict.fromkeys(
+        added, 2e-3
+    )
+    assert module.with_free_starts_and_grasps(one_free, "assumed", None) is one_free
 
 
 def test_every_grasp_without_an_offset_gets_one(urdf_folder):

@@ -26,8 +26,8 @@ from yid_ocp.analysis.point_checks import (
     _moved,
     cable_point_geometry_issues,
     forward_kinematics_issues,
-    object_point_rollout_issues,
-    point_distance_issues,
+    object_point_correction_issues,
+    points_too_distant_issues,
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
@@ -444,7 +444,7 @@ def test_what_is_a_little_off_or_at_rest_is_no_wrong_clock(arms, runs):
 )
 def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
     recording = with_points(runs[1], "points_camera", lambda p: factor * p)
-    found = point_distance_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
+    found = points_too_distant_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert doubt.limit_violation_ratio == pytest.approx(ratio, rel=1e-3)
@@ -453,7 +453,7 @@ def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
 
 def test_two_points_on_either_side_of_the_root_are_too_far_apart_for_the_branches_between_them(arms, runs):
     recording = with_points(runs[1], "points_camera", lambda p: p + np.array([[0.0, 0.6, 0.0], [0.0, -0.6, 0.0]]))
-    (doubt,) = point_distance_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
+    (doubt,) = points_too_distant_issues(arms[1], arms[1].system, arms[1].system.parameters.vector(), recording, usual)
     assert re.search(r"w_T1\b.*\bw_T3\b.*\b1\.81 m\b.*\b1\.14 m along", doubt.what)
 
 
@@ -549,14 +549,14 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
     samples = measured(sensor, at, 0.0 * at, change(place).reshape(20, 9))
     episode = SimpleNamespace(name="run", measurements=(samples,))
     result = SimpleNamespace(predicted_outputs=(place.reshape(20, 9),))
-    found = list(object_point_rollout_issues(episode, result, 2.0))
+    found = list(object_point_correction_issues(episode, result, 2.0))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         apart = np.sqrt(np.mean(np.sum((change(place) - place) ** 2, axis=2)))
         assert (doubt.recording, doubt.group, doubt.severity) == ("run", "points_camera", "not_trusted")
         assert doubt.limit_violation_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
         assert words in doubt.what
-    assert list(object_point_rollout_issues(episode, result, 0.0)) == []
+    assert list(object_point_correction_issues(episode, result, 0.0)) == []
 
 
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}

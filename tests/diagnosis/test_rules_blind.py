@@ -87,7 +87,7 @@ def drawn(monkeypatch):
         ensemble = BlindCaseGenerator(problem(**given), seed, finer, conditions=conditions)
         columns = {"kelvin_voigt": [[100.0]], "joint_coulomb": [[0.5]], "gravity_tilt": [[30.0, 40.0]]}
         seen = [detectable(of, columns.get(of.kind, [[50.0]])) for of in candidates]
-        ensemble.set_candidate_sensitivities_from_json(seen)
+        ensemble.set_candidate_sensitivities_from_list(seen)
         return ensemble
 
     monkeypatch.setattr(module, "run_experiment_with_injected_effects", experiment)
@@ -124,7 +124,7 @@ def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
     monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
     monkeypatch.setattr(module, "linearize_candidates", linearized)
-    [told] = BlindCaseGenerator(ensemble.problem, 3, None).candidate_sensitivities_to_json()
+    [told] = BlindCaseGenerator(ensemble.problem, 3, None).candidate_sensitivities_to_list()
     assert np.abs(told["columns"]) == 2.0
 
 
@@ -205,10 +205,10 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
 
 
 def test_what_is_detectable_survives_as_plain_data(drawn):
-    told = json.loads(json.dumps(drawn().candidate_sensitivities_to_json()))
+    told = json.loads(json.dumps(drawn().candidate_sensitivities_to_list()))
     other = drawn(seed=5)
-    other.set_candidate_sensitivities_from_json(told)
-    assert other.candidate_sensitivities_to_json() == told
+    other.set_candidate_sensitivities_from_list(told)
+    assert other.candidate_sensitivities_to_list() == told
     assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
     assert of_category(other, "single", 3.0)[1] == of_category(drawn(seed=5), "single", 3.0)[1]
 
@@ -322,7 +322,7 @@ def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
 def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(drawn, of, column, wanted, largest):
     ensemble = drawn(candidates=(of,))
     columns = [[column]] if len(of.amplitude_parameter_names) == 1 else [[0.6 * column, 0.8 * column]]
-    ensemble.set_candidate_sensitivities_from_json([detectable(of, columns)])
+    ensemble.set_candidate_sensitivities_from_list([detectable(of, columns)])
     for number in range(5):
         told = ensemble.draw_recordings_and_ground_truth(PlannedBlindCase(number, "one", "single", wanted))[1]
         [found], values = told.injected, np.array(list(told.injected[0].values.values()))
@@ -385,7 +385,7 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
 def chain(links, **values):
     parameters = SimpleNamespace(names=tuple(values), vector=lambda: np.array(list(values.values())))
     named = {name: SimpleNamespace(name=name, link_joints=((),) * count) for name, count in links.items()}
-    layouts = {"segment_layouts": tuple(named.values()), "layout_of_segment": named.__getitem__}
+    layouts = {"segment_layouts": tuple(named.values()), "segment_layout_by_name": named.__getitem__}
     return SimpleNamespace(parameters=parameters, **layouts)
 
 

@@ -32,7 +32,7 @@ A, S = "friction@elbow.a", "friction@elbow.s"
 CERTAIN = np.zeros((1, 1))
 TWO_RECORDINGS = SimpleNamespace(
     problem=SimpleNamespace(episodes=["first", "second"], system=SimpleNamespace(effects=range(200))),
-    restricted_to_effects=lambda group: [effect.label for effect in group],
+    with_step_of_only_effects=lambda group: [effect.label for effect in group],
 )
 
 
@@ -51,15 +51,15 @@ class Problem:
 
     unknowns = problem
 
-    def with_nominal_and_effects_free(self, effects):
+    def problem_with_nominal_and_effects_free(self, effects):
         self.freed = tuple(effects)
         return self
 
-    def with_effects_and_relinearized_filters(self, effects, at):
+    def problem_with_effects_and_relinearized_filters(self, effects, at):
         self.at.append(self.named_values(self.pack_unknowns(at)))
-        return self.with_nominal_and_effects_free(effects)
+        return self.problem_with_nominal_and_effects_free(effects)
 
-    def with_relinearized_held_out_filters(self, own, effects, at):
+    def problem_with_relinearized_held_out_filters(self, own, effects, at):
         assert own is self
         self.foreseen.append(dict(at))
         return self
@@ -321,14 +321,14 @@ def predicting(monkeypatch):
         told["episodes"] = [e.name for e in episodes]
         return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}} if results else {}
 
-    monkeypatch.setattr(module, "rmse_unit_and_count_by_channel", channel_errors)
+    monkeypatch.setattr(module, "rmse_unit_count_dicts_by_channel", channel_errors)
 
     def rows(there, whitening, result):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)
         residual = np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs])
         return SimpleNamespace(residual=residual, jacobian=np.full((len(residual), 2), [1.0, 7.0]))
 
-    monkeypatch.setattr(module, "whitened_residual_and_jacobian", rows)
+    monkeypatch.setattr(module, "episode_residual_and_jacobian", rows)
     usual = {"has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": ("k",), "unknown_names": (), "initial_unknowns": np.zeros(0)}
     monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, evaluation: evaluation)
@@ -359,8 +359,8 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     joint = held_out_loss(problem, np.zeros(1), np.array([[2.0]]))
     shift = -14 / (11 + 1 / 4)
     residual = found.total_chi2 + 2 * 14 * shift + 11 * shift**2
-    assert joint.total_chi2 == found.total_chi2 == found.joint_fit_chi2
-    assert joint.joint_fit_chi2 == pytest.approx(residual + (shift / 2) ** 2)
+    assert joint.total_chi2 == found.total_chi2 == found.added_joint_fit_chi2
+    assert joint.added_joint_fit_chi2 == pytest.approx(residual + (shift / 2) ** 2)
 
 
 @cases(

@@ -148,7 +148,7 @@ def test_an_inertia_turns_the_encoders_noise_into_more_noise_of_efforts(urdf_fol
     assert made.with_encoder_noise_in_efforts([rotor], {**values, "rotor_inertia@joint.armature": 1e-4}) is None
     chi2 = []
     for own in (made, made.with_encoder_noise_in_efforts([rotor], values)):
-        own = own.with_nominal_and_effects_free([rotor])
+        own = own.problem_with_nominal_and_effects_free([rotor])
         residual = own.evaluate(own.pack_unknowns(values), False).residual[own.residual_rows.data]
         chi2.append(residual @ residual / len(residual))
     assert chi2[1] == pytest.approx(1.0, abs=0.3)

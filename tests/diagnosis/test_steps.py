@@ -35,7 +35,7 @@ def test_all_candidates_together_are_the_nominal_model_until_they_are_freed(benc
     recordings = [episode.recording for episode in composed.problem.episodes]
     x = composed.problem.initial_unknowns * 1.1
     plain = bench.problem(recordings).evaluate(x)
-    together = composed.with_nominal_and_effects_free(()).evaluate(x)
+    together = composed.problem_with_nominal_and_effects_free(()).evaluate(x)
     assert together.residual == pytest.approx(plain.residual, rel=1e-9, abs=1e-9)
     assert together.jacobian == pytest.approx(plain.jacobian, rel=1e-8, abs=1e-8)
 
@@ -43,7 +43,7 @@ def test_all_candidates_together_are_the_nominal_model_until_they_are_freed(benc
 def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
     composed, nominal, _ = screened
     chosen = [effect for effect in composed.candidate_effects if effect.kind in ("rotor_inertia", "link_mass")]
-    some = composed.with_nominal_and_effects_free(chosen)
+    some = composed.problem_with_nominal_and_effects_free(chosen)
     alone = EstimationProblem(composed.problem.step, [e.recording for e in some.episodes], some.free, some.options)
     x = some.pack_unknowns(nominal.values) + 0.01
     assert some.unknown_names == alone.unknown_names

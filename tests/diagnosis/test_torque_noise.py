@@ -33,10 +33,10 @@ from yid_ocp.inference.whitening import (
 from yid_ocp.integrator.step import Step, compile_step, reachable_and_observable_state_mask, simulate
 from yid_ocp.model import System
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
-from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.servos_and_springs import JointSpringData
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
+from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.solvers import GaussNewton, fit_problem
 
 TIME_STEP, STEPS = 0.01, 200
@@ -47,7 +47,7 @@ FREE = ("elbow.stiffness", "elbow.damping")
 @pytest.fixture(scope="module")
 def step(urdf_folder) -> Step:
     tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": RobotJointSpring(3.0)}
+    springs = {"elbow": JointSpringData(3.0)}
     system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     return compile_step(system, TIME_STEP)
 
@@ -92,7 +92,7 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     assert weighted.candidate_effects == made.candidate_effects
     assert weighted.is_split_in_blocks == made.is_split_in_blocks
     own = weighted.problem
-    extended = weighted.with_nominal_and_effects_free(weighted.candidate_effects)
+    extended = weighted.problem_with_nominal_and_effects_free(weighted.candidate_effects)
     assert all(x is y is not None for x, y in zip(own.whitening_filters, extended.whitening_filters, strict=True))
     held = zip(own.held_out_whitening_filters, extended.held_out_whitening_filters, strict=True)
     assert all(x is y is not None for x, y in held)
@@ -104,7 +104,7 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
 
 
 def held_out_residual(problem, episode, result):
-    return whitened_residual_and_jacobian(episode, problem.held_out_whitening_filters[0], result).residual
+    return episode_residual_and_jacobian(episode, problem.held_out_whitening_filters[0], result).residual
 
 
 @cases("held_out", {"held_out": True, "in_blocks": False})
@@ -113,7 +113,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     made = composed(step, held_out, "effort_offset", "joint_viscous").with_whitening_linearized_at(
         {"elbow.stiffness": 2.5}
     )
-    wide = made.with_nominal_and_effects_free(made.candidate_effects)
+    wide = made.problem_with_nominal_and_effects_free(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.pack_unknowns({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
     moved = problem_with_reestimated_held_out_torque_biases(
@@ -144,14 +144,14 @@ def test_other_candidates_are_left_out_of_refits(step):
     )
     friction = next(e for e in made.candidate_effects if e.label == "joint_viscous@shoulder")
     elsewhere = next(e for e in made.candidate_effects if e.label == "joint_viscous@elbow")
-    some = all_candidates.restricted_to_effects([friction, elsewhere])
+    some = all_candidates.with_step_of_only_effects([friction, elsewhere])
     assert some.problem.step.sizes["nx"] < all_candidates.problem.step.sizes["nx"]
     assert {own.label for own in some.problem.system.effects} == {friction.label, elsewhere.label}
-    assert made.restricted_to_effects([friction]).problem.whitening_filters == (None,)
+    assert made.with_step_of_only_effects([friction]).problem.whitening_filters == (None,)
     found = []
     for hypotheses in (all_candidates, some):
-        own = hypotheses.with_effects_and_relinearized_filters([friction], at)
-        own = hypotheses.with_relinearized_held_out_filters(own, [friction], at)
+        own = hypotheses.problem_with_effects_and_relinearized_filters([friction], at)
+        own = hypotheses.problem_with_relinearized_held_out_filters(own, [friction], at)
         x = own.pack_unknowns(at)
         evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
         rows = held_out_residual(own, *held)
@@ -209,7 +209,7 @@ def sprung(step, urdf_folder):
     The spring's torque at rest is twelve times the offset that is stated.
     """
     tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": RobotJointSpring(3.0), "shoulder": RobotJointSpring(STRONG)}
+    springs = {"elbow": JointSpringData(3.0), "shoulder": JointSpringData(STRONG)}
     system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     moves = compile_step(system, TIME_STEP)
     # a spring about another angle is one about zero and a constant torque
@@ -245,7 +245,7 @@ def test_a_law_is_sought_at_another_joint_than_that_of_a_named_effect(sprung):
     problem, made = sprung
     spring = next(e for e in made.candidate_effects if e.kind == "joint_spring")
     nominal = fit_nominal_model(problem, made)
-    own = replace(made, problem=nominal.problem).restricted_to_effects([spring])
+    own = replace(made, problem=nominal.problem).with_step_of_only_effects([spring])
     found = refit_with_effects(own, [spring], nominal.values)
     assert found.problem.step is not made.problem.step
     search, sought = RefitContext(made, Thresholds(), NULL_PROGRESS), gap_law._neutral_law(found, "elbow", ("angle",))

@@ -13,7 +13,7 @@ from yid_ocp.inference.smoother_model import residual_models_with_smoother_unkno
 from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
+from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
 TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
@@ -51,7 +51,7 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
     torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
     changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
     result = problem.predictor.predict_episode(changed, *problem.unpack_episode_unknowns(x, 0), False)
-    return whitened_residual_and_jacobian(changed, None, result).residual
+    return episode_residual_and_jacobian(changed, None, result).residual
 
 
 def slopes(change, count, size):
@@ -110,7 +110,7 @@ def test_a_step_without_a_measurement_adds_no_likelihood_and_lets_the_state_go_o
     covariance = np.array([[2.0, 0.3], [0.3, 1.0]])
     map_ = np.array([[0.9, 0.2]])
     transition = kalman.StateTransition(map_, np.array([0.5]))
-    step, after, log_determinant = kalman.one_kalman_step(covariance, np.zeros((0, 2)), transition)
+    step, after, log_determinant = kalman.kalman_covariance_step(covariance, np.zeros((0, 2)), transition)
     assert log_determinant == 0.0
     whole = np.vstack([map_, [0.0, 0.5]])
     np.testing.assert_allclose(after, whole @ covariance @ whole.T)

@@ -29,7 +29,7 @@ from yid_ocp.inference.uncertainty import (
     _score_covariance,
     apply_profile_interval,
     assess_goodness_of_fit,
-    mask_of_unknowns_with_decisive_priors,
+    mask_of_priors_determining_unknown,
     misfit_robust_covariance,
     needs_no_profile_likelihood,
     parameter_estimates,
@@ -560,7 +560,7 @@ def test_a_mass_that_scales_with_a_motor_is_known_by_the_motors_priors(own_part,
     priors[[0, 1, 2], [1, 2, 3]] = 4.0, 4.0, 1.0
 
     def determined_by(count, column, known=priors):
-        mask = mask_of_unknowns_with_decisive_priors(data[:, :count], known[:, :count], column)
+        mask = mask_of_priors_determining_unknown(data[:, :count], known[:, :count], column)
         return np.flatnonzero(mask).tolist()
 
     assert determined_by(4, 0) == named

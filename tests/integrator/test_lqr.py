@@ -6,12 +6,12 @@ import pytest
 import scipy.linalg
 
 from yid_ocp.effects import make_effect
-from yid_ocp.effects.bodies import system_with_link_mass_factors
+from yid_ocp.effects.bodies import system_with_mass_scale_parameters
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import (
     EffectMomentumCalculator,
-    JointMotionAndTorqueWithSensitivities,
+    RecordedMotionWithSensitivities,
     lqr_tracking_feedback,
     proportional_tracking_feedback,
 )
@@ -148,7 +148,7 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     step, theta, (state, torque, internal), shift = moved(step_with(plain, names))
     read = torque + misread
     loop = lqr_tracking_feedback(step, state[:, ANGLES], read, shift.parameter_values_with_neutral_effects(theta))
-    recorded, true = (JointMotionAndTorqueWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
+    recorded, true = (RecordedMotionWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
     value, _ = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     if names or misread:
@@ -156,11 +156,11 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
 
 
 def test_the_reference_follows_masses_and_damping_of_the_arm_that_are_fitted(plain):
-    step = compile_step(system_with_link_mass_factors(plain, "mass_scale"), TIME_STEP, use_compiler=False)
+    step = compile_step(system_with_mass_scale_parameters(plain, "mass_scale"), TIME_STEP, use_compiler=False)
     names = {"shoulder.mass_scale": 1.1, "elbow.mass_scale": 0.8, "elbow.damping": 0.4}
     step, theta, (state, torque, internal), shift = moved(step, names)
     loop = lqr_tracking_feedback(step, state[:, ANGLES], torque, shift.parameter_values_with_neutral_effects(theta))
-    recorded = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], torque, internal)
+    recorded = RecordedMotionWithSensitivities(state[:, ANGLES], torque, internal)
     value, slopes = shift.effect_momentum_shifts_and_sensitivities(recorded, recorded, theta, tuple(names))
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     assert np.all(np.max(np.abs(slopes), axis=(0, 1)) > 1e-4)
@@ -171,8 +171,8 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     _, theta, (state, torque, none), shift = moved(step_with(plain, ()))
     assert set(shift.parameter_names) == OWN
     by_torque = np.stack([torque, 0 * torque], axis=2)
-    recorded = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], torque, none)
-    true = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
+    recorded = RecordedMotionWithSensitivities(state[:, ANGLES], torque, none)
+    true = RecordedMotionWithSensitivities(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
     value, slope = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, ("gain", "other"))
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
@@ -189,14 +189,14 @@ def test_derivatives_are_those_of_differences(plain, names):
     d, rng = len(wanted) + 2, np.random.default_rng(1)
     by_angles, by_torque = (0.01 * rng.normal(size=(*x.shape, d)) for x in (state[:, ANGLES], torque))
     by_internal = 0.1 * rng.normal(size=(len(internal), d))
-    recorded = JointMotionAndTorqueWithSensitivities(state[:, ANGLES], torque, internal)
+    recorded = RecordedMotionWithSensitivities(state[:, ANGLES], torque, internal)
 
     def at(move):
         """The shift after a move along each of d directions; parameters move by the first ones."""
         own = theta.copy()
         own[[step.system.parameters.index(name) for name in wanted]] += move[: len(wanted)]
         parts = (state[:, ANGLES] + by_angles @ move, torque + by_torque @ move, internal + by_internal @ move)
-        true = JointMotionAndTorqueWithSensitivities(*parts, by_angles, by_torque, by_internal)
+        true = RecordedMotionWithSensitivities(*parts, by_angles, by_torque, by_internal)
         return shift.effect_momentum_shifts_and_sensitivities(recorded, true, own, wanted)
 
     value, slopes = at(np.zeros(d))

@@ -11,7 +11,7 @@ from yid_ocp.integrator.statics import EquilibriumSolver, steady_state_internal_
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, RobotJointSpring, ServoModelOptions
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, JointSpringData, ServoModelOptions
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
@@ -49,7 +49,7 @@ def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest(parts):
 def arm(urdf_folder):
     """The double pendulum, its elbow driven, with a spring on each joint."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {name: RobotJointSpring(4.0, 0.1) for name in robot.joint_names}
+    springs = {name: JointSpringData(4.0, 0.1) for name in robot.joint_names}
     system = System.build(robot, driven=["elbow"], springs=springs)
     return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False))
 

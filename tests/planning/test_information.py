@@ -139,11 +139,11 @@ def test_distances_are_what_others_cannot_explain():
     rows = np.zeros((6, 7))
     rows[[0, 1, 2], [3, 4, 5]] = 50.0, 20.0, 10.0
     rows[0, 0] = 1e4  # a free parameter does to the data what the first effect does
-    first, second = criterion.distances_from_best_imitation(rows)[[0, 1], [1, 0]]
+    first, second = criterion.pairwise_imitation_distances(rows)[[0, 1], [1, 0]]
     assert first < 0.2
     assert second == pytest.approx(np.sqrt((10.0**2 + 30.0**2) / 2))
     rows[3, 3] = 7.0  # now a reading of its own
-    assert criterion.distances_from_best_imitation(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
+    assert criterion.pairwise_imitation_distances(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
 
 
 def line(w):

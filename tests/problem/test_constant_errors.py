@@ -9,9 +9,9 @@ from small_problems import H, pendulum_step, taken
 
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
+from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.problem.measurements import (
-    subtract_estimated_bias_and_clock_errors,
+    measurements_minus_sensor_error_estimates,
     whiten_against_sensor_biases,
     whitened_measurement_sensitivities_to_sensor_errors,
 )
@@ -104,7 +104,7 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
     _, x = least(spelt, spelt.initial_unknowns)
     found = problem.evaluate(problem.initial_unknowns, derivatives=False)
     for i, (episode, result) in enumerate(zip(problem.episodes, found.episode_predictions, strict=True)):
-        corrected = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
+        corrected = measurements_minus_sensor_error_estimates(episode.measurements, result.predicted_outputs)
         pairs = zip(episode.measurements, corrected, strict=True)
         [(before, after)] = [pair for pair in pairs if pair[0].sensor.effort_joints]
         offsets = [x[spelt.unknown_names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
@@ -115,7 +115,7 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
 def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
-    counted = whitened_residual_and_jacobian(episode, problem.held_out_whitening_filters[0], result).residual
+    counted = episode_residual_and_jacobian(episode, problem.held_out_whitening_filters[0], result).residual
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     plain = np.concatenate([samples.residual_and_jacobian(y).residual for samples, y in pairs])
     slopes = whitened_measurement_sensitivities_to_sensor_errors(episode.measurements)

@@ -23,7 +23,7 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import driven_joint_torques_of_rollout, simulate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorKindAndPreset, ServoModelOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
+from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 
 VALUES = {
     "shoulder.servo_gain": 0.6, "shoulder.servo_damping": 4.0, "shoulder.servo_torque_limit": 9.0,
@@ -131,11 +131,11 @@ def test_a_preset_belongs_to_a_dc_motor() -> None:
 def test_recordings_state_the_gain_of_the_firmware_once_for_all_joints_or_for_each(step) -> None:
     one = recording(swing(proportional_gain=400.0), name="one")
     each = recording(swing(proportional_gain=np.array([400.0, 100.0])), name="each")
-    found = servo_gain_factors_by_recording(step.system, [one, each])
+    found = servo_gain_parameters_by_recording(step.system, [one, each])
     assert found["one"] == {"shoulder.servo_gain_factor": 400.0, "elbow.servo_gain_factor": 400.0}
     assert found["each"]["elbow.servo_gain_factor"] == 100.0
     with pytest.raises(DataError, match="has no proportional gain"):
-        servo_gain_factors_by_recording(step.system, [one, recording(swing(), name="silent")])
+        servo_gain_parameters_by_recording(step.system, [one, recording(swing(), name="silent")])
 
 
 def test_with_efforts_of_zero_and_no_commands_motors_are_off_and_joints_are_let_go(urdf_folder, step) -> None:

@@ -14,9 +14,9 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     _noisy,
-    measured_point_positions,
     naive_cable_predictions,
-    rmse_unit_and_count_by_channel,
+    recorded_point_positions,
+    rmse_unit_count_dicts_by_channel,
 )
 
 FREE = ["elbow.stiffness", "elbow.damping"]
@@ -139,7 +139,7 @@ def test_a_parameter_that_is_not_there_is_named(problem):
 
 def test_residuals_are_those_of_the_result(problem):
     solution = yid.solve(problem, yid.GaussNewton())
-    errors = rmse_unit_and_count_by_channel(solution.episode_predictions, problem.episodes)
+    errors = rmse_unit_count_dicts_by_channel(solution.episode_predictions, problem.episodes)
     found = solution.channel_measurements_and_predictions()
     assert {entry.channel: entry.rmse for entry in found} == pytest.approx({k: v["rmse"] for k, v in errors.items()})
     for entry in found:
@@ -205,7 +205,7 @@ CABLE = CableTopology(PARENT, CHILDREN, dict.fromkeys(NAMES, (0.0, 0.0, 0.0)))
 
 def test_stay_repeats_the_last_given_frame(recording):
     predicted = naive_cable_predictions(recording, CABLE, NAMES)["stays"]
-    np.testing.assert_array_equal(predicted[:2], measured_point_positions(recording, NAMES)[:2])
+    np.testing.assert_array_equal(predicted[:2], recorded_point_positions(recording, NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 

@@ -15,7 +15,7 @@ from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     prescribed_coordinates_at_nodes,
     recorded_signal_kinds,
-    smoothed_joint_efforts,
+    smoothed_efforts_at_nodes,
     step_mean_input_delay_derivative,
     step_mean_inputs,
 )
@@ -135,15 +135,15 @@ def test_loads_are_smoothed_and_interpolated():
     effort = np.stack([np.ones(200), 3 * t + np.sin(2 * np.pi * 40 * t)], axis=1)
     made = recording(joints(["a", "b"], t, np.zeros((200, 2)), effort=effort))
     grid = TimeGrid(0.5, 0.025, 20)
-    found = smoothed_joint_efforts(made, ("b", "a"), grid, ZeroPhaseLowPassFilter(5.0))
+    found = smoothed_efforts_at_nodes(made, ("b", "a"), grid, ZeroPhaseLowPassFilter(5.0))
     np.testing.assert_allclose(found[:, 0], 3 * grid.node_times, atol=1e-3)
     np.testing.assert_allclose(found[:, 1], 1.0, atol=1e-9)
     low_pass, made = ZeroPhaseLowPassFilter(5.0), made.with_effort_sampling_kind("mean")
-    later = smoothed_joint_efforts(made, ("b", "a"), grid, low_pass)
+    later = smoothed_efforts_at_nodes(made, ("b", "a"), grid, low_pass)
     np.testing.assert_allclose(later[1:, 0], found[1:, 0] - 3 * np.diff(t)[0] / 2, atol=1e-3)
     for without in (recording(joints(["a"], t, np.zeros((200, 1)))), pointed()):
         with pytest.raises(DataError, match="elastic gears of the model need joint efforts"):
-            smoothed_joint_efforts(without, ("a",), grid, PLAIN)
+            smoothed_efforts_at_nodes(without, ("a",), grid, PLAIN)
 
 
 RECORDED = {

@@ -18,7 +18,7 @@ from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.initial_state_fit import InitialStateFitter, _speed
-from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
+from yid_ocp.problem.predictions import rmse_unit_count_dicts_by_channel
 from yid_ocp.sensors import sensor_function_with_jacobians
 from yid_ocp.sensors.points import PointSensor
 
@@ -41,7 +41,7 @@ def at(node, q, std=1e-3, both=True, **more):
 def solved(step, samples, window=0.02, posture=(), path=None, **values):
     theta = step.system.parameters.vector(values)
     path = np.zeros((30, len(step.system.prescribed))) if path is None else path
-    return InitialStateFitter(step).fit_to_points(np.array(posture), samples, theta, window, path)
+    return InitialStateFitter(step).fit_initial_state_to_points(np.array(posture), samples, theta, window, path)
 
 
 def momentum_at(step, momentum, q, v):
@@ -148,7 +148,7 @@ def test_parameters_are_fitted_along_with_the_start(urdf_folder):
         turned = value @ Rotation.from_rotvec([turn, 0, 0]).as_matrix().T
         camera = measured(points("lower", "tip", pose=pose, group="camera"), [0], [0.0], turned.reshape(1, 6), sharp)
         fitter, theta = InitialStateFitter(step, (TURN,)), step.system.parameters.vector()
-        found = fitter.fit_to_points(np.zeros(0), [here, camera], theta, 0.02, np.zeros((30, 0)))
+        found = fitter.fit_initial_state_to_points(np.zeros(0), [here, camera], theta, 0.02, np.zeros((30, 0)))
         assert found.fitted_parameters[TURN] == pytest.approx(turn, abs=1e-4)
         np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
 
@@ -255,14 +255,14 @@ def test_errors_are_euclidean_for_points_and_plain_for_efforts():
         predicted_outputs=(np.array([[3.0, 4, 0, 1, 0, 0], [0, 0, 1, 5, 5, 5]]), np.array([[4.0], [6.0], [9.0]]))
     )
     run = {"name": "run", "grid": SimpleNamespace(start_time=0.0, time_step=0.1)}
-    found = rmse_unit_and_count_by_channel([result, result], [SimpleNamespace(**run, measurements=(tips, loads))] * 2)
+    found = rmse_unit_count_dicts_by_channel([result, result], [SimpleNamespace(**run, measurements=(tips, loads))] * 2)
     assert found == {
         "points.a": {"rmse": pytest.approx(math.sqrt(13.0)), "unit": "m", "n": 4},
         "points.b": {"rmse": 1.0, "unit": "m", "n": 2},
         "joints.effort.j": {"rmse": pytest.approx(math.sqrt(12.5)), "unit": "N m", "n": 4},
     }
     hidden = SimpleNamespace(**run, measurements=(measured(efforts("j"), [0], [0.0], [[NAN]]),))
-    assert rmse_unit_and_count_by_channel([SimpleNamespace(predicted_outputs=(np.zeros((1, 1)),))], [hidden]) == {}
+    assert rmse_unit_count_dicts_by_channel([SimpleNamespace(predicted_outputs=(np.zeros((1, 1)),))], [hidden]) == {}
 
 
 POSTURE = (0.5, 0.5)
@@ -320,7 +320,7 @@ def test_a_recording_starts_in_the_shape_that_its_first_points_show(buckled, whi
     np.testing.assert_allclose(held.rollout.state[0], states[which - 1], atol=1e-6)
     if which == 2:  # its mirror image is tried, too, where no shape can be fitted; and it stays with other stiffnesses
         fitted = Mock(side_effect=DataError("no shape"))
-        monkeypatch.setattr(InitialStateFitter, "fit_to_points", fitted)
+        monkeypatch.setattr(InitialStateFitter, "fit_initial_state_to_points", fitted)
         assert np.ptp(rod_problem(step, states[1]).episodes[0].equilibrium_guess - states[1][:11]) < 1e-6
         assert [int(samples.node[0]) for samples in fitted.call_args.args[1]] == [0]  # where the prescribed path begins
         moved = problem.evaluate(2.0 * problem.initial_unknowns)

@@ -26,7 +26,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
 from yid_ocp.report.html import write_report, write_shared_plotly_script
-from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
+from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, rendered_section_dicts
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT
 from yid_ocp.workflow.build_problem import load_problem
 from yid_ocp.workflow.diagnose import _held_out_predictions, _scenes
@@ -137,7 +137,7 @@ def test_a_failed_solve_gets_no_verdicts(solved_pendulum, tmp_path):
 
 
 def test_sections_may_have_nothing_to_say():
-    assert render_sections(ReportData("x", "", {"format": "other/1"}), environment=None) == []
+    assert rendered_section_dicts(ReportData("x", "", {"format": "other/1"}), environment=None) == []
 
 
 def test_a_new_section_is_a_file_and_a_template(solved_pendulum, tmp_path, monkeypatch):

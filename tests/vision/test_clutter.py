@@ -7,7 +7,7 @@ from smooth_rods import COARSE, EYE, TARGET, SmoothY, box, filmed, floor_and_wal
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.vision import CloudFilterOptions, ExtraMesh, FrameSequence, look_at_pose
 from yid_ocp.vision.point_cloud import wanted_colour_mask
-from yid_ocp.vision.sequence_calibration import BackgroundPoints, foreign_objects_from_clusters
+from yid_ocp.vision.sequence_calibration import BackgroundPoints, foreign_clusters_to_objects
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
 from yid_ocp.vision.surface_meshes import extra_meshes_by_joint_index
 
@@ -88,14 +88,14 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
         (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
         (lambda t: [3.0, 0.3 * t, 0.5], True, "", "box_lower and box_upper"),
     ):
-        [thing] = foreign_objects_from_clusters(looked(place), 0.006, box_, links.__getitem__, False)
+        [thing] = foreign_clusters_to_objects(looked(place), 0.006, box_, links.__getitem__, False)
         assert (thing.moving, thing.link, thing.frames) == (moving, link, 6)
         assert help_ in thing.text
-    [thing] = foreign_objects_from_clusters(looked(lambda t: [0.5, 0.3 * t, 0.5]), 0.006, box_, links.__getitem__, True)
+    [thing] = foreign_clusters_to_objects(looked(lambda t: [0.5, 0.3 * t, 0.5]), 0.006, box_, links.__getitem__, True)
     assert "colour" in thing.text
     still = looked(lambda t: [0.5, 0.5, 0.5])
     for left_out in (False, True):  # what is done already is no advice
-        [thing] = foreign_objects_from_clusters(still, 0.006, box_, links.__getitem__, False, left_out)
+        [thing] = foreign_clusters_to_objects(still, 0.006, box_, links.__getitem__, False, left_out)
         assert ("background_estimation: frames" in thing.text) != left_out
         assert "record the scene without object and robot" in thing.text
 

@@ -12,7 +12,7 @@ from yid_ocp.cli import build_argument_parser, main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.vision import TrackOptions
-from yid_ocp.vision.track import FrameTracker
+from yid_ocp.vision.track import SingleFrameTracker
 
 CONFIG = """\
 model:
@@ -116,7 +116,7 @@ def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
     cli, carried_out, config, whole, tmp_path, monkeypatch
 ):
     """Killed after the second frame: the next run does the other alone, with the same result to the last bit."""
-    worked, work = [], FrameTracker.process_frame
+    worked, work = [], SingleFrameTracker.process_one_frame
 
     def interrupted(self, index, common):
         if len(worked) == 2:
@@ -124,11 +124,11 @@ def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
         worked.append(work(self, index, common))
         return worked[-1]
 
-    monkeypatch.setattr(FrameTracker, "process_frame", interrupted)
+    monkeypatch.setattr(SingleFrameTracker, "process_one_frame", interrupted)
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
-    monkeypatch.setattr(FrameTracker, "estimate_shared_values", None)  # it is known
+    monkeypatch.setattr(SingleFrameTracker, "estimate_shared_values", None)  # it is known
     again = carried_out("track", config, "--workers", "2", settings=(PLAIN, UNDRAWN))
     assert [frame["seconds"] for frame in again.result["frames"][:2]] == [report.cpu_seconds for report in worked]
     assert not (tmp_path / "run.partial").exists()

@@ -9,7 +9,7 @@ from yid_ocp.vision.shape_evidence import (
     TubeLinks,
     fit_quality_and_point_classes,
     nearest_surface_residuals,
-    surface_distances_along_sight,
+    surface_residuals_along_sight,
     tube_like_node_and_point_masks,
 )
 
@@ -107,7 +107,7 @@ def test_points_on_a_swath_are_wider_than_the_tube_and_tubes_are_slender():
     assert mine.sum() == len(tube())
 
 
-@pytest.mark.parametrize("ask", [nearest_surface_residuals, surface_distances_along_sight])
+@pytest.mark.parametrize("ask", [nearest_surface_residuals, surface_residuals_along_sight])
 def test_residuals_move_as_their_derivatives_say(ask):
     points = tube(noise=0.003)[::7]
     base = ask(TUBES.link_ends, TUBES.radius, points, CAMERA)
@@ -133,5 +133,5 @@ def test_residuals_move_as_their_derivatives_say(ask):
 def test_noise_along_the_sight_leaves_the_radius():
     """The mean error of a tube of the right radius is nothing along the sight; the nearest way it is not."""
     points = np.concatenate([tube(noise=0.005, seed=seed) for seed in range(8)])
-    found = surface_distances_along_sight(TUBES.link_ends, TUBES.radius, points, CAMERA)
+    found = surface_residuals_along_sight(TUBES.link_ends, TUBES.radius, points, CAMERA)
     assert abs(found.signed_distance.mean()) < 0.0004

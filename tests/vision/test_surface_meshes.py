@@ -116,7 +116,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert not np.array_equal(one.capture_times[:3], two.capture_times[:3])
     # the object's surface is where the points are
     surfaces = ArticulatedSurfaces(system.mechanism_with_values(), tubes(system))
-    away, _, _ = surfaces.distance_to_moving_surface(
+    away, _, _ = surfaces.nearest_moving_surfaces(
         one.sequence.load_world_cloud(1), one.true_configuration_at(one.capture_times[1]), 0.2
     )
     assert np.median(away) < 0.006
@@ -148,7 +148,7 @@ def test_distances_follow_the_joints(ball):
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         radii = np.linspace(0.05, 0.3, 50)
         points, expected = middle + radii[:, None] * directions, np.abs(radii - 0.1)
-        found = ball.distance_to_moving_surface(points, q, 0.15)[0]
+        found = ball.nearest_moving_surfaces(points, q, 0.15)[0]
         assert np.allclose(found[expected < 0.145], expected[expected < 0.145], atol=6e-4)
         assert np.isinf(found[expected > 0.155]).all()
         assert np.array_equal(ball.within_surface_distance_mask(points, q, 0.15, moving_only=True), np.isfinite(found))
@@ -161,7 +161,7 @@ def test_closest_points_give_the_way_out(ball):
     q = [0.3, 0.2]
     direction = np.array([0.6, 0.0, 0.8])
     points = centre(ball, q) + np.array([[0.14], [0.08], [0.5]]) * direction
-    distance, normal, part = ball.distance_to_moving_surface(points, q, 0.2)
+    distance, normal, part = ball.nearest_moving_surfaces(points, q, 0.2)
     assert np.allclose(distance[:2], [0.04, 0.02], atol=6e-4)
     assert np.allclose(normal[0], direction, atol=0.05)
     assert np.allclose(normal[1], -direction, atol=0.08)  # from the surface to the point, inwards here

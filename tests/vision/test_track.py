@@ -10,7 +10,7 @@ from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.vision import SceneDescription, TrackOptions
 from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
-from yid_ocp.vision.track import FrameTracker, track_object
+from yid_ocp.vision.track import SingleFrameTracker, track_object
 
 MILLIMETRE = 1e-3
 LATENCY, CALIBRATION_FRAMES = 0.06, 4
@@ -122,7 +122,7 @@ def test_positions_of_a_straight_object_stay_with_their_points(clean, recording)
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
-    tracker = FrameTracker(SceneDescription(system), small.recording, small.sequence, TrackOptions())
+    tracker = SingleFrameTracker(SceneDescription(system), small.recording, small.sequence, TrackOptions())
     assert tracker.point_names == ("w_T1", "w_T3")
     with pytest.raises(ConfigError, match="no point 'w_T9'"):
         track_object(SceneDescription(system), small.recording, small.sequence, TrackOptions(tracked_points=("w_T9",)))

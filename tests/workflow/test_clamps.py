@@ -158,7 +158,7 @@ def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_pat
     folder = folder_of(tmp_path / "old")
     (folder / "config.yaml").write_text(BEAM.replace("[beam.h5]", "[../beam.h5]"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline_run_folders=[old]",))
-    [found], message = run_history.load_recordings_without_effect(run)
+    [found], message = run_history.recordings_without_effect_or_reason(run)
     assert (found.name, message) == ("beam (without)", "")
     assert found.sha256 == read_recordings_of_role(run, "estimate")[0].sha256
 

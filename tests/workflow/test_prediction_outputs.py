@@ -19,7 +19,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_whitening_at
-from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.servos_and_springs import JointSpringData
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -249,12 +249,12 @@ def copied(system, values, *uncounted, **estimates):
     """Texts to copy, of estimates given as (value, std, unit, verdict); all parameters have `values`."""
     made = {n: ParameterEstimate(*own[:3], 3.0, 0.0, np.inf, True, own[3]) for n, own in estimates.items()}
     theta = system.parameters.vector(values)
-    return prediction_outputs.estimate_texts_by_format(system, theta, made, ("export", "my runs/a"), *uncounted)
+    return prediction_outputs.copyable_estimate_texts(system, theta, made, ("export", "my runs/a"), *uncounted)
 
 
 def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, springs={"elbow": RobotJointSpring(3.0, 0.2)})
+    system = System.build(robot, springs={"elbow": JointSpringData(3.0, 0.2)})
     kinds = [("joint_coulomb", "elbow"), ("rotor_inertia", "elbow"), ("joint_coulomb", "shoulder")]
     system = system.with_effects([make_effect(*own, system) for own in kinds])
     values = {"elbow.stiffness": 4.0, "elbow.damping": 0.3, "shoulder.damping": 0.2}

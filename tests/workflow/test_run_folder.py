@@ -185,7 +185,7 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
 
 
 EFFECT = """
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, generalized_force_at_joint, arm_joint_names
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, one_joint_generalized_force, arm_joint_names
 from yid_ocp.model.system import EffectStepTerms
 
 
@@ -203,7 +203,7 @@ class Constant(EffectBase):
         return (ParameterDefinition("push", "N m", 0.0, -5.0, 5.0, (-1.0, 1.0), "constant torque"),)
 
     def step_terms(self, state):
-        return EffectStepTerms(generalized_force=generalized_force_at_joint(state.system, self.location, self["push"]))
+        return EffectStepTerms(generalized_force=one_joint_generalized_force(state.system, self.location, self["push"]))
 """
 
 

@@ -23,7 +23,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.inference.whitening import problem_with_exact_inputs
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
+from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, fit_problem
 from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
@@ -42,7 +42,7 @@ class _MethodResult:
     method: str
     solution: Solution
     whitened_cost: float
-    held_out_predictions: list[PredictedEpisodeOrFailure]
+    held_out_predictions: list[EpisodeAndPredictionOrFailure]
     wall_seconds: float
     cpu_seconds: float
     peak_memory_mib: float

@@ -86,7 +86,7 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
     """Return the names of the fine joints that replace each divided joint of the coarse model."""
     found = {}
     for segment in coarse.segment_layouts:
-        links = fine.layout_of_segment(segment.name).link_joints
+        links = fine.segment_layout_by_name(segment.name).link_joints
         times = len(links) // len(segment.link_joints)
         for i, joints in enumerate(segment.link_joints if times > 1 else ()):
             for axis, joint in enumerate(joints):
@@ -156,7 +156,7 @@ def predicted_refit_residual_at_finer_step(
     return fitted.residual if fitted.ok and fitted.cost < before.cost else left
 
 
-def problem_corrected_for_few_links(
+def problem_data_corrected_for_few_links(
     problem: EstimationProblem, fitted: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
 ) -> EstimationProblem | None:
     """Return `problem` with all data corrected for the error of too few links.

@@ -28,11 +28,11 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
+from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
 from yid_ocp.problem.estimation_problem import held_out_prediction_arguments
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_and_count_by_channel
+from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_count_dicts_by_channel
 from yid_ocp.sensors.base import Sensor
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers import base as solvers
@@ -143,7 +143,7 @@ def _with_discretisation_errors(
 
 
 def _checked_solution_and_issues(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> tuple[Solution, tuple[Issue, ...]]:
     """Return the solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit."""
     if solution.evaluation is None:
@@ -271,7 +271,7 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
 
 
 def prediction_errors_units_and_fit_errors(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
     """Return the prediction errors of every recording (held-out first), and by channel the units and fit errors."""
     residuals: Mapping[str, Any] = {}
@@ -279,7 +279,7 @@ def prediction_errors_units_and_fit_errors(
     if solution.evaluation is not None:
         fitted = list(zip(problem.episodes, solution.episode_predictions, strict=True))
         able = [(result, episode) for episode, result in fitted if not isinstance(result, str)]
-        residuals = rmse_unit_and_count_by_channel([result for result, _ in able], [episode for _, episode in able])
+        residuals = rmse_unit_count_dicts_by_channel([result for result, _ in able], [episode for _, episode in able])
         pairs += fitted
     units = {channel: entry["unit"] for channel, entry in residuals.items()}
     return [_prediction_error_entry(problem, *pair) for pair in pairs], units, residuals
@@ -307,10 +307,10 @@ def _prediction_error_entry(
 
 def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
-) -> tuple[list[PredictedEpisodeOrFailure], dict[str, dict[str, float]]]:
+) -> tuple[list[EpisodeAndPredictionOrFailure], dict[str, dict[str, float]]]:
     """Predict the held-out recordings, and compute by channel the rms errors that sensor and torque noise cause."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
-    pairs: list[PredictedEpisodeOrFailure] = []
+    pairs: list[EpisodeAndPredictionOrFailure] = []
     expected: dict[str, dict[str, float]] = {}
     for episode, theta, offset in held_out_prediction_arguments(problem, x):
         outcome = predict(episode, theta, offset, False)

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from yid_ocp.analysis.identifiability import InitialStateKnowledge, free_starts_and_grasps, unknowns_of_other_problem
-from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_information
+from yid_ocp.analysis.identifiability import InitialStateKnowledge, map_unknowns_to_problem, with_free_starts_and_grasps
+from yid_ocp.analysis.torque_error_propagation import point_jacobians_and_joint_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -69,12 +69,12 @@ class UnchangedExperiment:
         theta, _ = self.problem.unpack_episode_unknowns(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
-    def camera_times_and_median_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def camera_points_times_and_median_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Return the points that a camera sees, with times [s] and median noise [m]. Without any: None and defaults."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: camera_pose_of_point_group(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_point_group_with_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_points_times_and_median_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Return the points that arms measure, with times [s] and median noise [m]. Without any: None and defaults."""
         t = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor_name == "arm", t, _DEFAULT_ARM_POINT_STD)
@@ -160,7 +160,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def step_with_frames_at_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
+def step_with_frames_and_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
     """Return the step with a frame at each measurable point, and these points. The equations do not change."""
     mechanism, seen = step.system.mechanism, measurable_points(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
@@ -173,7 +173,7 @@ class VariantPositionSensitivities:
     """The derivatives of the positions of all measurable points in one variant of an experiment.
 
     `position_sensitivities` holds, by (episode, group, frame), the derivatives of the frame's position at every node
-    with respect to the nx unknowns and q unknowns of torque and encoder errors (`point_sensitivities_and_information`).
+    with respect to nx unknowns and q unknowns of torque and encoder errors (`point_jacobians_and_joint_information`).
     """
 
     problem: EstimationProblem  # with nuisance unknowns; every measurable frame is observed at every node
@@ -259,15 +259,15 @@ class ExperimentVariantSensitivityBuilder:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         other = setup_changes - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
-        step, seen = step_with_frames_at_measurable_points(step)
-        wide = free_starts_and_grasps(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
+        step, seen = step_with_frames_and_measurable_points(step)
+        wide = with_free_starts_and_grasps(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(setup_changes), duration=None)
         dense = [self._dense(entry, i, seen, "torque" in setup_changes) for i, entry in enumerate(recordings)]
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}
         nuisances = [name for name in wide.free if name not in base.free]
         problem = EstimationProblem(step, dense, (*base.free, *nuisances), options, values)
-        x = unknowns_of_other_problem(setting.x, base.unknown_names, problem)
+        x = map_unknowns_to_problem(setting.x, base.unknown_names, problem)
         evaluation = problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message)
@@ -276,7 +276,7 @@ class ExperimentVariantSensitivityBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = point_sensitivities_and_information(problem, evaluation, x, i, finest, encoders)
+            points, by_joints[i] = point_jacobians_and_joint_information(problem, evaluation, x, i, finest, encoders)
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
@@ -300,7 +300,7 @@ class ExperimentVariantSensitivityBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Return the smallest noise standard deviation [m] of the points of each group in a recording."""
         finest = {}
-        samplings = self.setting.camera_times_and_median_std, self.setting.arm_point_group_with_times_and_std
+        samplings = self.setting.camera_points_times_and_median_std, self.setting.arm_points_times_and_median_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
@@ -420,8 +420,8 @@ class ExperimentVariantSensitivityBuilder:
         wanted: dict[str, dict[str, None]] = {}
         for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
-        camera = setting.camera_times_and_median_std(episode)[0]
-        arm = setting.arm_point_group_with_times_and_std(episode)[0]
+        camera = setting.camera_points_times_and_median_std(episode)[0]
+        arm = setting.arm_points_times_and_median_std(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})

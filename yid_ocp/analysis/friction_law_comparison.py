@@ -12,7 +12,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.effects.law import torque_law_quantity_at_midpoints
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
+from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
@@ -79,7 +79,7 @@ def cross_validate_over_motion_kinds(
             own_episode = replace(episode, measurements=tuple(episode.measurements[i] for i in kept))
             outcome = replace(outcome, predicted_outputs=tuple(outcome.predicted_outputs[i] for i in kept))
             if is_whitened:
-                rows = whitened_residual_and_jacobian(own_episode, None, outcome, np.inf).residual
+                rows = episode_residual_and_jacobian(own_episode, None, outcome, np.inf).residual
             else:
                 rows = np.vstack([p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)])
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))

@@ -148,8 +148,8 @@ def identifiability(
         said = unknown_name_error_arguments(name, names)
         raise ConfigError(f"'{name}' is not a free parameter", where="intervals", **said)
     given = unknown_vector_from_solution(problem, solution)
-    wide = free_starts_and_grasps(problem, start, grasp_std)
-    x = unknowns_of_other_problem(given, problem.unknown_names, wide)
+    wide = with_free_starts_and_grasps(problem, start, grasp_std)
+    x = map_unknowns_to_problem(given, problem.unknown_names, wide)
     # the matrices are small: threads of the linear algebra library cost more than they gain
     with threadpoolctl.threadpool_limits(1):
         as_solved, wide = wide is problem, problem_with_whitening_at(wide, x, rounds=2)
@@ -217,7 +217,7 @@ def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution 
     if solution is None:
         return problem.initial_unknowns
     if isinstance(solution, Solution):
-        return unknowns_of_other_problem(solution.x, solution.unknown_names, problem)
+        return map_unknowns_to_problem(solution.x, solution.unknown_names, problem)
     x = np.array(solution, float)
     if x.shape != (len(problem.unknown_names),):
         shape = f"shape ({len(problem.unknown_names)},), one value for each of problem.unknown_names"
@@ -228,7 +228,7 @@ def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution 
     return x
 
 
-def free_starts_and_grasps(
+def with_free_starts_and_grasps(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
     """Return the problem with initial states (`start` "unknown") and grasp offsets (`grasp_std` given) as unknowns."""
@@ -256,7 +256,7 @@ def free_starts_and_grasps(
     return EstimationProblem(problem.step, recordings, (*problem.free, *grasps), changed, nominal)
 
 
-def unknowns_of_other_problem(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
+def map_unknowns_to_problem(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
     """Return the unknown vector of `other` with the values of `x` by name. Other entries have their initial values."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])

@@ -219,7 +219,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
     return dict(zip(chain, np.cumsum(lengths)[::-1].tolist(), strict=True))
 
 
-def point_distance_issues(
+def points_too_distant_issues(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, options: _Choices
 ) -> Iterator[Issue]:
     """Yield issues about points that are farther apart, or farther from the root, than the object is long."""
@@ -259,7 +259,7 @@ def point_distance_issues(
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
-def object_point_rollout_issues(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
+def object_point_correction_issues(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
     """Yield issues about points that a simple correction moves to the rollout `result` of an object of `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names

@@ -17,7 +17,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
-from yid_ocp.integrator.step import iterate_step_derivatives
+from yid_ocp.integrator.step import rollout_step_derivatives
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
@@ -28,7 +28,7 @@ _NEGLIGIBLE_STD = 0.1  # standard deviation of a reading that may be neglected, 
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
-def point_sensitivities_and_information(
+def point_jacobians_and_joint_information(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -144,7 +144,7 @@ class _Motion:
             known = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
             pulled = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         inputs = np.concatenate([known, pulled], axis=2)
-        for state, _ in iterate_step_derivatives(step, course.theta, course.rollout, inputs, feedback):
+        for state, _ in rollout_step_derivatives(step, course.theta, course.rollout, inputs, feedback):
             self.by_state += [*state[:, :, : -2 * nu]]
             self.by_torque += [*state[:, :, -2 * nu : -nu]]
             self.by_angles += [*state[:, :, -nu:]]

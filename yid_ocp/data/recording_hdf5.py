@@ -237,7 +237,7 @@ def check_readable_in_child_process(path: Path, complaint: Callable[[Path], str]
         try:
             faulthandler.disable()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
-            with files.process_memory_limit():
+            with files.limit_process_memory():
                 said = complaint(path)
             os.write(there, f".{said}".encode(errors="replace")[:2000])
         finally:

@@ -312,15 +312,15 @@ class BlindCaseGenerator:
             for s in self._linearize_clean_recordings().signatures
         )
 
-    def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
+    def candidate_sensitivities_to_list(self) -> list[dict[str, Any]]:
         """Return the sensitivities of all candidates, from which detectable sizes follow, in JSON-compatible form."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
-    def set_candidate_sensitivities_from_json(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Set sensitivities that `candidate_sensitivities_to_json` of another generator of this experiment returned."""
+    def set_candidate_sensitivities_from_list(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+        """Set sensitivities that `candidate_sensitivities_to_list` of another generator of this experiment returned."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -482,7 +482,7 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
     for segment in nominal.segment_layouts:
-        factor = len(finer.layout_of_segment(segment.name).link_joints) / len(segment.link_joints)
+        factor = len(finer.segment_layout_by_name(segment.name).link_joints) / len(segment.link_joints)
         for what in ("bend", "twist"):
             name = f"{segment.name}.{what}"
             if name in truth and start[name] > 0:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step, problem_corrected_for_few_links
+from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step, problem_data_corrected_for_few_links
 from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
@@ -47,7 +47,7 @@ from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_sqrt
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import whitened_residual_and_jacobian
+from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.problem.measurements import ResidualAndJacobian
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
@@ -248,7 +248,7 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 12.0)
     composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
-    fine = problem_corrected_for_events(composed.with_nominal_and_effects_free(fit.effects), events)
+    fine = problem_corrected_for_events(composed.problem_with_nominal_and_effects_free(fit.effects), events)
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
     if left is None:
         return -math.inf
@@ -264,8 +264,8 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     """The nominal model, examined again on data without the error of the links, if that lowers r'r by so much."""
     search = seen.with_events
     search.progress.begin_stage("trying twice the links", 1.0, 11.0)
-    own = search.problem.with_nominal_and_effects_free(fit.effects)
-    corrected = problem_corrected_for_few_links(search.problem.problem, own, fit.unknowns, fit.evaluation, least)
+    own = search.problem.problem_with_nominal_and_effects_free(fit.effects)
+    corrected = problem_data_corrected_for_few_links(search.problem.problem, own, fit.unknowns, fit.evaluation, least)
     if corrected is None:
         return None
     problem = replace(search.problem, problem=corrected)
@@ -283,7 +283,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[HeldOutTruncation, ...]]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
     found = {cut.recording: cut for cut in known}
-    for fraction in hypotheses.SHORTER_HELD_OUT_FRACTIONS:
+    for fraction in hypotheses.KEPT_HELD_OUT_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
@@ -301,7 +301,7 @@ def _without_events(
     search: RefitContext, nominal: RefittedModel
 ) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
     """Remove what events explain, refit the nominal model, and examine it again."""
-    first, whole = search.problem, search.problem.problem_with_all_samples
+    first, whole = search.problem, search.problem.problem_fitting_all_samples
     events, smoothed = _happened(whole, nominal, search.thresholds)
     for round_ in range(_MAX_EVENT_ROUNDS):
         if not events:
@@ -395,7 +395,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
-        events = _happened(seen.with_events.problem.problem_with_all_samples, final, limits)[0]
+        events = _happened(seen.with_events.problem.problem_fitting_all_samples, final, limits)[0]
     search.record_stage_end("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
@@ -434,7 +434,7 @@ def _fitted_nominal_model(
 ) -> RefittedModel:
     """The nominal model fitted from a start, with whitening fixed there. Raises `SolverError` if it fails."""
     problem = search.problem.with_whitening_linearized_at(start)
-    nominal = problem.restricted_to_effects(())
+    nominal = problem.with_step_of_only_effects(())
     # a gap may move parameters so far that the solver's equilibrium is not found again from there
     for own in (start, {}):
         if fit := refit_with_effects(nominal, (), own, search.store, name, search.thresholds):
@@ -474,7 +474,7 @@ def _held_out_residuals(problem: EstimationProblem, predicted: HeldOutPrediction
     for (episode, result), whitening in zip(predicted, problem.held_out_whitening_filters, strict=True):
         if isinstance(result, str):
             raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
-        found.append(whitened_residual_and_jacobian(episode, whitening, result))
+        found.append(episode_residual_and_jacobian(episode, whitening, result))
     return found
 
 

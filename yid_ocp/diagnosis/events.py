@@ -18,7 +18,7 @@ import scipy.special
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.diagnosis.hypotheses import mask_out_samples
+from yid_ocp.diagnosis.hypotheses import mask_sensor_measurements
 from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
     CompiledInverseDynamics,
@@ -42,7 +42,7 @@ from yid_ocp.parallel.threads_and_processes import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import SensorMeasurements, subtract_estimated_bias_and_clock_errors
+from yid_ocp.problem.measurements import SensorMeasurements, measurements_minus_sensor_error_estimates
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
@@ -210,7 +210,7 @@ def _read_forces(
 ) -> Iterator[ForceEstimate]:
     """Yield force estimates at prescribed joints with compared efforts: required minus measured torque."""
     episode, result, _ = run
-    unbiased = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
+    unbiased = measurements_minus_sensor_error_estimates(episode.measurements, result.predicted_outputs)
     for samples, predicted in zip(unbiased, result.predicted_outputs, strict=True):
         if not samples.sensor.effort_joints or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
@@ -481,4 +481,4 @@ def _counting(
             # a wrong angle changes the required torques of all joints
             if event.channel == name or (is_effort and event.kind == "sample"):
                 hidden[:, column] |= inside[:, column]
-    return mask_out_samples(samples, hidden) if np.any(hidden & samples.positive_weight_mask) else samples
+    return mask_sensor_measurements(samples, hidden) if np.any(hidden & samples.positive_weight_mask) else samples

@@ -12,7 +12,7 @@ import scipy.linalg
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
-from yid_ocp.diagnosis.hypotheses import SHORTER_HELD_OUT_FRACTIONS, AllCandidatesProblem
+from yid_ocp.diagnosis.hypotheses import KEPT_HELD_OUT_FRACTIONS, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
 from yid_ocp.diagnosis.select import HeldOutGapClosure, held_out_chi2_decrease_and_std_error, held_out_gap_closure
 from yid_ocp.effects import EffectBase
@@ -183,7 +183,7 @@ def _refitted_families(
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
     composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
-    composed, _ = composed.truncate_failing_held_out_recordings(start, SHORTER_HELD_OUT_FRACTIONS[0])
+    composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_HELD_OUT_FRACTIONS[0])
     composed = composed.with_whitening_linearized_at(last.values, last.effects)
     before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
     if before is None:
@@ -243,7 +243,7 @@ def _visited_range(model: RefittedModel, place: str, quantity: str) -> tuple[flo
 
 def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws: Sequence[TorqueLaw]) -> list[_Family]:
     """Return the laws to refit, ordered by the evidence of a fit that is linearised about the model without a law."""
-    own = composed.with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
+    own = composed.problem_with_effects_and_relinearized_filters((*before.effects, *laws), before.values)
     evaluation = own.evaluate(own.pack_unknowns(before.values), True, before.evaluation.equilibrium_guesses)
     if not evaluation.ok or evaluation.jacobian is None:
         return []

@@ -13,7 +13,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import Progress
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
-from yid_ocp.effects.friction import effect_with_lowest_smoothing_speed
+from yid_ocp.effects.friction import effect_with_min_smoothing_speed_at_joint
 from yid_ocp.errors import ConfigError, DataError, SolverError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
@@ -37,7 +37,7 @@ CandidateNamesOrAll = Literal["all"] | Sequence[str]
 _BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
 _MIN_NOISE_GROWTH = 1.05  # of efforts beside effects from which weights are computed anew
 _MIN_PREDICTED_DURATION = 1.0  # shortest part of a truncated held-out recording that is kept [s]
-SHORTER_HELD_OUT_FRACTIONS = (0.9, 0.5, 0.0)
+KEPT_HELD_OUT_FRACTIONS = (0.9, 0.5, 0.0)
 """Fractions of the duration until the simulation of a held-out recording fails, of which it keeps one. All are below 1,
 because the simulation deviates before it fails. The next fraction is tried if the refitted model fails earlier."""
 
@@ -77,7 +77,7 @@ def make_candidate_effects(
 
 
 def _make_candidate(kind: str, place: str, system: System) -> EffectBase:
-    return effect_with_lowest_smoothing_speed(make_effect(kind, place, system), system)
+    return effect_with_min_smoothing_speed_at_joint(make_effect(kind, place, system), system)
 
 
 def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
@@ -170,7 +170,7 @@ class AllCandidatesProblem:
         return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held, some)
 
     @property
-    def problem_with_all_samples(self) -> EstimationProblem:
+    def problem_fitting_all_samples(self) -> EstimationProblem:
         """The problem with all candidates and all samples: alternate blocks that are held out are estimated on, too."""
         if not self.is_split_in_blocks:
             return self.problem
@@ -205,7 +205,7 @@ class AllCandidatesProblem:
         if not self.problem.has_process_noise:
             return self
         # filters of the nominal step are those of all candidates, which are neutral
-        made = (self if effects else self.restricted_to_effects(())).problem
+        made = (self if effects else self.with_step_of_only_effects(())).problem
         # filters are linearised about the estimated torques, so these must be known first
         x, errors = made.pack_unknowns(values), (episode.input_errors for episode in made.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
@@ -236,7 +236,7 @@ class AllCandidatesProblem:
 
         None if no joint's noise is clearly larger than now. Whitening is by sensor noise alone.
         """
-        own, now = self.with_nominal_and_effects_free(effects), self.problem
+        own, now = self.problem_with_nominal_and_effects_free(effects), self.problem
         theta, _ = own.unpack_episode_unknowns(own.pack_unknowns(values), 0)
         told = partial(episode_with_encoder_effort_noise, now.step, options=now.options, theta=theta)
         made = now.with_episodes([*map(told, now.episodes)], [*map(told, now.held_out)])
@@ -271,7 +271,7 @@ class AllCandidatesProblem:
         cut = problem.with_episodes(problem.episodes, kept) if kept else _in_blocks(problem)
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
-    def restricted_to_effects(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
+    def with_step_of_only_effects(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
         """Return the problem on a step of `effects` only (a third of the cost), unchanged if filters need others."""
         if self.functions_of_some is None:
             return self
@@ -279,19 +279,19 @@ class AllCandidatesProblem:
         own = _on_step_of_fewer_effects(self.problem, self.functions_of_some(key))
         return self if own is None else replace(self, problem=own, functions_of_some=None)
 
-    def with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
+    def problem_with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the problem in which the nominal free parameters and all parameters of `effects` are free."""
         own = (name for effect in effects for name in effect.parameters.names)
         return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameter_names, *own))
 
-    def with_effects_and_relinearized_filters(
+    def problem_with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Return the problem with free `effects` and filters of estimation recordings linearised for values `at`."""
-        own = self.with_nominal_and_effects_free(effects)
+        own = self.problem_with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
-    def with_relinearized_held_out_filters(
+    def problem_with_relinearized_held_out_filters(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Return `own` (a problem with free `effects`) with filters of held-out recordings linearised at `at`."""
@@ -408,10 +408,10 @@ def _masked(episode: Episode, parity: int) -> Episode:
     samples, block = [], min(_BLOCK_DURATION / episode.grid.time_step, episode.grid.steps / 3)
     for entry in episode.measurements:
         is_hidden = np.floor((entry.node + entry.fraction) / block).astype(int) % 2 != parity
-        samples.append(mask_out_samples(entry, is_hidden[:, None]))
+        samples.append(mask_sensor_measurements(entry, is_hidden[:, None]))
     return replace(episode, measurements=tuple(samples))
 
 
-def mask_out_samples(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
+def mask_sensor_measurements(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
     """Return the measurements without the samples that the mask `hidden`, (M, k) or (M, 1), marks."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

@@ -31,9 +31,9 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
-from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, whitened_residual_and_jacobian
-from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
+from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, episode_residual_and_jacobian
+from yid_ocp.problem.predictions import rmse_unit_count_dicts_by_channel
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
@@ -96,7 +96,7 @@ class HeldOutLoss:
         return float(self.block_chi2.sum()) + self.baseline_chi2
 
     @property
-    def joint_fit_chi2(self) -> float:
+    def added_joint_fit_chi2(self) -> float:
         """What these recordings add to the smallest chi2 of a fit to all recordings, in the linear model."""
         return self.updated_chi2 + self.baseline_chi2
 
@@ -214,7 +214,7 @@ class RefitContext:
             left_out = count * len(problem.episodes) * (len(problem.system.effects) - len(own))
             has_all = {effect.label for effect in effects} <= {effect.label for effect in own}
             if has_all and left_out >= _MIN_LEFT_OUT_FOR_OWN_STEP:
-                return self.problem.restricted_to_effects(own)
+                return self.problem.with_step_of_only_effects(own)
         return self.problem
 
     def _turned(self, fit: RefitStatistics, name: str) -> RefittedModel | None:
@@ -259,7 +259,7 @@ class RefitContext:
         return found
 
 
-HeldOutPredictions = Sequence[PredictedEpisodeOrFailure]
+HeldOutPredictions = Sequence[EpisodeAndPredictionOrFailure]
 """Predictions of all held-out recordings, with derivatives. Empty if they are not known."""
 EffectsWithStart = tuple[Sequence[EffectBase], Mapping[str, float]]
 """Effects to refit, and their values at the start."""
@@ -295,7 +295,7 @@ def refit_with_effects(
     if not finish.ok:
         return None
     values = own.unknowns.named_values(outcome.x)
-    own = problem.with_relinearized_held_out_filters(own, effects, values)
+    own = problem.problem_with_relinearized_held_out_filters(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
     ranges = ((name, *ends) for effect in effects for name, ends in effect.prior_ranges.items())
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
@@ -310,9 +310,9 @@ def _evaluated(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], values: Mapping[str, float]
 ) -> tuple[EstimationProblem, Evaluation]:
     """The problem with effects at known values, and its evaluation there."""
-    own = problem.with_effects_and_relinearized_filters(effects, values)
+    own = problem.problem_with_effects_and_relinearized_filters(effects, values)
     finish = own.evaluate(own.pack_unknowns(values))
-    return problem.with_relinearized_held_out_filters(own, effects, values), finish
+    return problem.problem_with_relinearized_held_out_filters(own, effects, values), finish
 
 
 def reevaluate_refit_with_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
@@ -334,7 +334,7 @@ def _model(
 def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:
     """One run from one start; its evaluation is not `ok` if the model cannot be rolled out."""
     neutral = neutral_effect_parameter_values(effects)
-    own = problem.with_effects_and_relinearized_filters(effects, start)
+    own = problem.problem_with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
         outcome = REFIT_SOLVER.minimize_cost(own, own.pack_unknowns({**start, **drawn}), None)
@@ -363,8 +363,8 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
 
 def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt:
     """The end of a run, linearised about the torques there."""
-    values = problem.with_nominal_and_effects_free(effects).unknowns.named_values(outcome.x)
-    placed = problem.with_effects_and_relinearized_filters(effects, values)
+    values = problem.problem_with_nominal_and_effects_free(effects).unknowns.named_values(outcome.x)
+    placed = problem.problem_with_effects_and_relinearized_filters(effects, values)
     return placed, outcome, placed.evaluate(outcome.x, equilibrium_guesses=outcome.equilibrium_guesses)
 
 
@@ -466,7 +466,7 @@ def held_out_loss(
         residuals.append(np.full(len(block), np.inf))
         errors.append(np.zeros((len(block), factor.shape[1])))
         if not isinstance(result, str):
-            part = whitened_residual_and_jacobian(episode, whitening, result)
+            part = episode_residual_and_jacobian(episode, whitening, result)
             residuals[-1], errors[-1] = part.residual, np.asarray(part.jacobian)[:, : len(factor)] @ factor
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
 
@@ -492,5 +492,5 @@ def held_out_rmse_and_unit_by_channel(
 ) -> dict[str, tuple[float, str]]:
     """Return the root mean square error and unit of each channel over all predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
-    errors = rmse_unit_and_count_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])
+    errors = rmse_unit_count_dicts_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])
     return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}

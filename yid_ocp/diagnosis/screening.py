@@ -102,7 +102,7 @@ def linearize_candidates(
     """
     labels = {effect.label for effect in base}
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
-    placed = problem.with_effects_and_relinearized_filters(base, values)
+    placed = problem.problem_with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
     scatter = null_test.encoder_noise_residual_covariance_factor(placed, placed.pack_unknowns(values))[rows.data]
     is_in_scatter = np.any(scatter, axis=1)

@@ -17,7 +17,7 @@ from yid_ocp.display import abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
-from yid_ocp.inference.uncertainty import mask_of_unknowns_with_decisive_priors, value_and_uncertainty_text
+from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
@@ -201,7 +201,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         data, priors = (fit.evaluation.jacobian[part] for part in (rows.data, rows.stated_priors))
         others: dict[str, None] = {}
         for name in own.amplitude_parameter_names:
-            by = mask_of_unknowns_with_decisive_priors(data, priors, names.index(name))
+            by = mask_of_priors_determining_unknown(data, priors, names.index(name))
             others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
         beside = f"These motions determine {own.label} only in relation to "
         text.append(_listed(beside, others, ": state one of them exactly."))

@@ -44,7 +44,7 @@ class EffectAmplitudeTransferCheck:
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
-    def disagreement_std_if_significant(self) -> float:
+    def std_of_disagreement_or_zero(self) -> float:
         """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
         apart = abs(self.estimation_value - self.held_out_value)
         spread = math.hypot(self.estimation_std, self.held_out_std)
@@ -187,7 +187,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             explained = _explained_fraction(nominal, last, limits)
             carried = _check_effect_amplitude_transfer(search, last)
             last = select.refit_with_model_error_in_stds(chosen[-1], limits)
-            least = {f"{e.effect_label}.{e.parameter}": e.disagreement_std_if_significant for e in carried}
+            least = {f"{e.effect_label}.{e.parameter}": e.std_of_disagreement_or_zero for e in carried}
             last = replace(last, std={name: max(std, least.get(name, 0.0)) for name, std in last.std.items()})
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
@@ -250,7 +250,7 @@ def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
-        least = _DISAGREEMENT_Z * entry.disagreement_std_if_significant
+        least = _DISAGREEMENT_Z * entry.std_of_disagreement_or_zero
         away.append(abs(entry.estimation_value - effect.neutral_values[name]) > least)
         found.append(entry)
     return [replace(entry, is_consistent=any(away)) for entry in found]

@@ -138,7 +138,7 @@ class _Backlash(_DistortedReading):
         servo, command = state.system.servos[self.location], state.u[state.system.driven.index(self.location)]
         free, geared = (servo.torque(command, state.q[index] + give, state.v[index]) for give in (0, play))
         taken = play - self["width"] / 2 * ca.tanh(geared / _PLAY_TORQUE)
-        force = base.generalized_force_at_joint(state.system, self.location, geared - free)
+        force = base.one_joint_generalized_force(state.system, self.location, geared - free)
         return EffectStepTerms(generalized_force=force, internal_equations={name: taken})
 
     def _error(self, effort: ca.SX) -> ca.SX:

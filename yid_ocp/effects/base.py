@@ -346,7 +346,7 @@ def nominal_bending_stiffness_by_joint(system: System, segment: str) -> dict[str
     return {s.joint_name: float(k) for s, k in zip(chosen, function.call([system.parameters.vector()]), strict=True)}
 
 
-def definition_scaled_by_effort_limits(
+def effort_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
     """Define a joint parameter that is neutral at 0. `effort_limit_ratio_to_baxter` scales `upper` and `expected`."""
@@ -362,7 +362,7 @@ def compliance_parameter_definition(
     return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 
 
-def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
+def one_joint_generalized_force(system: System, joint: str, value: ca.SX) -> ca.SX:
     """Return the generalized force vector (n, 1) that is `value` at one joint and zero at all others."""
     force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value

@@ -67,7 +67,7 @@ class _Density(_ScaledBodies):
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on mass and inertia"),)
 
     def _joints(self, system: System) -> tuple[str, ...]:
-        return tuple(joint for link in system.layout_of_segment(self.location).link_joints for joint in link)
+        return tuple(joint for link in system.segment_layout_by_name(self.location).link_joints for joint in link)
 
 
 def _joints_with_mass(system: System) -> tuple[str, ...]:
@@ -88,7 +88,7 @@ class _LinkMass(_ScaledBodies):
         return (self.location,)
 
 
-def system_with_link_mass_factors(system: System, name: str) -> System:
+def system_with_mass_scale_parameters(system: System, name: str) -> System:
     """Return a copy with a parameter `JOINT.name` for each arm link, which scales the link's mass and inertia."""
     tree, text = system.mechanism, "mass and inertia of the link on {} over those of the URDF"
     factors = {j: Parameter(f"{j}.{name}", 1.0, "1", 0.2, 3.0, text.format(j)) for j in _joints_with_mass(system)}
@@ -271,7 +271,7 @@ class _RotorInertia(EffectBase):
     required_excitation = "how hard it accelerates"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        base.definition_scaled_by_effort_limits("armature", "kg m^2", 5.0, 1.0, "rotor inertia at the joint"),
+        base.effort_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "rotor inertia at the joint"),
     )
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
@@ -294,7 +294,7 @@ class _AerodynamicDrag(EffectBase):
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         system, kinematics = state.system, state.kinematics
-        tree, segment = system.mechanism, system.layout_of_segment(self.location)
+        tree, segment = system.mechanism, system.segment_layout_by_name(self.location)
         velocity = _velocities(kinematics, state.v)
         wrenches, slopes = {}, {}
         for link, length in zip(segment.link_joints, segment.link_lengths, strict=True):

@@ -10,7 +10,7 @@ from typing import Literal
 import casadi as ca
 
 from yid_ocp.effects import base
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, definition_scaled_by_effort_limits
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, effort_scaled_parameter_definition
 from yid_ocp.model.system import Effect, EffectStepTerms, MidpointStateSymbols, System
 
 SIGN_SMOOTHING_SPEED = 0.02
@@ -57,7 +57,7 @@ class _JointFriction(EffectBase):
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        force = base.generalized_force_at_joint(state.system, self.location, -self._friction(v))
+        force = base.one_joint_generalized_force(state.system, self.location, -self._friction(v))
         return EffectStepTerms(dissipative_force=force)
 
 
@@ -68,7 +68,7 @@ def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Eff
     return replace(effect, sign_smoothing_speed=speed)
 
 
-def effect_with_lowest_smoothing_speed(effect: EffectBase, system: System) -> EffectBase:
+def effect_with_min_smoothing_speed_at_joint(effect: EffectBase, system: System) -> EffectBase:
     """Return a joint friction with the lowest smoothing speed of all at its joint. Other effects are unchanged."""
     if not isinstance(effect, _JointFriction):
         return effect
@@ -82,7 +82,7 @@ class _JointViscous(_JointFriction):
     """Viscous friction F = -b v of an arm joint, in addition to the model's damping."""
 
     equation = "F = -b v"
-    declared_parameters = (definition_scaled_by_effort_limits("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
+    declared_parameters = (effort_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
 
     max_sticking_speed = 0.0
 
@@ -95,7 +95,7 @@ class _JointCoulomb(_JointFriction):
     """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    declared_parameters = (definition_scaled_by_effort_limits("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
+    declared_parameters = (effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["tau_c"] * self._sign(v)
@@ -107,7 +107,7 @@ class _JointStribeck(_JointFriction):
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
-        definition_scaled_by_effort_limits("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
+        effort_scaled_parameter_definition("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
         ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
     )
 
@@ -140,7 +140,7 @@ class _JointLoadFriction(_JointFriction):
         smoothing_speed = min(self.sign_smoothing_speed, _LOAD_SIGN_SMOOTHING_SPEED)
         friction = self["share"] * size * ca.tanh(state.v[index] / smoothing_speed)
         # it dissipates energy, but is not a dissipative force of the speed alone: its size depends on weight and motor
-        return EffectStepTerms(generalized_force=base.generalized_force_at_joint(system, self.location, -friction))
+        return EffectStepTerms(generalized_force=base.one_joint_generalized_force(system, self.location, -friction))
 
 
 @EFFECTS.register("joint_presliding")
@@ -163,7 +163,7 @@ class _JointPresliding(EffectBase):
     required_excitation = "how fast it moves"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        definition_scaled_by_effort_limits("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
+        effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
         ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
     )
     declared_internal_coordinate_names = ("s",)  # the fraction of tau_c that acts, from -1 to 1
@@ -184,7 +184,7 @@ class _JointPresliding(EffectBase):
         # e^-x by its remainder over x^2, to avoid cancellation near zero, where an arm at rest stays
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
-        force = base.generalized_force_at_joint(state.system, self.location, -self["tau_c"] * mean)
+        force = base.one_joint_generalized_force(state.system, self.location, -self["tau_c"] * mean)
         equations = {name: state.h * rate - change}
         return EffectStepTerms(generalized_force=force, internal_equations=equations, static_equations={name: s})
 
@@ -204,7 +204,7 @@ class _JointSpring(EffectBase):
     required_excitation = "how far it bends"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        definition_scaled_by_effort_limits("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
+        effort_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 

@@ -133,7 +133,7 @@ def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
-    known = mjcf.file_format_elements_by_aspect()[aspect]
+    known = mjcf.elements_by_aspect_and_file_format()[aspect]
     if aspect == "reading":
         return _READING
     if form not in known:
@@ -142,7 +142,7 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 
 
 _READING = FeatureExportSupport(
-    "not representable", f"{mjcf.file_format_elements_by_aspect()['reading']['is']}: correct the readings instead"
+    "not representable", f"{mjcf.elements_by_aspect_and_file_format()['reading']['is']}: correct the readings instead"
 )
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is omitted")
 _UNUSED = FeatureExportSupport("native", "it has no influence on this model")
@@ -153,7 +153,7 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
     value, found = mjcf.ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
-        if value.is_neutral(effect):
+        if value.is_effect_neutral(effect):
             found[label] = _NEUTRAL
         else:
             _, aspects = mjcf.effect_joint_terms_and_changed_aspects(system, effect, value)

@@ -104,7 +104,7 @@ class KalmanStepMatrices:
         return (found + found.T) / 2, (other - pushed.T) @ closed + seen.T @ shaped, added
 
 
-def one_kalman_step(
+def kalman_covariance_step(
     covariance: Array, observation: Array, transition: StateTransition
 ) -> tuple[KalmanStepMatrices, Array, float]:
     """Compute the gains of a filter step, the next state covariance without process noise, and log det S.
@@ -132,7 +132,7 @@ def _library() -> ctypes.CDLL | None:
 
 
 @dataclass(frozen=True)
-class FixedGainKalmanFilter:
+class PrecomputedKalmanFilter:
     """A sequence of k steps of a linear Kalman filter with fixed gains, in compiled code if possible.
 
     The r rows of the matrices of all steps (see `KalmanStepMatrices`) are stacked. Step j begins at row `row_start[j]`.
@@ -221,7 +221,7 @@ def _addresses(arrays: Sequence[NDArray[Any] | None]) -> ctypes.Array[ctypes.c_v
     return (ctypes.c_void_p * len(arrays))(*(None if array is None else array.ctypes.data for array in arrays))
 
 
-def kalman_filter_and_covariance(
+def precompute_kalman_filter(
     covariance: Array,
     observation: Array,
     row_start: Sequence[int],
@@ -229,21 +229,21 @@ def kalman_filter_and_covariance(
     noises: int,
     decay: Array,
     variance: Array,
-) -> tuple[FixedGainKalmanFilter, Array]:
+) -> tuple[PrecomputedKalmanFilter, Array]:
     """Compute k successive steps of a Kalman filter. Returns the steps and the state covariance (nx, nx) after them.
 
     The last `noises` columns of `moves` (k, ns, ns + m + noises) are the effect of unit noises on the states. After
-    each step, `variance` (k, nx - ns) adds to the parameters' variance. Other arguments: see `FixedGainKalmanFilter`.
+    each step, `variance` (k, nx - ns) adds to the parameters' variance. Other arguments: see `PrecomputedKalmanFilter`.
     """
     count, library, covariance = np.diff(row_start), _library(), covariance.copy()
     white, projected = np.empty(int(np.sum(count**2))), np.empty_like(observation)
     moves, decay, variance, observation = map(np.ascontiguousarray, (moves, decay, variance, observation))
-    found = FixedGainKalmanFilter(row_start, moves, noises, decay, observation, white, projected)
+    found = PrecomputedKalmanFilter(row_start, moves, noises, decay, observation, white, projected)
     ns, known = moves.shape[1], moves.shape[2] - noises
     if library is None:
         roots, parameters = np.split(white, np.cumsum(count**2)[:-1]), np.arange(ns, len(covariance))
         for k, (span, transition) in enumerate(zip(found._spans, found._transitions, strict=True)):
-            step, covariance, _ = one_kalman_step(covariance, observation[span], transition)
+            step, covariance, _ = kalman_covariance_step(covariance, observation[span], transition)
             roots[k][:], projected[span] = step.whitening.ravel(), step.projected_covariance
             covariance[parameters, parameters] += variance[k]
             covariance[:ns, :ns] += moves[k, :, known:] @ moves[k, :, known:].T

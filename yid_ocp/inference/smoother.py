@@ -26,7 +26,7 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, one_kalman_step
+from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, kalman_covariance_step
 from yid_ocp.inference.smoother_model import (
     ResidualStateSpaceModel,
     SmoothedUnknownGroup,
@@ -37,7 +37,7 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.measurements import subtract_estimated_bias_and_clock_errors
+from yid_ocp.problem.measurements import measurements_minus_sensor_error_estimates
 
 _Models = Sequence[ResidualStateSpaceModel]
 _Groups = Sequence[SmoothedUnknownGroup]
@@ -152,7 +152,7 @@ def _forwards(model: ResidualStateSpaceModel, variance: Array) -> _Filtered:
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
         transition = StateTransition(move, np.full(nd, model.interval_correlation))
-        step, later, own = one_kalman_step(p, design, transition)
+        step, later, own = kalman_covariance_step(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, used, products, math.inf, ())
         white, after = step.normalized_innovations_and_next_mean(mean, interval.negative_residual_jacobian)
@@ -362,7 +362,7 @@ def smooth_unknown_forces_and_biases(
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
     if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
         less = [
-            replace(e, measurements=subtract_estimated_bias_and_clock_errors(e.measurements, result.predicted_outputs))
+            replace(e, measurements=measurements_minus_sensor_error_estimates(e.measurements, result.predicted_outputs))
             for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
         ]
         problem = problem.with_episodes(less, ())

@@ -14,7 +14,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
-from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
+from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
@@ -491,7 +491,7 @@ def interval_text(lower: float | None, upper: float | None) -> str:
     return f"above {lower:.4g}" if upper is None else f"{lower:.4g} to {upper:.4g}"
 
 
-def mask_of_unknowns_with_decisive_priors(data: Array, priors: Array, column: int) -> BoolArray:
+def mask_of_priors_determining_unknown(data: Array, priors: Array, column: int) -> BoolArray:
     """Return a mask (nx,) of the unknowns whose priors determine the unknown `column`. All False if the data do.
 
     `data` (n, nx) and `priors` (k, nx) are Jacobians of whitened residuals. Priors determine an unknown if its standard
@@ -536,7 +536,7 @@ class EstimateChecksBeyondFit:
     discretisation_shifts: Mapping[str, EstimateShiftByDiscretisation] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     uncounted_errors: tuple[str, ...] = ()
-    held_out_predictions: tuple[PredictedEpisodeOrFailure, ...] = ()
+    held_out_predictions: tuple[EpisodeAndPredictionOrFailure, ...] = ()
     expected_prediction_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     data_issues: tuple[Issue, ...] = ()
     step_stability: Mapping[str, Any] = field(default_factory=dict)

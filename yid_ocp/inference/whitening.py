@@ -37,13 +37,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import FixedGainKalmanFilter, kalman_filter_and_covariance
+from yid_ocp.inference.kalman import PrecomputedKalmanFilter, precompute_kalman_filter
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
     ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import iterate_step_derivatives, reachable_and_observable_state_mask
+from yid_ocp.integrator.step import reachable_and_observable_state_mask, rollout_step_derivatives
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -51,7 +51,7 @@ from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel
 from yid_ocp.problem.estimation_problem import held_out_parameter_vector, held_out_prediction_arguments
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
-from yid_ocp.problem.measurements import subtract_estimated_bias_and_clock_errors
+from yid_ocp.problem.measurements import measurements_minus_sensor_error_estimates
 
 _MIN_TORQUE_GAIN = 0.1  # smallest derivative of applied by recorded torque for conversions of errors
 _MIN_START_SLOPE = 1e-12  # smaller derivatives of an initial state are rounding
@@ -66,7 +66,7 @@ class _FilterPart(NamedTuple):
     first: int  # index of the first step
     rows: IntArray  # residual rows, in the order of the steps
     step_of_row: IntArray
-    kalman: FixedGainKalmanFilter
+    kalman: PrecomputedKalmanFilter
     by_torque: Array  # derivatives of the rows by a known torque of their step, shape (r, nu)
 
 
@@ -161,7 +161,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErr
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
     still = np.eye(len(kept), len(kept) + nu)[None], 0, np.ones((1, 2 * nu)), np.zeros((1, 2 * nu))
-    kalman, covariance = kalman_filter_and_covariance(covariance, observe, (0, len(rows)), *still)
+    kalman, covariance = precompute_kalman_filter(covariance, observe, (0, len(rows)), *still)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
     last = _FilterPart(count, rows, np.full(len(rows), count), kalman, none)
     return WhiteningFilter((steps, last), errors, first, live, spread)
@@ -203,7 +203,7 @@ def _filter_steps(
     observe, by_torque = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu))
     along = course.model_functions.step, course.theta, course.rollout
     places = kept[:, None] * (nx + inputs.shape[2]) + columns
-    for state, effort in iterate_step_derivatives(*along, inputs, feedback):
+    for state, effort in rollout_step_derivatives(*along, inputs, feedback):
         move = moves[begun : begun + len(state)]
         move[:] = state if ns == nx else state.reshape(len(state), -1).take(places, axis=1)  # faster than an index
         spans = pairwise(ends[begun : begun + len(state) + 1].tolist())
@@ -216,7 +216,7 @@ def _filter_steps(
     observe[:, known:] = observe[:, ns:known]
     observe[:, :ns] += before
     stepwise = ends.tolist(), moves, inputs.shape[2] - nu, decay, variance
-    kalman, covariance = kalman_filter_and_covariance(covariance, observe, *stepwise)
+    kalman, covariance = precompute_kalman_filter(covariance, observe, *stepwise)
     return _FilterPart(0, order, step_of_row, kalman, by_torque), covariance
 
 
@@ -232,7 +232,7 @@ def _innovations_and_bias(episode: Episode, result: EpisodePrediction, by: Proce
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:
     """Residual of an episode in units of sensor noise, after subtraction of constant sensor and clock errors."""
-    samples = subtract_estimated_bias_and_clock_errors(episode.measurements, result.predicted_outputs)
+    samples = measurements_minus_sensor_error_estimates(episode.measurements, result.predicted_outputs)
     pairs = zip(samples, result.predicted_outputs, strict=True)
     return np.concatenate([own.residual_and_jacobian(y).residual for own, y in pairs])
 

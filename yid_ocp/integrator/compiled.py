@@ -227,10 +227,10 @@ class CompiledKernel:
         self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
 
-    def iterate_step_derivatives(
+    def rollout_step_derivatives(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute the derivatives of a rollout's steps in C, as `step.iterate_step_derivatives` describes them."""
+        """Compute the derivatives of a rollout's steps in C, as `step.rollout_step_derivatives` describes them."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)

@@ -133,7 +133,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 
 @dataclass(frozen=True)
-class JointMotionAndTorqueWithSensitivities:
+class RecordedMotionWithSensitivities:
     """The angles and torques of the driven joints over a recording, with their derivatives in d directions (..., d).
 
     The first of the d directions are parameters. A derivative is None if the quantity depends on no direction.
@@ -213,8 +213,8 @@ class EffectMomentumCalculator:
 
     def effect_momentum_shifts_and_sensitivities(
         self,
-        recorded: JointMotionAndTorqueWithSensitivities,
-        true: JointMotionAndTorqueWithSensitivities,
+        recorded: RecordedMotionWithSensitivities,
+        true: RecordedMotionWithSensitivities,
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
@@ -249,7 +249,7 @@ class EffectMomentumCalculator:
         return (value - plain)[:, :, 0], total
 
     def _remembered(
-        self, motion: JointMotionAndTorqueWithSensitivities, theta: Array, wanted: _Wanted, width: int
+        self, motion: RecordedMotionWithSensitivities, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
         """Internal coordinates (N, nk) of joint effects at all nodes but the last, and derivatives (N, nk, d)."""
         steps = len(motion.torque)
@@ -305,7 +305,7 @@ class _InternalCoordinates:
         compiled = step.is_compiled
         self._maps = CasadiLockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
-    def along(self, motion: JointMotionAndTorqueWithSensitivities, start: Array, theta: Array) -> Array:
+    def along(self, motion: RecordedMotionWithSensitivities, start: Array, theta: Array) -> Array:
         """Return the effect's internal coordinates (N, k) along a motion from `start` (k,), without the last node."""
         before, now = motion._before_and_after
         found = [start]
@@ -316,7 +316,7 @@ class _InternalCoordinates:
 
     def slopes(
         self,
-        motion: JointMotionAndTorqueWithSensitivities,
+        motion: RecordedMotionWithSensitivities,
         values: Array,
         start: list[int],
         theta: Array,

@@ -239,7 +239,7 @@ class SystemBuildArguments(TypedDict, total=False):
     """Shape (3,) [m/s^2]; default: 9.81 along -z."""
     point_frames: Sequence[str] | None
     """Frames that sensors may measure, or points of a segment such as `T1:40%`; default: the segment tips `w_*`."""
-    springs: Mapping[str, servos_and_springs.RobotJointSpring]
+    springs: Mapping[str, servos_and_springs.JointSpringData]
     """Springs by robot joint; they become the parameters `JOINT.stiffness` and `JOINT.rest`."""
     servos: servos_and_springs.ServoModelOptions | None
     """Servos whose commands are the inputs of driven joints; adds `JOINT.servo_gain`, `JOINT.servo_damping`, ..."""
@@ -375,7 +375,7 @@ class System(ReprMixin):
         """The symbols of effects' internal coordinates by name, in the order of z. Grasps and placements use them."""
         return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
-    def layout_of_segment(self, name: str) -> SegmentLayout:
+    def segment_layout_by_name(self, name: str) -> SegmentLayout:
         """Return the layout of a segment. Raises `ModelError`, with the nearest name, if there is no such segment."""
         found = {layout.name: layout for layout in self.segment_layouts}
         require_known_names([name], found, "segment", "segments of the model", ModelError)

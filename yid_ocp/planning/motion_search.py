@@ -310,7 +310,7 @@ class EffectDiscriminationCriterion:
     amplitude_cases: tuple[Array, ...]
     parameter_columns: tuple[int, ...]  # columns with a prior: nominal parameters and parameters of effects
 
-    def distances_from_best_imitation(self, rows: Array) -> Array:
+    def pairwise_imitation_distances(self, rows: Array) -> Array:
         """Return the distance [data stds] of each effect (row) from its best imitation by another (column)."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):

@@ -14,7 +14,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, checked_rollout_inputs
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
-from yid_ocp.integrator.tracking_feedback import JointMotionAndTorqueWithSensitivities
+from yid_ocp.integrator.tracking_feedback import RecordedMotionWithSensitivities
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialStateWithSensitivity, truncate_episode
@@ -87,7 +87,7 @@ class EpisodePredictor:
             weight = 1.0 / self.options.start_point_noise_std
             samples = tuple(replace(s, weight=np.where(s.positive_weight_mask, weight, 0.0)) for s in samples)
         own, window = self._with(theta, episode.known_parameters), self.options.initial_state_fit_window
-        start = self.model_functions.initial_state_fitter.fit_to_points(
+        start = self.model_functions.initial_state_fitter.fit_initial_state_to_points(
             episode.initial_known_coordinates, samples, own, window, episode.prescribed_path
         )
         return replace(episode, fixed_initial_state=start)
@@ -178,7 +178,7 @@ class EpisodePredictor:
         if not self._follows_momenta:
             return inputs
         rows = slice(2 * self.system.n_coordinates, None)
-        recorded = JointMotionAndTorqueWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
+        recorded = RecordedMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
         shift, measured = self.model_functions.effect_momentum_calculator, episode.measured_driven_angles
         return inputs.with_effect_momentum_in_reference(shift, recorded, measured, theta, names, by_internal)
@@ -507,7 +507,10 @@ def episode_with_equilibrium_guess(predictor: EpisodePredictor, episode: Episode
     shapes = [least.copy()]
     shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
     with contextlib.suppress(DataError):
-        fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
+        fit, at = (
+            predictor.model_functions.initial_state_fitter.fit_initial_state_to_points,
+            episode.initial_known_coordinates,
+        )
         seen = [s for s in early.measurements if s.node[0] * episode.grid.time_step <= _MAX_RESTING_TIME]
         seen = [replace(s, node=np.zeros(1, np.int64), fraction=np.zeros(1)) for s in seen]
         # an equilibrium near this configuration has the details

@@ -32,8 +32,8 @@ from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.problem.recorded_inputs import (
     prescribed_coordinates_at_nodes,
+    smoothed_efforts_at_nodes,
     smoothed_joint_angles_at_nodes,
-    smoothed_joint_efforts,
     step_mean_inputs,
 )
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
@@ -238,7 +238,7 @@ def prepare_episode(
     if functions.input_corrections.angles_depend_on_effort:
         slow = ZeroPhaseLowPassFilter(_GEAR_LOAD_CUTOFF_FRACTION * options.path_cutoff)
         parts = ((system.driven, low_pass), (system.prescribed, slow))
-        load = np.hstack([smoothed_joint_efforts(recording, names, grid, own) for names, own in parts if names])
+        load = np.hstack([smoothed_efforts_at_nodes(recording, names, grid, own) for names, own in parts if names])
     known_parameters = options.parameters_by_recording.get(recording.name, {})
     start = errors = None
     if (state := options.known_initial_states.get(recording.name)) is not None:
@@ -362,5 +362,5 @@ def episode_with_encoder_effort_noise(step: Step, episode: Episode, options: Pro
     return replace(episode, measurements=tuple(map(changed, episode.measurements)))
 
 
-PredictedEpisodeOrFailure = tuple[Episode, EpisodePrediction | str]
+EpisodeAndPredictionOrFailure = tuple[Episode, EpisodePrediction | str]
 """A recording and its prediction, or the reason why it has no prediction."""

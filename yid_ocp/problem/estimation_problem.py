@@ -18,8 +18,8 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_equilibrium_guess
 from yid_ocp.problem.episodes import (
     Episode,
+    EpisodeAndPredictionOrFailure,
     EpisodePrediction,
-    PredictedEpisodeOrFailure,
     mass_matrix_diagonal_at_zero,
     prepare_episode,
     truncate_episode,
@@ -35,13 +35,13 @@ from yid_ocp.problem.evaluation import (
     check_initial_values_and_bounds,
     check_no_known_value_of_free_parameters,
     check_unique_recording_names,
+    episode_residual_and_jacobian,
     estimated_initial_state_names,
+    initial_internal_state_offset_limits,
     initial_unknown_vector_and_bounds,
-    max_abs_initial_internal_state_offsets,
     positive_unknowns_mask,
     stated_prior_stds_of_unknowns,
     stated_rms_noise_of_data_residuals,
-    whitened_residual_and_jacobian,
 )
 from yid_ocp.problem.measurements import huber_loss_and_sqrt_weights
 from yid_ocp.problem.model_functions import ModelFunctions
@@ -222,7 +222,7 @@ class EstimationProblem(ReprMixin):
         cost, residuals, jacobians = 0.0, [], []
         threshold = self.options.huber_threshold
         for i, result in enumerate(done):
-            part = whitened_residual_and_jacobian(self.episodes[i], self.whitening_filters[i], result, threshold)
+            part = episode_residual_and_jacobian(self.episodes[i], self.whitening_filters[i], result, threshold)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
@@ -268,7 +268,7 @@ class EstimationProblem(ReprMixin):
         prior, prior_jacobian = self.priors.residual_and_jacobian(x)
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
-    def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[PredictedEpisodeOrFailure]:
+    def predict_held_out(self, x: ArrayLike, derivatives: bool = False) -> list[EpisodeAndPredictionOrFailure]:
         """Predict every held-out recording at the unknowns `x` of a fit to the estimation recordings.
 
         Returns each episode with its prediction or an error message. An `estimated` initial state is computed from its
@@ -387,7 +387,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
     short = _beginning(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
-    limit = max_abs_initial_internal_state_offsets(predictor.system, predictor.unknowns.initial_state_names)
+    limit = initial_internal_state_offset_limits(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

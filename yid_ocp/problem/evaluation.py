@@ -117,7 +117,7 @@ def _sensor_whitened_residual(
     )
 
 
-def whitened_residual_and_jacobian(
+def episode_residual_and_jacobian(
     episode: Episode, whitening: ProcessNoiseWhitener | None, result: EpisodePrediction, threshold: float = np.inf
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
@@ -213,7 +213,7 @@ def initial_unknown_vector_and_bounds(
 ) -> tuple[Array, Array, Array]:
     """Return the initial unknown vector and its lower and upper bounds, (nx,) each. Initial states have offset zero."""
     parameters, pack = system.parameters, unknowns.pack_same_for_all_recordings
-    wide = max_abs_initial_internal_state_offsets(system, unknowns.initial_state_names)
+    wide = initial_internal_state_offset_limits(system, unknowns.initial_state_names)
     start = pack(lambda name: theta[parameters.index(name)], np.zeros(len(wide)))
     return start, pack(lambda name: parameters[name].lower, -wide), pack(lambda name: parameters[name].upper, wide)
 
@@ -326,7 +326,7 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
     return {name: size for effect in effects for name, size in effect.max_abs_initial_internal_coordinates.items()}
 
 
-def max_abs_initial_internal_state_offsets(system: System, names: Sequence[str]) -> Array:
+def initial_internal_state_offset_limits(system: System, names: Sequence[str]) -> Array:
     """Return the largest absolute initial offset of each effect's internal coordinate, infinite for other names."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])

@@ -99,7 +99,7 @@ class InitialStateFitter:
         loads = [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
         self._load = ca.Function("load", e.arguments, loads)
 
-    def fit_to_points(
+    def fit_initial_state_to_points(
         self,
         configuration: Array,
         samples: Sequence[SensorMeasurements],

@@ -296,7 +296,7 @@ def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[Sensor
     return found
 
 
-def subtract_estimated_bias_and_clock_errors(
+def measurements_minus_sensor_error_estimates(
     samples: Sequence[SensorMeasurements], predicted: Sequence[Array]
 ) -> tuple[SensorMeasurements, ...]:
     """Subtract from measurements the constant errors and clock offsets that predictions (M, k), one a sensor, show."""

@@ -16,7 +16,7 @@ from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
     EffectMomentumCalculator,
-    JointMotionAndTorqueWithSensitivities,
+    RecordedMotionWithSensitivities,
     compile_driven_arms_only_step,
 )
 from yid_ocp.model.system import System
@@ -68,7 +68,7 @@ class CorrectedInputs:
     def with_effect_momentum_in_reference(
         self,
         shift: EffectMomentumCalculator,
-        recorded: JointMotionAndTorqueWithSensitivities,
+        recorded: RecordedMotionWithSensitivities,
         measured: Array,
         theta: Array,
         names: Sequence[str],
@@ -85,7 +85,7 @@ class CorrectedInputs:
             return self
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
-        true = JointMotionAndTorqueWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
+        true = RecordedMotionWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
         momentum, slope = shift.effect_momentum_shifts_and_sensitivities(recorded, true, theta, names)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 

@@ -45,16 +45,16 @@ def naive_cable_predictions(
         "moves_with_clamps": (held, np.full((len(points), len(held)), 1.0 / len(held))),
         "linear_carry": (ends, np.stack([np.interp(places, between, row) for row in np.eye(len(ends))], axis=1)),
     }
-    found = {"stays": np.array(measured_point_positions(recording, points))}
+    found = {"stays": np.array(recorded_point_positions(recording, points))}
     found["stays"][_GIVEN_FRAMES:] = start
     for name, (known, share) in shares.items():
-        moved = measured_point_positions(recording, known) - _start_frame(recording, known)
+        moved = recorded_point_positions(recording, known) - _start_frame(recording, known)
         found[name] = found["stays"].copy()
         found[name][_GIVEN_FRAMES:] += np.einsum("pk,mkx->mpx", share, moved)[_GIVEN_FRAMES:]
     return found
 
 
-def measured_point_positions(recording: Recording, points: Sequence[str]) -> Array:
+def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
     """Return the measured positions (M, len(points), 3) [m] of points in one group of a recording, or `DataError`."""
     for group in recording.points:
         if set(points) <= set(group.names):
@@ -69,7 +69,7 @@ def measured_point_positions(recording: Recording, points: Sequence[str]) -> Arr
 
 def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
     """Measured positions (len(points), 3) [m] in the second frame, from which predictions without a model start."""
-    at, where = measured_point_positions(recording, points), f"recording '{recording.name}'"
+    at, where = recorded_point_positions(recording, points), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
         what, allowed = f"there are {len(at)} frames of the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
         raise DataError(what, where=where, allowed=allowed, hint="remove the recording from the settings")
@@ -128,7 +128,7 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
     return tuple(found)
 
 
-def rmse_unit_and_count_by_channel(
+def rmse_unit_count_dicts_by_channel(
     results: Sequence[EpisodePrediction], episodes: Sequence[Episode]
 ) -> dict[str, dict[str, Any]]:
     """Compute the root mean square error, unit and number of samples by channel, with the keys `rmse`, `unit`, `n`.

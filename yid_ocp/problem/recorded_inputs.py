@@ -111,7 +111,7 @@ def _motor_off_steps(
     return np.asarray(enabled[np.clip(row, 0, len(joints.t) - 1)] < 0.5)
 
 
-def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
+def servo_gain_parameters_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
     """Read the servo gains stated in recordings: by recording name, the values of parameters `JOINT.servo_gain_factor`.
 
     Raises `DataError` if only some of the recordings with position commands state gains.
@@ -205,7 +205,7 @@ def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: ZeroPh
     return np.asarray(spline(np.clip(grid.node_times, *t[[0, -1]])))
 
 
-def smoothed_joint_efforts(
+def smoothed_efforts_at_nodes(
     recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter
 ) -> Array:
     """Low-pass filter joint efforts and sample them at each node, (steps + 1, len(names)) [N m]. Raises `DataError`."""

@@ -20,7 +20,6 @@ from yid_ocp.report.terminal import (
     SummaryTable,
     TableRows,
     copyable_estimates_blocks,
-    format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
     p_value_text,
@@ -28,6 +27,7 @@ from yid_ocp.report.terminal import (
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
     unused_efforts_sentence,
+    value_text_and_display_unit,
 )
 
 _MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # smallest listed share of the gap, and largest number of listed time windows
@@ -51,7 +51,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
     for channel, error in before["rmse"].items():
         errors = [error, *(step["rmse"].get(channel) for step in steps)]
-        shown = [format_error_value_and_unit(value, before["unit"][channel]) for value in errors]
+        shown = [value_text_and_display_unit(value, before["unit"][channel]) for value in errors]
         rows.append((channel, *(text for text, _ in shown), shown[0][1]))
     yield SummaryTable(rows, "Errors on held-out recordings", is_key_table=True)
     rows = [("where", "share of the gap", "when [s]")]
@@ -342,7 +342,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
     for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
         unit = channel_or_group_unit(units, channel)
         errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
-        cells = (format_error_value_and_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
+        cells = (value_text_and_display_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
         yield f"held out: {channel}" + (f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""), *cells
     for words, key, form in (
         ("iterations", "iterations", "d"),
@@ -429,7 +429,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         alike = [entry for entry in judged if entry["channel"].rpartition(".")[0] == group]
         sizes = zip(*((*entry["rmse"].values(), entry["difference"]) for entry in alike), strict=True)
         means = [statistics.fmean(size**2 for size in own) ** 0.5 for own in sizes]
-        texts = [" ".join(format_error_value_and_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
+        texts = [" ".join(value_text_and_display_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
         text = f"{group}, {where}: error {texts[0]} by {first}, {texts[1]} by {second} (rms)"
         yield SummaryStatement(f"{text}; their predictions differ by {texts[2]}", "conclusion")
     none, names = f"no parameter differs by more than {_MAX_RUN_DIFFERENCE} std", abbreviated_names_text(differing)
@@ -439,7 +439,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [("recording", "channel", first, second, "difference", "unit")]
     for entry in result["channels"]:
         three = (*entry["rmse"].values(), entry["difference"])
-        errors = [format_error_value_and_unit(size, entry["unit"]) for size in three]
+        errors = [value_text_and_display_unit(size, entry["unit"]) for size in three]
         rows.append((entry["recording"], entry["channel"], *(text for text, _ in errors), errors[0][1]))
     yield SummaryTable(rows, "Errors of both runs, and the difference of their predictions (rms)")
 

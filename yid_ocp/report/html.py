@@ -18,7 +18,7 @@ from yid_ocp.files import write_text
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS
 from yid_ocp.integrator.compiler import private_cache_folder
 from yid_ocp.report.figures import figure_html
-from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
+from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, rendered_section_dicts
 from yid_ocp.report.terminal import CodeBlock, SummaryTable
 from yid_ocp.solvers.base import Status
 
@@ -57,7 +57,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     shared = _shared_script(path)
     scripts = {"shared": shared, "packed": "" if shared else _packed_script()}
     page = environment.get_template("page.html")
-    write_text(path, page.render(findings=findings, sections=render_sections(findings, environment), **scripts))
+    write_text(path, page.render(findings=findings, sections=rendered_section_dicts(findings, environment), **scripts))
     return True
 
 

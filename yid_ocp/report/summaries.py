@@ -26,13 +26,13 @@ from yid_ocp.report.terminal import (
     bound_range_text,
     copyable_estimates_blocks,
     discretisation_shift_sentences,
-    format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
     unused_efforts_sentence,
+    value_text_and_display_unit,
 )
 
 _BASELINE_DESCRIPTIONS = {
@@ -68,7 +68,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     rows = [("channel", "error (rms)", "unit", "samples")]
     for name, entry in result["residuals"].items():
-        rows.append((name, *format_error_value_and_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
+        rows.append((name, *value_text_and_display_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
     yield SummaryTable(rows, "Errors on the fitted recordings")
     yield from _held_out_blocks(result)
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
@@ -118,7 +118,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         guesses = {name: _rms([own[name][c] for own in known for c in channels]) for name in names}
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))
-        sizes = [" ".join(format_error_value_and_unit(x, unit)).rstrip() for x in errors]
+        sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
         guess = f", and {sizes[3]} without a model, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
         text = f"held-out errors of {group} are {sizes[0]} (rms), {sizes[1]} on the fitted recordings{guess}"
         if noise is None or error is None or fitted is None:
@@ -155,9 +155,9 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("held-out recording", "channel", "error (rms)", "by noise", "unit", "without a model")]
     for recording, channel, rmse, noise, guesses in errors:
         unit = channel_or_group_unit(units, channel)
-        without = (f"{format_error_value_and_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
-        error, shown = format_error_value_and_unit(rmse, unit)
-        by_noise = "" if noise is None else format_error_value_and_unit(noise, unit)[0]
+        without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
+        error, shown = value_text_and_display_unit(rmse, unit)
+        by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
         rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
@@ -381,8 +381,8 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
     for part in ("", ".effort", ".position"):
         known = noise.get(f"{name}{part}")
         if known is not None and known["std"] is not None:
-            words = " ".join(format_error_value_and_unit(known["std"], known["unit"]))
-            offset = " ".join(format_error_value_and_unit(known.get("bias_std"), known["unit"]))
+            words = " ".join(value_text_and_display_unit(known["std"], known["unit"]))
+            offset = " ".join(value_text_and_display_unit(known.get("bias_std"), known["unit"]))
             words += f", offset {offset}" if known.get("bias_std") else ""
             said.append(words + (" (estimated)" if known.get("estimated") else ""))
     return "; ".join(said)
@@ -504,7 +504,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 @register_summary("yid-export/1")
-def export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     listed = {
@@ -524,7 +524,7 @@ def export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         return
     rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
-        sizes = (format_error_value_and_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
+        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
     yield SummaryTable(rows)
     if gate["fall"] is not None:

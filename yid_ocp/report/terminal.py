@@ -95,7 +95,7 @@ def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
-def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, str]:
+def value_text_and_display_unit(value: float | None, unit: str) -> tuple[str, str]:
     """Return the value of an error as text (a dash for None), and the unit in which it is displayed."""
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
     return ("–" if value is None else f"{factor * value:.3g}"), shown
@@ -166,7 +166,7 @@ def misfit_summary_blocks(
             yield SummaryStatement(said if known else none, "conclusion")
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
-        sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
+        sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
         texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} ({entry['baseline']})")
     texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
     yield SummaryStatement(f"worse than a guess without a model: {'; '.join(texts)}" if texts else "", "verdict")

@@ -129,10 +129,10 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     is_sample = joints.effort_sampling_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
     sensor = PrescribedJointEffortSensor(names)
-    return [filtered_effort_measurements(around, sensor, joints.t, effort, std, bias, is_sample=is_sample)]
+    return [filtered_effort_sensor_data(around, sensor, joints.t, effort, std, bias, is_sample=is_sample)]
 
 
-def filtered_effort_measurements(
+def filtered_effort_sensor_data(
     inputs: SensorDataInputs, sensor: JointSensor, t: Array, values: Array, std: Array, bias: Array, *, is_sample: bool
 ) -> SensorData:
     """Low-pass filter an effort sensor's measurements, and thin them until their noise is nearly independent.
@@ -142,7 +142,7 @@ def filtered_effort_measurements(
     time. Raises `DataError` if the recording is too short for the filter.
     """
     # the mean of an interval belongs to its centre
-    kept, measured = filtered_node_indices_and_values(inputs, t, values, "efforts", at_centres=not is_sample)
+    kept, measured = node_indices_and_low_pass_values(inputs, t, values, "efforts", at_centres=not is_sample)
     measured[_may_stick(inputs, sensor.joint_names, inputs.node_times[kept])] = np.nan
     times, last = inputs.node_times[kept], len(inputs.node_times) - 1
     unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
@@ -153,7 +153,7 @@ def filtered_effort_measurements(
     return SensorData(sensor, times, measured, *more, smoothing_filter=inputs.effort_filter)
 
 
-def filtered_node_indices_and_values(
+def node_indices_and_low_pass_values(
     inputs: SensorDataInputs, t: Array, values: Array, noun: str, *, at_centres: bool = False, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).

@@ -11,7 +11,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
-from yid_ocp.sensors.joints import JointSensor, filtered_effort_measurements
+from yid_ocp.sensors.joints import JointSensor, filtered_effort_sensor_data
 
 _TORQUE_CONSTANT = "torque_constant"
 _CURRENT = base.CHANNEL_KINDS.register("motors.current")(
@@ -73,4 +73,4 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraSensorInte
         raise DataError("a torque constant is zero", where=where, allowed=allowed)
     sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
     values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
-    return filtered_effort_measurements(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)
+    return filtered_effort_sensor_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)

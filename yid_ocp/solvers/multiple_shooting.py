@@ -234,7 +234,7 @@ class _AdaptiveRidge(ca.Callback):
 
     def __init__(self, scale: Array, size: int) -> None:
         ca.Callback.__init__(self)
-        self.factor = symbolic_transcription.MIN_HESSIAN_RIDGE
+        self.factor = symbolic_transcription.MIN_RIDGE_FACTOR
         self._scale, self._change, self._size = scale, np.zeros(len(scale)), size
         self.construct("factor", {})
 
@@ -247,7 +247,7 @@ class _AdaptiveRidge(ca.Callback):
     def update(self, before: Array, after: Array) -> None:
         change = (after - before) / np.maximum(np.abs(after), self._scale)
         turned = float(change @ self._change) < 0
-        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, symbolic_transcription.MIN_HESSIAN_RIDGE)
+        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, symbolic_transcription.MIN_RIDGE_FACTOR)
         self._change = change
 
 

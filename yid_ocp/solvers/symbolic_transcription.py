@@ -50,7 +50,7 @@ from yid_ocp.solvers.nonlinear_program import (
 )
 
 # Smallest factor of the Hessian ridge (`GaussNewtonHessianRidge`).
-MIN_HESSIAN_RIDGE = 0.1
+MIN_RIDGE_FACTOR = 0.1
 
 
 def transcribe(
@@ -262,7 +262,7 @@ class _Maker:
         residuals += self._priors(columns)
         order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
         lower, upper, start = (np.concatenate(part) for part in (self._w.lower, self._w.upper, self._w.values))
-        ridge = GaussNewtonHessianRidge(np.concatenate(at_ridge), problem.unknown_scales[order], MIN_HESSIAN_RIDGE)
+        ridge = GaussNewtonHessianRidge(np.concatenate(at_ridge), problem.unknown_scales[order], MIN_RIDGE_FACTOR)
         vectors = lower, upper, start, np.concatenate([np.zeros(0), *self._p.values])
         terms = tuple(constraints), tuple(residuals)
         symbols = ca.MX.sym("w", self._w.size), ca.MX.sym("p", self._p.size)

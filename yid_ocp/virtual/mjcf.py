@@ -43,7 +43,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
 @functools.cache
-def file_format_elements_by_aspect() -> Mapping[str, Mapping[str, str]]:
+def elements_by_aspect_and_file_format() -> Mapping[str, Mapping[str, str]]:
     """Return, for each model aspect that an engine may lack, its description (`is`) and elements by file format."""
     return dict(YAML(typ="safe").load(Path(__file__).with_name("aspects.yaml")))
 
@@ -77,7 +77,7 @@ class ExpressionEvaluator:
         """Values of an expression that depends on parameters only."""
         return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
 
-    def is_neutral(self, effect: Effect) -> bool:
+    def is_effect_neutral(self, effect: Effect) -> bool:
         """Whether an effect changes nothing, because all its amplitudes have their neutral values."""
         names, neutral = getattr(effect, "amplitude_parameter_names", ()), getattr(effect, "neutral_values", {})
         return bool(names) and all(self._values[name] == neutral[name] for name in names)
@@ -91,7 +91,7 @@ class ExpressionEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Find the model aspects (keys of `file_format_elements_by_aspect`) whose expressions depend on `symbols`."""
+    """Find the model aspects (keys of `elements_by_aspect_and_file_format`) whose expressions depend on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -165,7 +165,7 @@ def system_joint_dynamics_terms(system: System, value: ExpressionEvaluator) -> d
         if not value._is_zero_at_parameter_values(compliance):
             stiffness = 1 / float(value(compliance)[0])
             add(joint, JointDynamicsTerms(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
-    for effect in (own for own in system.effects if not value.is_neutral(own)):
+    for effect in (own for own in system.effects if not value.is_effect_neutral(own)):
         for joint, own in effect_joint_terms_and_changed_aspects(system, effect, value)[0].items():
             add(joint, own)
     return found
@@ -439,14 +439,14 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
 
 
 def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: bool) -> None:
-    native = file_format_elements_by_aspect().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
+    native = elements_by_aspect_and_file_format().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
     able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
     for effect in system.effects:
         aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
         if aspects:
-            changed = file_format_elements_by_aspect()[min(aspects)]["is"]
+            changed = elements_by_aspect_and_file_format()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            allowed = ", ".join(own["is"] for name, own in file_format_elements_by_aspect().items() if name in able)
+            allowed = ", ".join(own["is"] for name, own in elements_by_aspect_and_file_format().items() if name in able)
             where, hint = f"effect '{effect.kind}@{effect.location}'", "remove the effect"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:

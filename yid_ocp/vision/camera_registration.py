@@ -188,7 +188,7 @@ class MovingArmSurface:
                 error = (distance - 1.0) * square  # n . (P - (origin + d (P - origin)))
             kept = (square > _MIN_INCIDENCE_COSINE * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
         else:
-            error, normal, part = self.robot_surfaces.distance_to_moving_surface(points, q, reach)
+            error, normal, part = self.robot_surfaces.nearest_moving_surfaces(points, q, reach)
             kept = np.ones(len(points), bool)
         chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
         behind, now, later = (

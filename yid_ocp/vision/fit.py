@@ -87,7 +87,7 @@ class ShapeFitOptions:
 class ShapeFitter:
     """A fitter of a flexible object's bending angles to camera points. Parameters default to nominal values.
 
-    The joints in `loose`, such as a free root (`shape_guesses.system_with_free_root`), are fitted too, with an almost
+    The joints in `loose`, such as a free root (`shape_guesses.add_free_root_joints`), are fitted too, with an almost
     flat prior. Raises `DataError` if the system has no object.
     """
 
@@ -368,7 +368,7 @@ class ShapeFitter:
         return LocalQuadraticModel(cost, gradient, hessian)
 
     def make_shape_guess_finder(self) -> ShapeGuessFinder:
-        """Make a finder of initial shapes for a system with a free root (`shape_guesses.system_with_free_root`)."""
+        """Make a finder of initial shapes for a system with a free root (`shape_guesses.add_free_root_joints`)."""
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
         tree = self.system.mechanism_with_values(self._values)
         return ShapeGuessFinder(self.system, tree, self.rest_configuration, self.bend_joints, lengths)
@@ -391,7 +391,7 @@ class ShapeFitter:
             hessian[:] += weighted.T @ rows
 
         if task is not None:
-            depths = shape_evidence.surface_distances_along_sight(corners, self.link_radii, task.points, task.camera)
+            depths = shape_evidence.surface_residuals_along_sight(corners, self.link_radii, task.points, task.camera)
             weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
             segment = np.array([names.index(owner) for owner in self.link_segments])
             for k in range(len(self.link_radii)):

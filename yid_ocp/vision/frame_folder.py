@@ -88,7 +88,7 @@ def _read_pcd(path: Path) -> _Cloud:
         raise _damaged(path, f"it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes")
     # Open3D prints errors to standard output and returns an empty cloud
     try:
-        with files.process_memory_limit(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        with files.limit_process_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
     except (MemoryError, RuntimeError) as error:
         raise _damaged(path, "it declares more points than fit into memory") from error

@@ -169,7 +169,7 @@ def times_configurations_points_of_good_frames(
     fits, of = list(good.values()), list(columns)
     t = np.array([frames[k].joint_time for k in good])
     position = np.array([fit.point_positions[of] for fit in fits])
-    by_sizes = np.array([sizes.point_std_of_dimensions(fit.dimension_equations.point_jacobian[of]) for fit in fits])
+    by_sizes = np.array([sizes.point_std_from_dimensions(fit.dimension_equations.point_jacobian[of]) for fit in fits])
     std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), options.min_point_std), by_sizes)
     velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
     # a point is measured at a uniformly distributed time within the exposure

@@ -88,7 +88,7 @@ class ForeignObject:
     text: str  # location and advice
 
 
-def foreign_objects_from_clusters(
+def foreign_clusters_to_objects(
     clusters: Sequence[tuple[float, Sequence[ForeignCluster]]],
     noise: float,
     box: tuple[Array, Array],
@@ -224,7 +224,7 @@ class TubeDimensionEstimates:
                 lines.append(f"{name} seems to be wrong: {found}, {said}. Measure it again, or {remedy}")
         return tuple(lines)
 
-    def point_std_of_dimensions(self, points: Array) -> Array:
+    def point_std_from_dimensions(self, points: Array) -> Array:
         """Compute the standard deviations (np, 3) [m] of points due to wrong or uncertain tube dimensions.
 
         `points` (np, 3, 2 s) are the derivatives of the points by the 2 s dimensions of s segments. An estimated

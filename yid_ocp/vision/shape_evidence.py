@@ -336,7 +336,7 @@ def nearest_surface_residuals(
     return _SurfaceResiduals(np.arange(len(points)), link, error, rows, np.full(len(points), -share))
 
 
-def surface_distances_along_sight(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
+def surface_residuals_along_sight(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
     """Return the distances of points from the tubes along the line of sight. Arguments: `nearest_surface_residuals`.
 
     At a distance u from the axis across the line of sight, the surface of a tube of radius r is sqrt(r^2 - u^2) nearer

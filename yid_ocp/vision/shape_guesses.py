@@ -183,7 +183,7 @@ def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[f
     return length, way
 
 
-_FREE_ROOT_PREFIX = "found_root"  # prefix of the joints added by `system_with_free_root`
+_FREE_ROOT_PREFIX = "found_root"  # prefix of the joints added by `add_free_root_joints`
 _MAX_ENDS = 7  # of a centerline; more ends are clutter and give too many assignments
 _TRIED_MATCH_RATIO = 1.3  # assignments with distance errors up to this multiple of the best one are tried
 _WHOLE_OBJECT_TOLERANCE = 0.08  # relative length error of a centerline that shows the whole object
@@ -207,7 +207,7 @@ class _InitialShape(NamedTuple):
     end_anchors: tuple[ObservedObjectEnd, ...]
 
 
-def system_with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
+def add_free_root_joints(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
     """Make a system without grasps, whose object has six named free root joints (position [m], x-y-z angles)."""
     tree = system.mechanism_with_values(values)
     q = ca.SX.sym("q", system.n_coordinates)

@@ -174,7 +174,7 @@ class ArticulatedSurfaces:
                 result[asked[near]] = distance.astype(np.float64) <= reach
         return result
 
-    def distance_to_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
+    def nearest_moving_surfaces(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
         """Return distance [m], normal towards the point and part of the nearest moving surface; inf, 0, -1 if none."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)

@@ -39,7 +39,7 @@ from yid_ocp.vision.sequence_calibration import (
     TubeDimensionEstimates,
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
-from yid_ocp.vision.shape_guesses import ShapeGuessFinder, cloud_centerline_tree, system_with_free_root
+from yid_ocp.vision.shape_guesses import ShapeGuessFinder, add_free_root_joints, cloud_centerline_tree
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, SceneDescription, TriangleMesh
 from yid_ocp.vision.track_result import FrameReport, SingleFrameStages, TrackResult
 
@@ -71,9 +71,9 @@ def track_object(
     Raises `DataError` if joint angles are missing, time stamps come from another clock, or no frame is good (with the
     reasons). Raises `ConfigError` if a point does not exist in the system, and `ModelError` if meshes cannot be read.
     """
-    tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
+    tracker = SingleFrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_shared_values()
-    frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
+    frames = [tracker.process_one_frame(i, common) for i in tracker.frame_order]
     return tracker.track_result_from_frame_reports(*tracker.align_root_ends_and_mark_outlying_frames(frames), common)
 
 
@@ -97,7 +97,7 @@ class _Look(NamedTuple):
     starts: Sequence[Sequence[Array]]
 
 
-class FrameTracker:
+class SingleFrameTracker:
     """A tracker that processes frames one by one, in any process. Arguments are as in `track_object`.
 
     `frame_order` lists all frames by time stamp, `calibration_frames` the frames used to calibrate the camera.
@@ -119,7 +119,7 @@ class FrameTracker:
             what = f"root_placement is '{options.root_placement}', but the robot that holds the object gives its place"
             raise ConfigError(what, where="track.options.root_placement", allowed="model", hint=hint)
         if anywhere:
-            system, loose = system_with_free_root(system, values)
+            system, loose = add_free_root_joints(system, values)
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
         self.shape_fitter = ShapeFitter(system, options.shape_fit, values, loose)
@@ -281,7 +281,7 @@ class FrameTracker:
                 raise DataError("no point has a colour of the object: check track.options.filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
-    def process_frame(self, index: int, common: SequenceEstimates) -> FrameReport:
+    def process_one_frame(self, index: int, common: SequenceEstimates) -> FrameReport:
         """Process one frame, independent of other frames, and return its report."""
         work, look = self._look(index, common.camera_calibration, common.background)
         if look is None:
@@ -351,7 +351,7 @@ class FrameTracker:
         box = corners.min(axis=0) - self._widest, corners.max(axis=0) + self._widest
         seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.shape_fit.surface_noise_std
         coloured, still = self.sequence.load_colours is not None, self.options.background_estimation == "frames"
-        return sequence_calibration.foreign_objects_from_clusters(seen, noise, box, self._links, coloured, still)
+        return sequence_calibration.foreign_clusters_to_objects(seen, noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
         if self.robot_surfaces is None:

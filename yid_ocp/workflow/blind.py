@@ -248,7 +248,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     first = Path(folder) / f"{name}.h5"
     _BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = ensemble.candidate_sensitivities_to_json()
+    detectable = ensemble.candidate_sensitivities_to_list()
     write_strict_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
@@ -258,7 +258,7 @@ def _draw_case(
 ) -> dict[str, Any]:
     """Task: simulate and write the recordings of a case. Returns its label, and the data that its diagnosis may use."""
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.set_candidate_sensitivities_from_json(read_input_json(detectable))
+    ensemble.set_candidate_sensitivities_from_list(read_input_json(detectable))
     case, label = ensemble.draw_recordings_and_ground_truth(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")

@@ -17,11 +17,11 @@ from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.effects.bodies import system_with_link_mass_factors
+from yid_ocp.effects.bodies import system_with_mass_scale_parameters
 from yid_ocp.effects.friction import (
     EFFECT_KINDS_BY_FRICTION_LAW,
     TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED,
-    effect_with_lowest_smoothing_speed,
+    effect_with_min_smoothing_speed_at_joint,
     effect_with_sign_smoothing_speed,
 )
 from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
@@ -32,7 +32,7 @@ from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transfo
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
+from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, JointSpringData
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.workflow import run_inputs
@@ -100,12 +100,12 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             damping=damping,
             gravity=model.gravity,
             point_frames=model.measured_points,
-            springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.joint_springs.items()},
+            springs={name: JointSpringData(s.stiffness, s.rest_position) for name, s in model.joint_springs.items()},
             servos=arms.servo if mode == "servo" else None,
         )
     if any(said.use_recorded_straight_position for said in model.frames.values()) and run.recordings.estimate:
         # marker positions if no recording is specified
-        [places] = marker_positions_from_reference_pose(run, system, read_recordings_of_role(run, count=1)).values()
+        [places] = marker_position_values_by_recording(run, system, read_recordings_of_role(run, count=1)).values()
         system = replace(system, parameters=system.parameters.with_nominal_values(places))
     return _completed(run, system, link_division)
 
@@ -133,7 +133,7 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
     """Return the measured vertices and clamps of a run's cable. None for an object that is not held by clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
-        return None if run.model.object is None else run.model.object.branch_vertices()
+        return None if run.model.object is None else run.model.object.clamped_cable_topology()
 
 
 def are_arm_states_estimated(run: RunSettings) -> bool:
@@ -193,7 +193,7 @@ def _clamped_system(run: RunSettings, cable: CableTopology) -> System:
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
     """The system with uncertain link masses, the effects, and the parameter values of the settings."""
     if run.model.arms.relative_link_mass_std > 0:
-        system = system_with_link_mass_factors(system, _LINK_MASS_PARAMETER)
+        system = system_with_mass_scale_parameters(system, _LINK_MASS_PARAMETER)
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
     for joint in friction_joint_names(run, system):
         assert run.model.friction is not None
@@ -230,7 +230,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
             allowed, hint = "`law_csv` and `depends_on` with kind: law", "leave them out, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         made = make_effect(said.kind, said.location, system, dict(said.values))
-        return effect_with_lowest_smoothing_speed(made, system)
+        return effect_with_min_smoothing_speed_at_joint(made, system)
     if said.law_csv is None or said.depends_on is None or said.values:
         what, hint = "the law lacks `law_csv` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
         allowed = "`law_csv` and `depends_on`, without `values`"
@@ -380,7 +380,7 @@ def _with_extra_frames(
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
     """Robot and objects with the additional frames of the settings.
 
-    A frame of uncertain position, or located by `marker_positions_from_reference_pose`, has parameters NAME.x, .y, .z.
+    A frame of uncertain position, or located by `marker_position_values_by_recording`, has parameters NAME.x, .y, .z.
     """
     made = list(items)
     for name, said in run.model.frames.items():
@@ -413,7 +413,7 @@ def _with_extra_frames(
     return carrier, made
 
 
-def marker_positions_from_reference_pose(
+def marker_position_values_by_recording(
     run: RunSettings, system: System, recordings: Iterable[Recording]
 ) -> dict[str, dict[str, float]]:
     """Return parameter values for marker positions on the object [m], by recording, from its pose when straight.

@@ -31,7 +31,7 @@ from yid_ocp.model.objects.base import CableTopology, ClampPosePointNames
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import DividedLinksModel, RefinementKind
-from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
+from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
@@ -72,8 +72,8 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
         for name in {group.name for group in groups if is_point_group_measured_by_arm(group)}:
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
     cable = cable_topology_between_clamps(run)
-    own = build.marker_positions_from_reference_pose(run, system, recordings)
-    for name, factors in servo_gain_factors_by_recording(system, recordings).items():
+    own = build.marker_position_values_by_recording(run, system, recordings)
+    for name, factors in servo_gain_parameters_by_recording(system, recordings).items():
         # gains in the settings take precedence over recorded ones
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
@@ -314,7 +314,7 @@ def _beside_the_model(
         told += point_checks.forward_kinematics_issues(arm, recording, _choice(run))
         found += [issue for issue in told if not _is_modelled(system, issue)]
     theta = system.parameters.vector()
-    return found + list(point_checks.point_distance_issues(arm, system, theta, recording, _choice(run)))
+    return found + list(point_checks.points_too_distant_issues(arm, system, theta, recording, _choice(run)))
 
 
 def _excitation(
@@ -358,7 +358,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
         own = problem.unpack_episode_unknowns(problem.initial_unknowns, i)
         result = problem.predictor.predict_episode(episode, *own, False, None)
         if isinstance(result, EpisodePrediction):
-            found += point_checks.object_point_rollout_issues(episode, result, size)
+            found += point_checks.object_point_correction_issues(episode, result, size)
     return found
 
 

@@ -74,7 +74,7 @@ def run_diagnose(
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step", ahead=24.5)
         runs = run_history.estimates_of_each_baseline_run(run)
-        without, said = run_history.load_recordings_without_effect(run)
+        without, said = run_history.recordings_without_effect_or_reason(run)
         if said:
             folder.log_event("message", level="WARNING", source="baseline", text=said)
         run = run_history.settings_with_baseline_effects(run, runs)
@@ -166,7 +166,7 @@ def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, An
     lines += ["problem:", f"  time_step: {used:g}"] if used != stated else []
     copied = system, fit.problem.unpack_episode_unknowns(fit.unknowns, 0)[0], estimates
     export = "export", folder, "--out", "model.xml"
-    return prediction_outputs.estimate_texts_by_format(*copied, export, model_yaml=lines)
+    return prediction_outputs.copyable_estimate_texts(*copied, export, model_yaml=lines)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from yid_ocp.export.signals import (
 )
 from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
-from yid_ocp.report.summaries import export_summary
+from yid_ocp.report.summaries import summarize_export
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import mujoco_xml
@@ -67,7 +67,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         form = form or _FORMAT_BY_ENDING.get(ending, ending)
         with stderr_progress_display(arguments) as progress:
             manifest = _export_model(source, Path(out), form, arguments.lossy, progress)
-        print_result(arguments, manifest, lambda: summary_terminal_lines(export_summary(manifest)), out, out)
+        print_result(arguments, manifest, lambda: summary_terminal_lines(summarize_export(manifest)), out, out)
         return EXIT_DONE
     if source.is_dir() and form == "csv":
         allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording, or the run's signals as mcap"

@@ -18,7 +18,7 @@ from yid_ocp.solvers import Solution, Status, fit_problem
 from yid_ocp.workflow.build import friction_joint_names, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
-from yid_ocp.workflow.prediction_outputs import estimate_texts_by_format
+from yid_ocp.workflow.prediction_outputs import copyable_estimate_texts
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
@@ -73,7 +73,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         section = f"{{law: {best.law}, joints: [{', '.join(result['joints'])}]}}"
         again = "solve", os.path.relpath(folder.final_path / "config.yaml"), "--set", f"model.friction={section}"
         copied = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0], solution.parameters, again
-        result["to_use"] = estimate_texts_by_format(*copied, model_yaml=["model:", f"  friction: {section}"])
+        result["to_use"] = copyable_estimate_texts(*copied, model_yaml=["model:", f"  friction: {section}"])
         folder.log_event("end", warranted=best.law)
         known = {"problem": problem, "solution": solution, "section_data": {"friction_clouds": clouds}}
         written = folder.write_result_and_report(run, progress, result, **known)

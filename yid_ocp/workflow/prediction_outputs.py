@@ -20,7 +20,7 @@ from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, PredictedEpisodeOrFailure
+from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
@@ -69,7 +69,7 @@ def has_unused_efforts(problem: EstimationProblem) -> bool:
     return recorded and not problem.system.driven and JOINT_EFFORT_SENSOR_KEY not in used
 
 
-def estimate_texts_by_format(
+def copyable_estimate_texts(
     system: System,
     theta: Array,
     estimates: Mapping[str, ParameterEstimate],
@@ -158,7 +158,7 @@ EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, Episo
 
 
 def write_solve_trajectories(
-    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
+    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> None:
     """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1` (HDF5).
 

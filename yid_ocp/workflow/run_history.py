@@ -209,7 +209,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
     return replace(settings_with_added_effects(run, added), parameters={**run.parameters, **freed})
 
 
-def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
+def recordings_without_effect_or_reason(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
     """Return recordings without the sought effect (of settings or baseline), and the reason if they are unreadable."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):

@@ -15,7 +15,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByDiscretisation, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
+from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.solvers import Iterate, Solution, Status
 from yid_ocp.solvers import base as solvers
 from yid_ocp.solvers.base import IterationCallback
@@ -57,7 +57,7 @@ def run_solve(
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
             "unused_efforts": prediction_outputs.has_unused_efforts(problem),
-            "to_use": prediction_outputs.estimate_texts_by_format(*copied, export, checks.uncounted_errors),
+            "to_use": prediction_outputs.copyable_estimate_texts(*copied, export, checks.uncounted_errors),
             "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
         result = solution_to_result_dict(problem, solution, held_out) | more
@@ -126,7 +126,7 @@ def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dic
 
 
 def solution_to_result_dict(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[PredictedEpisodeOrFailure]
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> dict[str, Any]:
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = estimation.prediction_errors_units_and_fit_errors(problem, solution, held_out)

@@ -32,7 +32,7 @@ from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceEstimates, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import SceneDescription, VirtualFramesWithTruth
-from yid_ocp.vision.track import FrameTracker
+from yid_ocp.vision.track import SingleFrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import data_quality_issues_of_recording, issues_to_plain_data
@@ -233,18 +233,18 @@ def _read_joints(run: RunSettings) -> Recording | None:
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
-def _frame_tracker(config: Path) -> FrameTracker:
+def _frame_tracker(config: Path) -> SingleFrameTracker:
     """Return the tracker of the frames in files. A process makes it once while the configuration has the same text."""
     return _tracker(config.absolute(), files.read_input_text(config))
 
 
 @lru_cache(maxsize=1)  # another configuration replaces it, because frames take much memory
-def _tracker(config: Path, text: str) -> FrameTracker:
+def _tracker(config: Path, text: str) -> SingleFrameTracker:
     del text
     run = load_config(config)
     sequence, scene = _read_frames(run, "frames_path"), _camera_scene(run, build_system(run))
     background = None if run.track.background_frames_path is None else _read_frames(run, "background_frames_path")
-    return FrameTracker(scene, _read_joints(run), sequence, run.track.options, background)
+    return SingleFrameTracker(scene, _read_joints(run), sequence, run.track.options, background)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +261,11 @@ class _FrameTasks:
         return files.dataclass_from_plain_data(SequenceEstimates, found)
 
     def track_frames(
-        self, tracker: FrameTracker, common: SequenceEstimates, workers: WorkerConfig | Executor, progress: Progress
+        self,
+        tracker: SingleFrameTracker,
+        common: SequenceEstimates,
+        workers: WorkerConfig | Executor,
+        progress: Progress,
     ) -> list[FrameReport]:
         names, told = tracker.sequence.frame_names, files.to_lossless_plain_data(common)
         tasks = {names[i]: {"common": told, "index": i} for i in tracker.frame_order}
@@ -343,5 +347,5 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     del inputs
-    found = _frame_tracker(config).process_frame(index, files.dataclass_from_plain_data(SequenceEstimates, common))
+    found = _frame_tracker(config).process_one_frame(index, files.dataclass_from_plain_data(SequenceEstimates, common))
     return dict(files.to_lossless_plain_data(found))

@@ -25,7 +25,7 @@ from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import DataError, import_optional, nearest_name_question, unknown_name_error_arguments
-from yid_ocp.files import check_input_file, file_sha256, process_memory_limit
+from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
 JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"
@@ -86,7 +86,7 @@ class OpenBag:
     def raise_read_errors_as_data_errors(self) -> Iterator[None]:
         """Turn every error during reading of the bag into a `DataError` (context manager)."""
         try:
-            with process_memory_limit():  # compressed data may state no size or a wrong one
+            with limit_process_memory():  # compressed data may state no size or a wrong one
                 yield
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
             tool = "rosbag" if self.path.suffix == ".bag" else "ros2 bag"

@@ -289,7 +289,7 @@ model:
         OptionInfo("CSV table with the columns point, x, y, z [m]"),
     ]
 
-    def branch_vertices(self) -> CableTopology:
+    def clamped_cable_topology(self) -> CableTopology:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
         found = CableTopology(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
         for name in self.branch_properties_by_name:
@@ -298,9 +298,9 @@ model:
         return found
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: Vector3) -> System:
-        return clamped_cable_system(edge_lengths, self.branch_vertices(), replace(self, gravity=gravity))
+        return clamped_cable_system(edge_lengths, self.clamped_cable_topology(), replace(self, gravity=gravity))
 
     def edge_length_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         if not self.has_edge_lengths_per_recording:
             return {}
-        return length_parameters_from_edges(self.branch_vertices(), edge_lengths)
+        return length_parameters_from_edges(self.clamped_cable_topology(), edge_lengths)

@@ -91,7 +91,7 @@ def _init_object(word: str, segments: Mapping[str, _SegmentGeometry]) -> Initial
 
 
 def _cable(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
-    length, mass, radius = base.require_numeric_object_values("a cable", numbers, base.SIZE_AND_MASS_DESCRIPTIONS)
+    length, mass, radius = base.extract_required_object_numbers("a cable", numbers, base.SIZE_AND_MASS_DESCRIPTIONS)
     section = _section(numbers)
     segment = _init_segment(links, length, mass, None if section else radius, cross_section_size=section)
     return _init_object("cable", {"cable": segment})
@@ -99,7 +99,7 @@ def _cable(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
 
 def _beam(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     sizes = {name: base.SIZE_AND_MASS_DESCRIPTIONS[name] for name in ("length", "mass")}
-    length, mass = base.require_numeric_object_values("a beam", numbers, sizes)
+    length, mass = base.extract_required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
     if section is None and "radius" not in numbers:
         what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
@@ -116,7 +116,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
         hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
         raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
     wanted = base.SIZE_AND_MASS_DESCRIPTIONS
-    length, mass, radius = base.require_numeric_object_values("each branch of a tree", numbers, wanted)
+    length, mass, radius = base.extract_required_object_numbers("each branch of a tree", numbers, wanted)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="a whole number from 1 to 16")

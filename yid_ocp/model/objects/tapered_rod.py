@@ -22,7 +22,7 @@ _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
 def _init_object(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
-    length, mass, radius, tip = base.require_numeric_object_values(
+    length, mass, radius, tip = base.extract_required_object_numbers(
         "a tapered rod", numbers, base.SIZE_AND_MASS_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = _TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")

@@ -12,7 +12,7 @@ from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import PredictedEpisodeOrFailure
+from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.registry import Registry
 from yid_ocp.report.animation import AnimationData
 from yid_ocp.solvers import Solution
@@ -35,7 +35,7 @@ class ReportData:
     result: Mapping[str, Any]
     problem: EstimationProblem | None = None
     solution: Solution | None = None
-    held_out: Sequence[PredictedEpisodeOrFailure] = ()
+    held_out: Sequence[EpisodeAndPredictionOrFailure] = ()
     animations: Sequence[AnimationData] = ()
     robot: str | None = None
     noise_fraction: float = 1.0
@@ -80,7 +80,7 @@ def draw_figure_per_unit(
     return [("", draw(own, "" if unit == "1" else unit)) for unit, own in grouped.items()]
 
 
-def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
+def rendered_section_dicts(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
     """Return all sections that have content, in order, each with the keys `name`, `title` and `html`."""
     result = []
     sections = {name: REPORT_SECTIONS[name] for name in REPORT_SECTIONS}

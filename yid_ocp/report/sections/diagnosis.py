@@ -18,7 +18,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
-from yid_ocp.report.terminal import format_error_value_and_unit, scale_and_unit_with_metres_as_mm
+from yid_ocp.report.terminal import scale_and_unit_with_metres_as_mm, value_text_and_display_unit
 
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
@@ -77,7 +77,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         sentences.append(f"With {names}, chi² per degree of freedom {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
-            errors = (" ".join(format_error_value_and_unit(*model[most])) for model in (before, after))
+            errors = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
             worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
