@@ -232,10 +232,12 @@ def _with_changed_parameters(seen: _Examined, judged: Judgement, earlier: Earlie
     effects.
     """
     search, fit, released = seen.search, seen.nominal, list[str]()
-    while left := earlier.parameters_that_left_priors(fit, search.thresholds):
-        released.append(left[0])
-        search.progress.begin_stage(f"trying a change of {' and '.join(released)}", 1.0, 8.5)
-        fit = _fitted_nominal_model(search.restarted_with(_without_priors_of(search.problem, released)), fit.values)
+    with contextlib.suppress(SolverError):
+        while left := earlier.parameters_that_left_priors(fit, search.thresholds):
+            search.progress.begin_stage(f"trying a change of {' and '.join([*released, left[0]])}", 1.0, 8.5)
+            free = _without_priors_of(search.problem, [*released, left[0]])
+            fit = _fitted_nominal_model(search.restarted_with(free), fit.values)
+            released.append(left[0])
     best = [seen.nominal, *(entry.refitted_model for entry in judged.selected_effects)][-1]
     limits, most = search.thresholds, 1.0 if judged.verdict == "unknown" else -1.0
     if not released or select.relative_bic_difference(fit, best, len(released), limits) > most:
