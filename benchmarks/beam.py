@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     for division in chosen.divisions:
         start = time.perf_counter()
         system = build_system(run, division)
-        links = len(system.segment_layout_by_name(name).link_joints)
+        links = len(system.find_segment_layout(name).link_joints)
         problem = build_problem(run, build_step(run, system))
         solution = fit_problem(problem, run.solver)
         size = {key: solution.parameters[f"{name}.{key}"].value for key in ("length", "mass", "size_x", "size_y")}

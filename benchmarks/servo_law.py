@@ -97,7 +97,7 @@ def left_out_errors(
         slope = np.diff(np.eye(N_KNOTS), axis=0)[(knots[:-1] < first) | (knots[1:] > last)] / FLAT_STD
         fold = with_prior(problem, law, family.precision + slope.T @ slope)
         start = replace(solution, x=fitted.x, parameters={})
-        errors |= ladder.cross_validate_over_motion_kinds("", fold, start, {kind: own}).left_out_errors
+        errors |= ladder.cross_validate_law_by_motion_kind("", fold, start, {kind: own}).left_out_errors
     return errors
 
 
@@ -114,7 +114,7 @@ def main() -> int:
     print("| law of | error on kinds left out [rad] | " + " | ".join(n for own in kinds.values() for n in own) + " |")
     for quantity in (None, *arguments.quantities):
         if quantity is None:
-            errors = dict(ladder.cross_validate_over_motion_kinds("", base, solution, kinds).left_out_errors)
+            errors = dict(ladder.cross_validate_law_by_motion_kind("", base, solution, kinds).left_out_errors)
         else:
             errors = left_out_errors(base, solution, quantity, kinds)
         mean, std = ladder.mean_and_std_error_over_motion_kinds(errors, kinds)

@@ -13,7 +13,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors.joints import PrescribedJointEffortSensor
@@ -71,7 +71,7 @@ PENDULUM = ("shoulder", "elbow")
 def pendulum_step(folder, effects=(), **how):
     """A double pendulum with springs and dampers; effects as (kind, location, values)."""
     robot = read_urdf(folder / "double_pendulum.urdf")
-    springs = {joint: JointSpringData(stiffness, 0.1) for joint, stiffness in zip(PENDULUM, (6.0, 3.0), strict=True)}
+    springs = {joint: StiffnessAndRest(stiffness, 0.1) for joint, stiffness in zip(PENDULUM, (6.0, 3.0), strict=True)}
     loose = {joint: spring for joint, spring in springs.items() if joint not in how.get("driven", ())}
     loose = {joint: spring for joint, spring in loose.items() if joint not in how.get("prescribed", ())}
     system = System.build(

@@ -82,7 +82,7 @@ def limit_process_memory() -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def check_input_number_count(count: int, where: str) -> None:
+def check_not_too_many_numbers(count: int, where: str) -> None:
     """Raise `DataError` if an input file contains or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
         allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"

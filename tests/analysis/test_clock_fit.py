@@ -8,7 +8,7 @@ import pytest
 from yid_ocp.analysis.clock_checks import problem_with_fitted_clocks_and_issues
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -43,7 +43,7 @@ def swung(late, frequency, seed):
 def test_damping_is_right_where_markers_are_late(tmp_path):
     file = tmp_path / "bench.xml"
     file.write_text(BENCH.format(elbow=""))
-    seen = {"prescribed": ["shoulder"], "point_frames": ["tip"], "springs": {"elbow": JointSpringData(2.0, 0.0)}}
+    seen = {"prescribed": ["shoulder"], "point_frames": ["tip"], "springs": {"elbow": StiffnessAndRest(2.0, 0.0)}}
     step = compile_step(System.build(read_urdf(file), damping={"elbow": 0.05}, **seen), 0.005)
     late = [swung(0.0005, frequency, i) for i, frequency in enumerate((0.9, 1.4))]
     truth, problems = {"elbow.stiffness": 3.0, "elbow.damping": 0.02}, {}

@@ -15,7 +15,7 @@ from small_problems import pendulum_step, taken
 from yid_ocp.analysis import compare as module
 from yid_ocp.analysis import estimation
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, compare_methods
-from yid_ocp.analysis.estimation import choose_fit_with_or_without_shape_memory, prediction_errors_units_and_fit_errors
+from yid_ocp.analysis.estimation import choose_fit_with_or_without_shape_memory, prediction_errors_units_and_fit_rmse
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -473,7 +473,7 @@ def test_errors_of_held_out_and_fitted_recordings_leave_out_what_fixed_the_start
     made = EstimationProblem(step, [taken(step, 1)], ("elbow.stiffness",), options, None, [taken(step, 2)])
     evaluation, held_out = made.evaluate(made.initial_unknowns, False), made.predict_held_out(made.initial_unknowns)
     fit = SimpleNamespace(evaluation=evaluation, episode_predictions=evaluation.episode_predictions)
-    entries, units, residuals = prediction_errors_units_and_fit_errors(made, fit, held_out)
+    entries, units, residuals = prediction_errors_units_and_fit_rmse(made, fit, held_out)
     assert [entry["recording"] for entry in entries] == ["run_2", "run_1"]
     assert units == dict.fromkeys(residuals, "m")
     [k] = [i for i, s in enumerate(made.episodes[0].measurements) if s.sensor.group_name == "points_camera"]
@@ -483,7 +483,7 @@ def test_errors_of_held_out_and_fitted_recordings_leave_out_what_fixed_the_start
     assert later.all() == (start == "equilibrium")
     assert entries[1]["rmse"]["points_camera"] == pytest.approx(math.sqrt(np.nanmean(square[later])))
     assert entries[1]["rmse"]["points_camera.tip"] == pytest.approx(math.sqrt(np.nanmean(square[:, 1])))
-    unfitted, nothing, _ = prediction_errors_units_and_fit_errors(made, SimpleNamespace(evaluation=None), held_out)
+    unfitted, nothing, _ = prediction_errors_units_and_fit_rmse(made, SimpleNamespace(evaluation=None), held_out)
     assert ([entry["recording"] for entry in unfitted], nothing) == (["run_2"], {})
 
 
@@ -522,7 +522,7 @@ def test_torque_errors_carry_a_held_out_motion_as_far_as_is_said(urdf_folder):
     fit = replace(solution(elbow_mass=estimate(1.0)), x=problem.initial_unknowns)
     checks = estimation.add_intervals_and_checks(problem, fit).checks
     pairs, expected = checks.held_out_predictions, checks.expected_prediction_errors
-    found = [entry["rmse"] for entry in prediction_errors_units_and_fit_errors(problem, fit, pairs)[0]]
+    found = [entry["rmse"] for entry in prediction_errors_units_and_fit_rmse(problem, fit, pairs)[0]]
     channel = next(name for name in expected["held_0"] if name.endswith(".tip"))
     errors = np.sqrt(np.mean([own[channel] ** 2 for own in found]))
     noise = np.sqrt(np.mean([own[channel] ** 2 for own in expected.values()]))

@@ -20,7 +20,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.model_functions import NodeStateValues
@@ -108,7 +108,7 @@ def swinging(request, urdf_folder):
     """A pendulum on a springy elbow, its tip seen; the shoulder follows its torque under the filter, or its path."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     how = {request.param: ["shoulder"], "damping": 0.1, "point_frames": ["tip"]}
-    system = System.build(robot, springs={"elbow": JointSpringData(3.0, 0.4)}, **how)
+    system = System.build(robot, springs={"elbow": StiffnessAndRest(3.0, 0.4)}, **how)
     step = compile_step(system, 0.01, use_compiler=False)
     t = 0.01 * np.arange(STEPS + 1)
     effort = {"effort": np.zeros((len(t), 1)), "effort_kind": "command", "effort_std": 0.05}
@@ -214,7 +214,7 @@ def hung_rod(urdf_folder):
 
     def find(stiffness=3.0, damping=0.0, mode="driven", gravity=-9.81):
         more = {"gravity": (0, 0, gravity), "damping": damping, mode: ["shoulder"]}
-        system = System.build(robot, springs={"elbow": JointSpringData(stiffness)}, point_frames=["tip"], **more)
+        system = System.build(robot, springs={"elbow": StiffnessAndRest(stiffness)}, point_frames=["tip"], **more)
         return step_map_natural_frequencies(system, {"shoulder": 0.0}, system.parameters.vector(), H)
 
     return find
@@ -233,7 +233,7 @@ def test_a_rod_swings_at_the_frequency_of_its_spring_and_weight(hung_rod, mode, 
 
 def test_frequencies_of_several_joints_ascend(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"shoulder": JointSpringData(30.0), "elbow": JointSpringData(3.0)}
+    springs = {"shoulder": StiffnessAndRest(30.0), "elbow": StiffnessAndRest(3.0)}
     system = System.build(robot, springs=springs, damping=0.3, point_frames=["tip"])
     found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
     m1, m2, l1, c1, c2 = 1.0, 0.6, 0.5, 0.25, 0.2

@@ -31,7 +31,7 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, fit_problem
@@ -460,7 +460,7 @@ def test_a_search_that_converged_at_an_unstable_time_step_has_stalled(light, lig
 @pytest.mark.parametrize(("noise", "moved"), [(0.0, False), (2e-4, True)])
 def test_noise_of_the_angles_that_move_an_object_widens_its_damping(urdf_folder, noise, moved):
     """It makes the rod vibrate, which a fit damps away: by several standard deviations of the data."""
-    robot, springs = read_urdf(urdf_folder / "double_pendulum.urdf"), {"elbow": JointSpringData(60.0)}
+    robot, springs = read_urdf(urdf_folder / "double_pendulum.urdf"), {"elbow": StiffnessAndRest(60.0)}
     how = {"springs": springs, "damping": {"shoulder": 0.0, "elbow": 0.02}, "prescribed": ["shoulder"]}
     system = System.build(robot, point_frames=["tip"], **how)
     step, t = compile_step(system, 0.005, use_compiler=False), 0.005 * np.arange(801)

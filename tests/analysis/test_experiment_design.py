@@ -17,11 +17,11 @@ from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
     ExperimentVariantSensitivityBuilder,
-    PointObservationSchedule,
+    SinglePointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
     measurable_points,
-    step_with_frames_and_measurable_points,
+    step_and_measurable_points_with_frames,
 )
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
@@ -32,7 +32,7 @@ from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
@@ -105,7 +105,7 @@ def sloped():
 
 def view(times, std, frame="a"):
     stds = np.array(std, float) * np.ones((len(times), 3))
-    return PointObservationSchedule("camera", frame, np.array(times), stds)
+    return SinglePointObservationSchedule("camera", frame, np.array(times), stds)
 
 
 TIMES = [(0.0, {0: 1.0}), (0.5, {1: 1.0}), (0.75, {1: 0.5, 2: 0.5}), (1.6, {3: 0.8, 4: 0.2}), (2.0, {4: 1.0})]
@@ -161,7 +161,7 @@ def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(urdf_folder):
 def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
     turn = "continuous", " ".join(map(str, axis))
     robot = chain_of_motors(tmp_path, turn=turn, slide=("prismatic", "1 0 0"))
-    springs = {"turn": JointSpringData(1.0), "slide": JointSpringData(1.0)}
+    springs = {"turn": StiffnessAndRest(1.0), "slide": StiffnessAndRest(1.0)}
     system = System.build(robot, springs=springs, point_frames=["hand"])
     *moving, marker = measurable_points(system)
     there = [name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0]
@@ -198,7 +198,7 @@ def swung(urdf_folder):
     """swung(**options): a pendulum, the shoulder moved as measured, the elbow springy, the tip seen by a camera."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(
-        robot, prescribed=["shoulder"], springs={"elbow": JointSpringData(3.0)}, damping=0.1, point_frames=["tip"]
+        robot, prescribed=["shoulder"], springs={"elbow": StiffnessAndRest(3.0)}, damping=0.1, point_frames=["tip"]
     )
     step = compile_step(system, 0.02, use_compiler=False)
     t = 0.02 * np.arange(41)
@@ -273,7 +273,7 @@ def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
     np.testing.assert_allclose(camera.t, episode.grid.node_times)
     assert np.all(camera.std == 1.0)
     step = swung().step
-    more, seen = step_with_frames_and_measurable_points(step)
+    more, seen = step_and_measurable_points_with_frames(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel

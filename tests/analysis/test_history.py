@@ -13,7 +13,7 @@ from small_problems import PENDULUM, joints, pendulum_step, recording, seen
 
 from yid_ocp.analysis.friction_law_comparison import (
     CrossValidatedFrictionLawFit,
-    cross_validate_over_motion_kinds,
+    cross_validate_law_by_motion_kind,
     mean_and_std_error_over_motion_kinds,
     measured_and_predicted_friction_torques,
     recording_names_by_name_stem,
@@ -203,7 +203,7 @@ def test_kinds_go_by_name_and_a_true_law_predicts_each_from_the_others_and_shows
 
     solution = fit_problem(driven, GaussNewton(), restarts=False)
     monkeypatch.setattr(GaussNewton, "minimize_cost", searched)
-    fit = cross_validate_over_motion_kinds("coulomb", driven, solution, recording_names_by_name_stem(driven))
+    fit = cross_validate_law_by_motion_kind("coulomb", driven, solution, recording_names_by_name_stem(driven))
     names = {"slow_1", "slow_2", "fast_1", "turn_1"}
     assert folds == [(names - own, own) for own in ({"slow_1", "slow_2"}, {"fast_1"}, {"turn_1"})]
     assert (set(fit.left_out_errors), fit.unit) == (names, "rad")
@@ -230,7 +230,7 @@ def test_laws_of_an_arm_that_moves_as_measured_are_judged_by_its_efforts(urdf_fo
         far = seen(["tip"], t, np.full((201, 1, 3), 9.0), std=np.full((201, 1, 3), 1e-3))
         made.append(recording(moved, far, name=f"run {seed}"))
     problem, kinds = EstimationProblem(step, made, [law]), {"one": ("run 0",), "other": ("run 1",)}
-    fit = cross_validate_over_motion_kinds("coulomb", problem, fit_problem(problem, restarts=False), kinds)
+    fit = cross_validate_law_by_motion_kind("coulomb", problem, fit_problem(problem, restarts=False), kinds)
     assert (fit.unit, fit.left_out_errors) == ("std", pytest.approx({"run 0": 1.1, "run 1": 1.1}, abs=0.2))
 
 

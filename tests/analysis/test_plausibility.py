@@ -13,7 +13,7 @@ import pytest
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
 from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, point_clock_offset_drift_and_rms_error
-from yid_ocp.analysis.estimation import prediction_errors_units_and_fit_errors
+from yid_ocp.analysis.estimation import prediction_errors_units_and_fit_rmse
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
     _loaded,
@@ -25,8 +25,8 @@ from yid_ocp.analysis.joint_checks import (
 from yid_ocp.analysis.point_checks import (
     _moved,
     cable_point_geometry_issues,
+    correctable_object_point_issues,
     forward_kinematics_issues,
-    object_point_correction_issues,
     points_too_distant_issues,
 )
 from yid_ocp.config.reader import load_config
@@ -501,7 +501,7 @@ def errors_of_guess(names, value, run=None, cable=None):
         SimpleNamespace(options=options, step=SimpleNamespace(time_step=0.1)),
         SimpleNamespace(evaluation=None),
     )
-    [told], *_ = prediction_errors_units_and_fit_errors(problem, fit, [(episode, "not predicted")])
+    [told], *_ = prediction_errors_units_and_fit_rmse(problem, fit, [(episode, "not predicted")])
     return told["baselines"]["stays"]
 
 
@@ -549,14 +549,14 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
     samples = measured(sensor, at, 0.0 * at, change(place).reshape(20, 9))
     episode = SimpleNamespace(name="run", measurements=(samples,))
     result = SimpleNamespace(predicted_outputs=(place.reshape(20, 9),))
-    found = list(object_point_correction_issues(episode, result, 2.0))
+    found = list(correctable_object_point_issues(episode, result, 2.0))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         apart = np.sqrt(np.mean(np.sum((change(place) - place) ** 2, axis=2)))
         assert (doubt.recording, doubt.group, doubt.severity) == ("run", "points_camera", "not_trusted")
         assert doubt.limit_violation_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
         assert words in doubt.what
-    assert list(object_point_correction_issues(episode, result, 0.0)) == []
+    assert list(correctable_object_point_issues(episode, result, 0.0)) == []
 
 
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}

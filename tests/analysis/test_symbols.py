@@ -14,13 +14,13 @@ from yid_ocp.analysis.step_symbols import NamedStepEquations, count_operations, 
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import Grasp
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 
 
 @pytest.fixture(scope="module")
 def symbols(urdf_folder):
     """A driven shoulder, a springy elbow whose tip is tied to a rod; a relaxing branch on the rod."""
-    system = held_rod(urdf_folder, kind="axis", driven=["shoulder"], springs={"elbow": JointSpringData(3.0)})
+    system = held_rod(urdf_folder, kind="axis", driven=["shoulder"], springs={"elbow": StiffnessAndRest(3.0)})
     return NamedStepEquations.from_equations(discrete_equations(system))
 
 

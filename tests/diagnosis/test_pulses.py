@@ -96,7 +96,7 @@ def test_friction_that_holds_may_change_by_twice_itself_wherever_a_joint_stands_
 def test_the_likeliest_forces_are_those_measured_in_whatever_unit(unit):
     made, values = history(wobble()), NOISE**2 * history(wobble()).score
     scaled = replace(made, score=made.score / unit, information=made.information / unit**2)
-    np.testing.assert_allclose(scaled.max_likelihood_force / unit, values, rtol=1e-5)
+    np.testing.assert_allclose(scaled.most_likely_force_signal / unit, values, rtol=1e-5)
 
 
 def test_windows_longer_than_a_history_are_not_looked_at():

@@ -385,7 +385,7 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
 def chain(links, **values):
     parameters = SimpleNamespace(names=tuple(values), vector=lambda: np.array(list(values.values())))
     named = {name: SimpleNamespace(name=name, link_joints=((),) * count) for name, count in links.items()}
-    layouts = {"segment_layouts": tuple(named.values()), "segment_layout_by_name": named.__getitem__}
+    layouts = {"segment_layouts": tuple(named.values()), "find_segment_layout": named.__getitem__}
     return SimpleNamespace(parameters=parameters, **layouts)
 
 

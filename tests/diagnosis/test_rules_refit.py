@@ -59,7 +59,7 @@ class Problem:
         self.at.append(self.named_values(self.pack_unknowns(at)))
         return self.problem_with_nominal_and_effects_free(effects)
 
-    def problem_with_relinearized_held_out_filters(self, own, effects, at):
+    def relinearize_held_out_filters_of_problem(self, own, effects, at):
         assert own is self
         self.foreseen.append(dict(at))
         return self

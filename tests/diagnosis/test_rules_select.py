@@ -15,7 +15,7 @@ from heard import Heard
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult
-from yid_ocp.diagnosis.select import held_out_chi2_decrease_and_std_error, held_out_gap_closure, select_effects
+from yid_ocp.diagnosis.select import chi2_per_sample_decrease_and_std_error, held_out_gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 LIMITS = Thresholds()
@@ -79,11 +79,11 @@ def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks():
 
 def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
     before, after = loss(3.0, 4.0, 2.0, count=10.0), loss(2.0, 2.0, 2.0, count=10.0)
-    gained, error = held_out_chi2_decrease_and_std_error(before, after)
+    gained, error = chi2_per_sample_decrease_and_std_error(before, after)
     assert gained == pytest.approx(1.0)
     # blocks differ by 10, 20 and 0: their standard deviation is 10, and there are three of them
     assert error == pytest.approx(math.sqrt(3) * 10.0 / 30.0)
-    assert held_out_chi2_decrease_and_std_error(after, before) == pytest.approx((-gained, error))
+    assert chi2_per_sample_decrease_and_std_error(after, before) == pytest.approx((-gained, error))
 
 
 SMALL = effect("small@x", amplitude())
@@ -228,7 +228,7 @@ class Rounds:
         self.progress, self.skipped, self.is_late = self.heard, [], False
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
 
-    def record_skip_if_past_deadline(self, *what):
+    def is_skipped_past_deadline(self, *what):
         self.skipped += what if self.is_late else ()
         return self.is_late
 
@@ -391,7 +391,7 @@ def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it
     ]
     for lost, std in ((loss(3.0, 3.2), math.sqrt(0.125)), (loss(1.0, 1.0), 0.01)):
         own = replace(entry, refitted_model=replace(entry.refitted_model, held_out_loss=lost))
-        found = select.refit_with_model_error_in_stds(replace(own, extended_models=tuple(moved)), LIMITS)
+        found = select.widen_refit_stds_by_model_error(replace(own, extended_models=tuple(moved)), LIMITS)
         assert found.std[name] == pytest.approx(std)
 
 
@@ -444,7 +444,7 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     spring = fit([effect("spring@elbow", amplitude("a"), amplitude("b"))], loss(1.0, 1.0), cost=100.0)
     offset = fit([effect("offset@elbow")], loss(1.01, 1.01), cost=101.0)
     spring, offset = (replace(own, residual_count=100) for own in (spring, offset))
-    assert held_out_chi2_decrease_and_std_error(offset.held_out_loss, spring.held_out_loss) == pytest.approx(
+    assert chi2_per_sample_decrease_and_std_error(offset.held_out_loss, spring.held_out_loss) == pytest.approx(
         (0.01, 0.0)
     )
     # 4 more of r'r; a parameter less is worth the logarithm of a hundred
@@ -612,6 +612,6 @@ def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
     counts = np.full(8, 10.0)
     before, after = (HeldOutLoss(of * counts, counts, {}, of * counts.sum(), by) for of, by in ((2, 800.0), (3, 0.0)))
     assert (before.chi2_per_sample, after.chi2_per_sample) == (12.0, 3.0)
-    assert held_out_chi2_decrease_and_std_error(before, after) == (pytest.approx(9.0), 0.0)
+    assert chi2_per_sample_decrease_and_std_error(before, after) == (pytest.approx(9.0), 0.0)
     found = held_out_gap_closure(before, after)
     assert (found.fraction, found.ci_low, found.ci_high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))

@@ -33,7 +33,7 @@ from yid_ocp.inference.whitening import (
 from yid_ocp.integrator.step import Step, compile_step, reachable_and_observable_state_mask, simulate
 from yid_ocp.model import System
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
@@ -47,7 +47,7 @@ FREE = ("elbow.stiffness", "elbow.damping")
 @pytest.fixture(scope="module")
 def step(urdf_folder) -> Step:
     tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": JointSpringData(3.0)}
+    springs = {"elbow": StiffnessAndRest(3.0)}
     system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     return compile_step(system, TIME_STEP)
 
@@ -151,7 +151,7 @@ def test_other_candidates_are_left_out_of_refits(step):
     found = []
     for hypotheses in (all_candidates, some):
         own = hypotheses.problem_with_effects_and_relinearized_filters([friction], at)
-        own = hypotheses.problem_with_relinearized_held_out_filters(own, [friction], at)
+        own = hypotheses.relinearize_held_out_filters_of_problem(own, [friction], at)
         x = own.pack_unknowns(at)
         evaluation, [held] = own.evaluate(x), own.predict_held_out(x)
         rows = held_out_residual(own, *held)
@@ -209,7 +209,7 @@ def sprung(step, urdf_folder):
     The spring's torque at rest is twelve times the offset that is stated.
     """
     tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": JointSpringData(3.0), "shoulder": JointSpringData(STRONG)}
+    springs = {"elbow": StiffnessAndRest(3.0), "shoulder": StiffnessAndRest(STRONG)}
     system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     moves = compile_step(system, TIME_STEP)
     # a spring about another angle is one about zero and a constant torque

@@ -17,7 +17,7 @@ from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.problem import ProblemOptions
-from yid_ocp.problem.evaluation import estimated_initial_state_names, initial_internal_state_offset_limits
+from yid_ocp.problem.evaluation import estimated_initial_state_names, max_abs_initial_internal_offsets
 from yid_ocp.sensors import PointSensor, PositionSensor, PrescribedJointEffortSensor, sensor_function_with_jacobians
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
@@ -359,7 +359,7 @@ def test_where_it_begins_is_estimated_with_every_recording() -> None:
     assert estimated_initial_state_names(whole, options, (), theta) == ()
     [name] = estimated_initial_state_names(whole, options, ("joint_presliding@left_a.tau_c",), theta)
     assert name == "z.joint_presliding@left_a.s"
-    assert initial_internal_state_offset_limits(whole, [name]).tolist() == [1.0]
+    assert max_abs_initial_internal_offsets(whole, [name]).tolist() == [1.0]
     known = whole.parameters.vector({"joint_presliding@left_a.tau_c": 0.1})
     assert estimated_initial_state_names(whole, options, (), known) == (name,)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutConvergenceInfo, RolloutInputs, SensitivityDirections
+from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutInputs, RolloutNewtonSummary, SensitivityDirections
 from yid_ocp.model import Grasp, System
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
@@ -160,4 +160,4 @@ def test_both_kernels_agree(parts, hard):
 @pytest.mark.parametrize("step", [3, 700])
 def test_a_failure_after_hundreds_of_steps_names_the_methods_limit(code, step):
     late = step == 700 and code in (NewtonStatusCode.NOT_CONVERGED, NewtonStatusCode.NOT_FINITE)
-    assert ("midpoint rule has no numerical damping" in RolloutConvergenceInfo(code, step, 0.1, 5, 5).message) is late
+    assert ("midpoint rule has no numerical damping" in RolloutNewtonSummary(code, step, 0.1, 5, 5).message) is late

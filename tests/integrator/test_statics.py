@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.discrete import RIGID_HOLD_STIFFNESS, equilibrium_equations
-from yid_ocp.integrator.statics import EquilibriumSolver, steady_state_internal_coordinates
+from yid_ocp.integrator.statics import EquilibriumSolver, steady_effect_internal_coordinates
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import rotation_from_rpy
-from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, JointSpringData, ServoModelOptions
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, ServoModelOptions, StiffnessAndRest
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
@@ -49,7 +49,7 @@ def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest(parts):
 def arm(urdf_folder):
     """The double pendulum, its elbow driven, with a spring on each joint."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {name: JointSpringData(4.0, 0.1) for name in robot.joint_names}
+    springs = {name: StiffnessAndRest(4.0, 0.1) for name in robot.joint_names}
     system = System.build(robot, driven=["elbow"], springs=springs)
     return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False))
 
@@ -135,7 +135,7 @@ def test_internal_coordinates_of_an_object_that_has_long_been_there(parts):
     step = compile_step(system, 1e-3, use_compiler=False)
     q = np.linspace(0.1, 0.5, 9)
     np.testing.assert_allclose(
-        steady_state_internal_coordinates(step, q, system.parameters.vector()), [q[0]], rtol=1e-12
+        steady_effect_internal_coordinates(step, q, system.parameters.vector()), [q[0]], rtol=1e-12
     )
     plain = compile_step(parts.cable(), 1e-3, use_compiler=False)
-    assert steady_state_internal_coordinates(plain, q, plain.system.parameters.vector()).shape == (0,)
+    assert steady_effect_internal_coordinates(plain, q, plain.system.parameters.vector()).shape == (0,)

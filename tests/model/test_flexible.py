@@ -259,7 +259,7 @@ def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
     run = load_config(tmp_path / "run.yaml")
     system = build_system(run, link_division=2)
     assert system.parameters["rod.taper"].value == 0.4
-    assert len(system.segment_layout_by_name("rod").link_joints) == 8
+    assert len(system.find_segment_layout("rod").link_joints) == 8
     assert link_division_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
     given = {"length": LENGTH, "mass": MASS, "radius": 0.006, "tip_radius": 0.003}
     made = object_factories_for_init()["tapered_rod"].build(given, 4)

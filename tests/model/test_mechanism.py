@@ -19,7 +19,7 @@ from yid_ocp.model.mechanism import (
     Inertia,
     homogeneous_transform,
     merge_inertias,
-    rotation_from_axis_sin_cos,
+    numeric_axis_sin_cos_rotation,
     rotation_from_rpy,
     rpy_from_rotation,
     snap_near_integer_entries,
@@ -175,7 +175,7 @@ AXES = st.sampled_from([*map(tuple, np.eye(3)), (0.0, -1.0, 0.0), (0.0, 0.0, -1.
 @given(axis=AXES, angle=ANGLES)
 def test_a_turn_about_an_axis(axis, angle):
     expected = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
-    numeric = rotation_from_axis_sin_cos(axis, math.sin(angle), math.cos(angle))
+    numeric = numeric_axis_sin_cos_rotation(axis, math.sin(angle), math.cos(angle))
     np.testing.assert_allclose(numeric, expected, rtol=0, atol=1e-14)
     symbolic = symbolic_rotation_from_axis_angle(axis, ca.SX(angle))
     assert symbolic.is_dense()

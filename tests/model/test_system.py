@@ -41,7 +41,7 @@ def test_configuration_order_of_the_paper(dual_arm):
     assert dual_arm.actuated_coordinate_indices == tuple(range(14))
     assert dual_arm.unprescribed_coordinate_indices == tuple(range(50))
     assert [segment.name for segment in dual_arm.segment_layouts] == ["T1", "T2", "T3"]
-    assert dual_arm.segment_layout_by_name("T2").parent_segment == "T1"
+    assert dual_arm.find_segment_layout("T2").parent_segment == "T1"
 
 
 def test_forces_and_energy(robot):
@@ -132,7 +132,7 @@ WRONG = {
     "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "three finite numbers"]),
     "frame": (lambda robot: System.build(robot, objects=[(foam_y_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
     "objects": (lambda robot: System.build(objects=[(foam_y_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
-    "segment": (lambda robot: System.build(robot).segment_layout_by_name("T1"), ["segment 'T1'"]),
+    "segment": (lambda robot: System.build(robot).find_segment_layout("T1"), ["segment 'T1'"]),
 }
 
 

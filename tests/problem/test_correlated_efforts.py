@@ -112,7 +112,7 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
     np.testing.assert_allclose(problem.cost_and_gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
     program = transcribe(problem)
-    arguments, theta = program.solver_arguments, program.block_indices_rows_and_unit("theta").index.ravel()
+    arguments, theta = program.solver_arguments, program.find_vector_block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9})
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)

@@ -20,7 +20,7 @@ from small_problems import (
 from yid_ocp.data.recording import validated_recording
 from yid_ocp.effects import candidate_kinds_and_locations
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import driven_joint_torques_of_rollout, simulate
+from yid_ocp.integrator.step import actuated_joint_torques_of_rollout, simulate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorKindAndPreset, ServoModelOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
@@ -76,7 +76,7 @@ def test_an_integral_takes_the_sag_away_and_stands_still_while_the_motor_is_off(
     assert z[601:] == pytest.approx(np.tile(z[600], (300, 1)), abs=1e-9)
     middle = (q[1:601] + q[:600]) / 2
     assert z[600] == pytest.approx(H * np.sum(command[0] - middle, axis=0), abs=1e-9)
-    torque = driven_joint_torques_of_rollout(step, made.theta, found.rollout)
+    torque = actuated_joint_torques_of_rollout(step, made.theta, found.rollout)
     assert torque[599] == pytest.approx(np.array([60.0, 25.0]) * 3.0 * z[600], rel=0.02)
 
 

@@ -21,7 +21,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import driven_joint_torques_of_rollout, simulate
+from yid_ocp.integrator.step import actuated_joint_torques_of_rollout, simulate
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, ServoModelOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
@@ -106,7 +106,7 @@ def test_the_torque_along_a_rollout_is_what_moves_it(urdf_folder, scale) -> None
     step = servo_step(urdf_folder, [("clock_scale", "clock", {"scale": scale})])
     made = problem_of(step, commanded(), ["shoulder.damping"])
     [result] = made.evaluate(made.initial_unknowns, False).episode_predictions
-    torque = driven_joint_torques_of_rollout(step, made.theta, result.rollout)
+    torque = actuated_joint_torques_of_rollout(step, made.theta, result.rollout)
     q = result.rollout.state[:, :2]
     rate, middle = np.diff(q, axis=0) * scale / H, (q[1:] + q[:-1]) / 2
     demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate

@@ -222,7 +222,7 @@ def test_unknown_forces_of_the_smoother_move_these_readings_as_an_effect_does(
     [model] = residual_models_with_smoother_unknowns(
         made, made.initial_unknowns, made.evaluate(made.initial_unknowns), interval=0.2
     )
-    bent = [link[0] for link in curved.segment_layout_by_name("T1").link_joints]
+    bent = [link[0] for link in curved.find_segment_layout("T1").link_joints]
     moment = 4.0 * np.isin(model.unknown_names, bent) / model.reference_std
     state, products = model.initial_state_jacobian @ moment, np.zeros(3)
     for part in model.intervals:

@@ -9,7 +9,7 @@ from yid_ocp.data import JointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, fit_problem
@@ -107,7 +107,7 @@ def moved(urdf_folder):
 
     def make(kind, truth, free, seed=0):
         robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-        plain = System.build(robot, springs={"shoulder": JointSpringData(6.0, 0.1)}, prescribed=JOINTS)
+        plain = System.build(robot, springs={"shoulder": StiffnessAndRest(6.0, 0.1)}, prescribed=JOINTS)
         system = plain.with_effects([make_effect(kind, "elbow", plain)])
         step = compile_step(system, H, use_compiler=False)
         t = H * np.arange(N_STEPS + 1)

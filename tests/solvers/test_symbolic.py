@@ -233,7 +233,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     assert problem_with_sensor_noise_only(problem).evaluate(x).cost > 3 * expected
     program = transcribe(problem)
     arguments = program.solver_arguments
-    theta = program.block_indices_rows_and_unit("theta").index.ravel()
+    theta = program.find_vector_block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
     found = solver(**arguments)
@@ -243,7 +243,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     exact = not encoders and feedback["arm_tracking_feedback"] != "lqr"
     assert float(found["f"]) == pytest.approx(expected, rel=1e-4 if exact else 4e-3)
     assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["arm_tracking_feedback"] != "none")
-    assert program.block_indices_rows_and_unit("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
+    assert program.find_vector_block("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
 
 
 def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):

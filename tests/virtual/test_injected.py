@@ -215,7 +215,7 @@ class Bench:
 
 
 def joints_of(segment, *axes):
-    return [link[axis] for link in SYSTEM.segment_layout_by_name(segment).link_joints for axis in axes]
+    return [link[axis] for link in SYSTEM.find_segment_layout(segment).link_joints for axis in axes]
 
 
 def slope(bench, potential, q, step=1e-6):
@@ -251,7 +251,7 @@ def soft_wall(bench):
 
 
 def creased(bench):
-    bent = bench.data.qpos[bench.address(*SYSTEM.segment_layout_by_name("T1").link_joints[1][:2])]
+    bent = bench.data.qpos[bench.address(*SYSTEM.find_segment_layout("T1").link_joints[1][:2])]
     return -0.5 * 12.0 * max(np.linalg.norm(bent) - 0.03, 0.0) ** 2
 
 

@@ -28,12 +28,7 @@ from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_deriva
 from yid_ocp.model.mechanism import Frame, Inertia, Placement
 from yid_ocp.model.system import six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.mjcf import (
-    ExpressionEvaluator,
-    mujoco_model_from_mjcf_text,
-    mujoco_xml,
-    system_joint_dynamics_terms,
-)
+from yid_ocp.virtual.mjcf import CasadiEvaluator, mujoco_model_from_mjcf_text, mujoco_xml, system_joint_dynamics_terms
 
 MECHANICAL = {
     "kelvin_voigt": ("T", {"tau": 0.05}),
@@ -234,7 +229,7 @@ def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
 
 def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
     changed = with_effect(system, "joint_coulomb", "elbow", {"tau_c": 0.4})
-    assert system_joint_dynamics_terms(changed, ExpressionEvaluator(changed))["elbow"].dry_friction == 0.4
+    assert system_joint_dynamics_terms(changed, CasadiEvaluator(changed))["elbow"].dry_friction == 0.4
     model = mujoco_model_from_mjcf_text(mujoco_xml(changed, emulate=True))
     assert model.dof_frictionloss[model.joint("elbow").id] == 0.4
 

@@ -58,10 +58,10 @@ def test_a_gap_is_empty_unless_something_hides_it():
     points = np.concatenate([tube(high=-0.25), tube(low=-0.05)])
     bare = asked(points)
     assert bare.visibly_empty_fraction[0] == pytest.approx(0.6, abs=0.11)
-    assert bare.covered_fraction_of_visible_links(np.array([1.0, 0.0])) <= 0.5
+    assert bare.covered_fraction_of_visible_length(np.array([1.0, 0.0])) <= 0.5
     before = asked(points, wall((-0.2, 0.0), (-0.05, 0.05), 1.2))
     assert before.visibly_empty_fraction[0] == 0.0
-    assert before.covered_fraction_of_visible_links(np.array([1.0, 0.0])) == 1.0
+    assert before.covered_fraction_of_visible_length(np.array([1.0, 0.0])) == 1.0
     assert before.covered_fraction[0] <= 0.5
     assert asked(points, removed=lambda places: places[:, 0] < 0.0).visibly_empty_fraction[0] == 0.0
 

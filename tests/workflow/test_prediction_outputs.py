@@ -10,7 +10,7 @@ import pytest
 from small_problems import pendulum_step
 
 from yid_ocp.analysis import estimation
-from yid_ocp.analysis.estimation import prediction_errors_units_and_fit_errors
+from yid_ocp.analysis.estimation import prediction_errors_units_and_fit_rmse
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
@@ -19,7 +19,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_whitening_at
-from yid_ocp.model.servos_and_springs import JointSpringData
+from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -81,7 +81,7 @@ def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
     problem, fit, held_out = solved_pendulum
     apart = [*held_out, (held_out[0][0], "step 3 did not converge")]
-    entry, failed, _ = prediction_errors_units_and_fit_errors(problem, fit, apart)[0]
+    entry, failed, _ = prediction_errors_units_and_fit_rmse(problem, fit, apart)[0]
     assert entry["recording"] == "held_out"
     samples = held_out[0][0].measurements[0]
     for i, channel in enumerate(samples.sensor.channel_names):
@@ -254,7 +254,7 @@ def copied(system, values, *uncounted, **estimates):
 
 def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, springs={"elbow": JointSpringData(3.0, 0.2)})
+    system = System.build(robot, springs={"elbow": StiffnessAndRest(3.0, 0.2)})
     kinds = [("joint_coulomb", "elbow"), ("rotor_inertia", "elbow"), ("joint_coulomb", "shoulder")]
     system = system.with_effects([make_effect(*own, system) for own in kinds])
     values = {"elbow.stiffness": 4.0, "elbow.damping": 0.3, "shoulder.damping": 0.2}

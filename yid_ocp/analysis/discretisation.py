@@ -86,7 +86,7 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
     """Return the names of the fine joints that replace each divided joint of the coarse model."""
     found = {}
     for segment in coarse.segment_layouts:
-        links = fine.segment_layout_by_name(segment.name).link_joints
+        links = fine.find_segment_layout(segment.name).link_joints
         times = len(links) // len(segment.link_joints)
         for i, joints in enumerate(segment.link_joints if times > 1 else ()):
             for axis, joint in enumerate(joints):

@@ -148,7 +148,7 @@ def _checked_solution_and_issues(
     """Return the solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit."""
     if solution.evaluation is None:
         return solution, problem.options.data_issues
-    errors, units, _ = prediction_errors_units_and_fit_errors(problem, solution, held_out)
+    errors, units, _ = prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     found = clock_and_noise_issues_from_residuals(problem, solution.x, solution.evaluation)
     found += _worse_than_baseline_issues(errors, units)
     if any(issue.severity != "warning" for issue in found):
@@ -270,7 +270,7 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
-def prediction_errors_units_and_fit_errors(
+def prediction_errors_units_and_fit_rmse(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
     """Return the prediction errors of every recording (held-out first), and by channel the units and fit errors."""

@@ -44,7 +44,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 
 @dataclass(frozen=True)
-class PointObservationSchedule:
+class SinglePointObservationSchedule:
     """The sample times and noise standard deviations with which one point of a group is measured."""
 
     point_group: str
@@ -86,7 +86,7 @@ class UnchangedExperiment:
             return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
         return None, times, std
 
-    def existing_point_observation_schedules(self, episode: Episode) -> list[PointObservationSchedule]:
+    def existing_point_observation_schedules(self, episode: Episode) -> list[SinglePointObservationSchedule]:
         """Return the sample times and noise standard deviations of every point that is measured in a recording."""
         found = []
         for group in _used_point_groups(self.problem, episode):
@@ -97,7 +97,7 @@ class UnchangedExperiment:
                 if self.problem.system.mechanism.has_frame(frame):
                     at = group.names.index(point)
                     seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                    found.append(PointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
+                    found.append(SinglePointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def _std(self, group: PointGroup) -> Array:
@@ -160,7 +160,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def step_with_frames_and_measurable_points(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
+def step_and_measurable_points_with_frames(step: Step) -> tuple[Step, list[_MeasurablePoint]]:
     """Return the step with a frame at each measurable point, and these points. The equations do not change."""
     mechanism, seen = step.system.mechanism, measurable_points(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
@@ -186,7 +186,7 @@ class VariantPositionSensitivities:
     feasibility_notes: tuple[str, ...] = ()  # obstacles on a real robot, such as joint limits
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
-    def fisher_information_with_prior(self, views: Sequence[Sequence[PointObservationSchedule]]) -> Array:
+    def fisher_information_with_prior(self, views: Sequence[Sequence[SinglePointObservationSchedule]]) -> Array:
         """Return the Fisher information (nx, nx) of observations (`views`, one list per recording) and prior."""
         total = self.prior_information.copy()
         nx = len(total)
@@ -200,7 +200,7 @@ class VariantPositionSensitivities:
                 total -= own[:nx, nx:] @ scipy.linalg.solve(own[nx:, nx:], own[nx:, :nx], assume_a="pos")
         return total
 
-    def _of(self, episode: int, grid: TimeGrid, view: PointObservationSchedule) -> Array:
+    def _of(self, episode: int, grid: TimeGrid, view: SinglePointObservationSchedule) -> Array:
         key = (episode, view.point_group, view.frame, view.times.tobytes(), view.std.tobytes())
         if key not in self._known:
             inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)
@@ -259,7 +259,7 @@ class ExperimentVariantSensitivityBuilder:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         other = setup_changes - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
-        step, seen = step_with_frames_and_measurable_points(step)
+        step, seen = step_and_measurable_points_with_frames(step)
         wide = with_free_starts_and_grasps(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         plain = replace(wide.options, huber_threshold=math.inf, weak_prior_geometric_std=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(setup_changes), duration=None)

@@ -56,7 +56,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
     return {kind: tuple(own) for kind, own in found.items()}
 
 
-def cross_validate_over_motion_kinds(
+def cross_validate_law_by_motion_kind(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> CrossValidatedFrictionLawFit:
     """Fit a friction law without each of the `kinds` of motion in turn, and compute its errors on the omitted kind."""

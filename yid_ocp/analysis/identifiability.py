@@ -46,7 +46,7 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # change of the data by a combination over that
 
 
 @dataclass(frozen=True)
-class ParameterStdsAndVerdict:
+class StdsAndVerdictOfParameter:
     """The value, standard deviations and identifiability verdict of one parameter.
 
     The verdict follows the rules of `inference.uncertainty.parameter_verdict`, as in a solution. `interval` is the 95 %
@@ -85,7 +85,7 @@ class IdentifiabilityResult(ReprMixin):
     correlations (p, p) and the Fisher information of relative changes (p, p) are dimensionless.
     """
 
-    parameters: Mapping[str, ParameterStdsAndVerdict]
+    parameters: Mapping[str, StdsAndVerdictOfParameter]
     parameter_names: tuple[str, ...]  # in the order of the matrices
     correlations: Array  # shape (p, p), NaN in rows of parameters without information
     fisher_information: Array  # for relative changes, nuisances eliminated, shape (p, p)
@@ -176,7 +176,7 @@ def identifiability(
     for name, value, scale, alone in zip(names, x[view.chosen], view.scale, view.alone, strict=True):
         entry, relative = judged[name], 1.0 / float(alone) if alone > 0 else math.inf
         sizes = entry.std, entry.std / float(scale), relative
-        parameters[name] = ParameterStdsAndVerdict(float(value), entry.unit, *sizes, entry.verdict, entry.interval)
+        parameters[name] = StdsAndVerdictOfParameter(float(value), entry.unit, *sizes, entry.verdict, entry.interval)
     return IdentifiabilityResult(parameters, names, correlations, information, directions, nuisances, chi2, profiles)
 
 

@@ -259,7 +259,7 @@ def points_too_distant_issues(
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
-def object_point_correction_issues(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
+def correctable_object_point_issues(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
     """Yield issues about points that a simple correction moves to the rollout `result` of an object of `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names

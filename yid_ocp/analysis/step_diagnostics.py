@@ -50,7 +50,7 @@ _RESPONSE_STEPS = 100
 
 
 @dataclass(frozen=True)
-class ParameterEquationsAndSensors:
+class EquationsAndSensorsOfParameter:
     """The step equations that contain one parameter, and the response of the sensors to this parameter."""
 
     parameter: str
@@ -71,7 +71,7 @@ def equations_and_sensors_per_parameter(
     state: Array,
     theta: Array,
     stages: StepResidualsAndJacobians,
-) -> tuple[ParameterEquationsAndSensors, ...]:
+) -> tuple[EquationsAndSensorsOfParameter, ...]:
     """Find for each parameter the step equations that contain it, and the sensors that respond to it.
 
     The equilibrium `state` is disturbed by adding one unit to one equation of one step. The later states follow the
@@ -86,7 +86,7 @@ def equations_and_sensors_per_parameter(
             entered[column - at.start].append(row)
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
     if episode is None:
-        return tuple(ParameterEquationsAndSensors(*entry, None, "", (), None, 0.0) for entry in known)
+        return tuple(EquationsAndSensorsOfParameter(*entry, None, "", (), None, 0.0) for entry in known)
     gain = np.zeros((step.sizes["nu"], step.sizes["nx"]))
     if episode.tracking_feedback is not None:
         gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
@@ -102,7 +102,7 @@ def equations_and_sensors_per_parameter(
         best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
         seen, read = tuple(names[r] for r in answered), tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
         moved = float(np.max(by_theta[:, i], initial=0.0))
-        found.append(ParameterEquationsAndSensors(*entry, seen, best, read, moved, span))
+        found.append(EquationsAndSensorsOfParameter(*entry, seen, best, read, moved, span))
     return tuple(found)
 
 

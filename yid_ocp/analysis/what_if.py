@@ -15,7 +15,7 @@ from yid_ocp.analysis.experiment_design import (
     CAMERA_GROUP,
     SETUP_CHANGE_DESCRIPTIONS,
     ExperimentVariantSensitivityBuilder,
-    PointObservationSchedule,
+    SinglePointObservationSchedule,
     UnchangedExperiment,
     VariantPositionSensitivities,
     measurable_points,
@@ -241,7 +241,7 @@ class _Outcomes:
 
     def _views(
         self, episode: Episode, changes: Sequence[ExperimentChange], layout: VariantPositionSensitivities
-    ) -> list[PointObservationSchedule]:
+    ) -> list[SinglePointObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_points_times_and_median_std(episode)
         arm, arm_times, arm_std = setting.arm_points_times_and_median_std(episode)
@@ -250,8 +250,8 @@ class _Outcomes:
         if rate is not None:
             times = uniform_sample_times(episode.grid, rate)
 
-        def look(frame: str) -> PointObservationSchedule:
-            return PointObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
+        def look(frame: str) -> SinglePointObservationSchedule:
+            return SinglePointObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
 
         # a point that the second arm holds is measured by that arm
         held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
@@ -263,7 +263,7 @@ class _Outcomes:
         views += [look(change.camera_frame) for change in changes if change.camera_frame]
         feels = [*sorted(held - before), *(change.arm_frame for change in changes if change.arm_frame)]
         felt = np.full((len(arm_times), 3), arm_std)
-        return views + [PointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
+        return views + [SinglePointObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
 
 
 def _relative_stds_and_gain(layout: VariantPositionSensitivities, information: Array) -> tuple[dict[str, float], float]:

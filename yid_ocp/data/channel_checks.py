@@ -269,8 +269,8 @@ LIMIT_VIOLATION_RATIO_CAP = 1e3
 """Largest value of `Issue.limit_violation_ratio`; larger ratios are clipped."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
-LATE_POINTS_WORDS = "the points match the angles best "  # of a note of merged files; the lag [s] follows
 """Smallest number of differences between samples from which a channel's noise is estimated."""
+LATE_POINTS_WORDS = "the points match the angles best "  # of a note of merged files; the lag [s] follows
 
 
 @dataclass(frozen=True)

@@ -145,14 +145,14 @@ class EarlierRunsBaseline:
         found = self.parameter_shifts_of_fit(fit, limits)
         return found is not None and bool(found.significant_parameter_shifts)
 
-    def parameters_that_left_priors(self, fit: RefittedModel, limits: Thresholds) -> list[str]:
+    def parameters_shifted_since_baseline(self, fit: RefittedModel, limits: Thresholds) -> list[str]:
         """List the significantly changed parameters of `fit` that earlier runs still hold, most changed first."""
         found, held = self.parameter_shifts_of_fit(fit, limits), fit.problem.options.multivariate_prior.parameter_names
         return [entry.name for entry in found.significant_parameter_shifts if entry.name in held] if found else []
 
     def predict_counterfactual_errors(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> CounterfactualPredictionErrors | None:
+    ) -> ErrorsWithEffectsRemovedOrAdded | None:
         """Predict recordings made without the effects of `last`, and those with them, with and without these effects.
 
         Reference recordings are predicted by `last` without its effects, and the diagnosed recordings by the parameters
@@ -173,8 +173,8 @@ class EarlierRunsBaseline:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return CounterfactualPredictionErrors(removed, _nothing(present, error.what))
-        return CounterfactualPredictionErrors(removed, _predicted(last, present, then, {**then, **effects}))
+            return ErrorsWithEffectsRemovedOrAdded(removed, _nothing(present, error.what))
+        return ErrorsWithEffectsRemovedOrAdded(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def problem_with_priors_and_baseline(
@@ -237,7 +237,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class CounterfactualPredictionErrors:
+class ErrorsWithEffectsRemovedOrAdded:
     """The prediction errors on reference recordings without the effects, and on diagnosed recordings with them."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model

@@ -482,7 +482,7 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
     for segment in nominal.segment_layouts:
-        factor = len(finer.segment_layout_by_name(segment.name).link_joints) / len(segment.link_joints)
+        factor = len(finer.find_segment_layout(segment.name).link_joints) / len(segment.link_joints)
         for what in ("bend", "twist"):
             name = f"{segment.name}.{what}"
             if name in truth and start[name] > 0:
@@ -495,7 +495,7 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
     return values
 
 
-def diagnose_blind_case(
+def diagnose_unlabelled_case(
     ensemble: BlindCaseGenerator,
     case: UnlabelledCase,
     candidates: CandidateNamesOrAll = "all",

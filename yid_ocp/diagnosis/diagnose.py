@@ -102,7 +102,7 @@ def diagnose(
         composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
-        search.record_stage_end("compose")
+        search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
         nominal = fit_nominal_model(problem, composed, known_fits.solution, known_fits.store, thresholds)
         return _diagnosed(problem, _examined(search, nominal), earlier)
@@ -133,11 +133,11 @@ def _examined(
     """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
     limits = search.thresholds
     search, nominal, cuts = _followed(search, nominal, known)
-    search.record_stage_end("nominal")
+    search.record_stage_end_time("nominal")
     search.progress.begin_stage("looking for events", 4.0, 11.5)
     with_events = search
     search, nominal, events, smoothed = _without_events(search, nominal)
-    search.record_stage_end("events")
+    search.record_stage_end_time("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
     effects = search.problem.candidates_with_prior_ranges_from_states(states)
     predicted = nominal.problem.predict_held_out(nominal.unknowns, True)
@@ -161,7 +161,7 @@ def _examined(
         if not own.step.time_step > _MAX_STEP_OF_LAST_HALVING:
             raise
         return _at_half_time_step(seen, "the model with all candidates fails", 0.0)
-    search.record_stage_end("screening")
+    search.record_stage_end_time("screening")
     evidence = replace(evidence, screening=screened)
     seen, gap = replace(seen, evidence=evidence), screened.largest_predicted_chi2_decrease
     return (evidence.warrants_effect_search(limits) and _at_finer_discretisation(seen, nominal, gap)) or seen
@@ -233,14 +233,14 @@ def _with_changed_parameters(seen: _Examined, judged: Judgement, earlier: Earlie
     """
     search, fit, released = seen.search, seen.nominal, list[str]()
     with contextlib.suppress(SolverError):
-        while left := earlier.parameters_that_left_priors(fit, search.thresholds):
+        while left := earlier.parameters_shifted_since_baseline(fit, search.thresholds):
             search.progress.begin_stage(f"trying a change of {' and '.join([*released, left[0]])}", 1.0, 8.5)
             free = _without_priors_of(search.problem, [*released, left[0]])
             fit = _fitted_nominal_model(search.restarted_with(free), fit.values)
             released.append(left[0])
     best = [seen.nominal, *(entry.refitted_model for entry in judged.selected_effects)][-1]
     limits, most = search.thresholds, 1.0 if judged.verdict == "unknown" else -1.0
-    if not released or select.relative_bic_difference(fit, best, len(released), limits) > most:
+    if not released or select.bic_difference_per_threshold(fit, best, len(released), limits) > most:
         return None
     anew = _examined_with(seen, _without_priors_of(seen.with_events.problem, released))
     return None if anew.evidence.residual_exceeds_noise(limits) else anew
@@ -381,7 +381,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         known = nominal.problem, nominal.unknowns, nominal.evaluation
         smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
-    search.record_stage_end("localisation")
+    search.record_stage_end_time("localisation")
     remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
     if accepted := judged.accepted_selected_effects:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
@@ -398,11 +398,11 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
         events = _happened(seen.with_events.problem.problem_fitting_all_samples, final, limits)[0]
-    search.record_stage_end("remaining")
+    search.record_stage_end_time("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
     law = find_gap_law(search, problem, final, places, seen.events)
-    search.record_stage_end("law")
+    search.record_stage_end_time("law")
     ends = search.stage_ends
     finding = DiagnosisResult(
         **(vars(evidence) | vars(judged)),

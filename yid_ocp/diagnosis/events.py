@@ -18,7 +18,7 @@ import scipy.special
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.diagnosis.hypotheses import mask_sensor_measurements
+from yid_ocp.diagnosis.hypotheses import hide_marked_measurements
 from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
     CompiledInverseDynamics,
@@ -481,4 +481,4 @@ def _counting(
             # a wrong angle changes the required torques of all joints
             if event.channel == name or (is_effort and event.kind == "sample"):
                 hidden[:, column] |= inside[:, column]
-    return mask_sensor_measurements(samples, hidden) if np.any(hidden & samples.positive_weight_mask) else samples
+    return hide_marked_measurements(samples, hidden) if np.any(hidden & samples.positive_weight_mask) else samples

@@ -14,7 +14,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import KEPT_HELD_OUT_FRACTIONS, AllCandidatesProblem
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
-from yid_ocp.diagnosis.select import HeldOutGapClosure, held_out_chi2_decrease_and_std_error, held_out_gap_closure
+from yid_ocp.diagnosis.select import HeldOutGapClosure, chi2_per_sample_decrease_and_std_error, held_out_gap_closure
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.law import (
     TORQUE_LAW_QUANTITY_UNITS,
@@ -118,7 +118,7 @@ def find_gap_law(
     the nominal one. `places` are the locations of the gap, the most likely first.
     """
     places = [p for p in dict.fromkeys(places) if allowed_torque_law_quantity_names(problem.system, p)][:_MAX_PLACES]
-    if not places or search.record_skip_if_past_deadline("a law"):
+    if not places or search.is_skipped_past_deadline("a law"):
         return None
     if (h := last.problem.step.time_step) != problem.step.time_step:
         problem = problem.with_time_step(h)
@@ -150,7 +150,7 @@ def find_gap_law(
             best = better[0]
     closure = held_out_gap_closure(before.held_out_loss, best.loss)
     least = _MIN_LEFTOVER_CLOSURE if last.effects else _MIN_CLOSURE
-    gained, error = held_out_chi2_decrease_and_std_error(before.held_out_loss, best.loss)
+    gained, error = chi2_per_sample_decrease_and_std_error(before.held_out_loss, best.loss)
     if not (gained > error and closure.ci_low > least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
@@ -202,7 +202,7 @@ def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw],
     """Return whether a refit predicts about as well as the best (the first), with the fewest quantities of such."""
 
     def is_as_good(own: _RefittedLaw) -> bool:
-        gained, error = held_out_chi2_decrease_and_std_error(own.loss, found[0].loss)
+        gained, error = chi2_per_sample_decrease_and_std_error(own.loss, found[0].loss)
         return gained <= max(2 * error, slack)
 
     fewest = min(len(own.law.quantities) for own in found if is_as_good(own))

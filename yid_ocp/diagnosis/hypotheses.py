@@ -13,7 +13,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import Progress
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
-from yid_ocp.effects.friction import effect_with_min_smoothing_speed_at_joint
+from yid_ocp.effects.friction import lower_smoothing_speed_to_joint_min
 from yid_ocp.errors import ConfigError, DataError, SolverError, nearest_name_question
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
@@ -26,7 +26,7 @@ from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, episode_with_encoder_effort_noise, truncate_episode
+from yid_ocp.problem.episodes import Episode, truncate_episode, with_encoder_noise_in_effort_std
 from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions
@@ -77,7 +77,7 @@ def make_candidate_effects(
 
 
 def _make_candidate(kind: str, place: str, system: System) -> EffectBase:
-    return effect_with_min_smoothing_speed_at_joint(make_effect(kind, place, system), system)
+    return lower_smoothing_speed_to_joint_min(make_effect(kind, place, system), system)
 
 
 def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
@@ -238,7 +238,7 @@ class AllCandidatesProblem:
         """
         own, now = self.problem_with_nominal_and_effects_free(effects), self.problem
         theta, _ = own.unpack_episode_unknowns(own.pack_unknowns(values), 0)
-        told = partial(episode_with_encoder_effort_noise, now.step, options=now.options, theta=theta)
+        told = partial(with_encoder_noise_in_effort_std, now.step, options=now.options, theta=theta)
         made = now.with_episodes([*map(told, now.episodes)], [*map(told, now.held_out)])
         pairs = zip(now.episodes, made.episodes, strict=True)
         samples = (own for before, after in pairs for own in zip(before.measurements, after.measurements, strict=True))
@@ -291,7 +291,7 @@ class AllCandidatesProblem:
         own = self.problem_with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
-    def problem_with_relinearized_held_out_filters(
+    def relinearize_held_out_filters_of_problem(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Return `own` (a problem with free `effects`) with filters of held-out recordings linearised at `at`."""
@@ -408,10 +408,10 @@ def _masked(episode: Episode, parity: int) -> Episode:
     samples, block = [], min(_BLOCK_DURATION / episode.grid.time_step, episode.grid.steps / 3)
     for entry in episode.measurements:
         is_hidden = np.floor((entry.node + entry.fraction) / block).astype(int) % 2 != parity
-        samples.append(mask_sensor_measurements(entry, is_hidden[:, None]))
+        samples.append(hide_marked_measurements(entry, is_hidden[:, None]))
     return replace(episode, measurements=tuple(samples))
 
 
-def mask_sensor_measurements(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
+def hide_marked_measurements(samples: SensorMeasurements, hidden: BoolArray) -> SensorMeasurements:
     """Return the measurements without the samples that the mask `hidden`, (M, k) or (M, 1), marks."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

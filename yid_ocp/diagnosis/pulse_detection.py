@@ -27,7 +27,7 @@ import scipy.sparse
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.integrator.step import Step, driven_joint_torques_of_rollout
+from yid_ocp.integrator.step import Step, actuated_joint_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.system import MidpointStateSymbols, System
@@ -67,7 +67,7 @@ class CompiledInverseDynamics:
         function = self._function.map(len(nodes))
         squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
         applied = np.zeros((len(nodes), n))
-        torque = driven_joint_torques_of_rollout(self._step, theta, rollout)
+        torque = actuated_joint_torques_of_rollout(self._step, theta, rollout)
         driven, prescribed = system.actuated_coordinate_indices, system.prescribed_coordinate_indices
         for indices, effort in ((driven, torque), (prescribed, rollout.effort)):
             if indices:
@@ -158,7 +158,7 @@ class ForceEstimate:
         return np.hypot(self.model_error_std, self.friction_limit)
 
     @property
-    def max_likelihood_force(self) -> Array:
+    def most_likely_force_signal(self) -> Array:
         """The maximum-likelihood force (M,) at every time point, in `unit`."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
         return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
@@ -370,7 +370,7 @@ def _both_shapes(begin: Array, end: Array) -> _Windows:
 
 
 def _rests(history: ForceEstimate) -> list[_Rest]:
-    values = history.max_likelihood_force
+    values = history.most_likely_force_signal
     least = 1e-9 + float(np.median(history.model_error_std))
     spread = max(1.4826 * float(np.median(np.abs(values - np.median(values)))), least)
     slowest = max(float(np.sqrt(np.mean(values**2))), spread)
@@ -422,7 +422,7 @@ def _stands_out(
     if not 1.02 * _MIN_PULSE_POINTS * history.time_spacing < length < 0.98 * longest:
         return False
     size = abs(float(rest.sizes(own)[0]))
-    near = history.max_likelihood_force[(t > begin - length) & (t < end + length)]
+    near = history.most_likely_force_signal[(t > begin - length) & (t < end + length)]
     if size * float(np.abs(own).max()) > _MAX_PULSE_RANGE_RATIO * float(np.ptp(near)):
         return False
     begins = np.arange(float(t[0]), float(t[-1]) - length, history.time_spacing)

@@ -184,11 +184,11 @@ class RefitContext:
         """Return a context for another problem, without the results that are stored or recorded for the one before."""
         return replace(self, problem=problem, store=store, record=EffectSearchRecord(), rounds=[])
 
-    def record_stage_end(self, name: str) -> None:
+    def record_stage_end_time(self, name: str) -> None:
         """Record that a stage ends now."""
         self.stage_ends[name] = time.perf_counter()
 
-    def record_skip_if_past_deadline(self, *what: str) -> bool:
+    def is_skipped_past_deadline(self, *what: str) -> bool:
         """Check whether the deadline for refits has passed. If so, `what` is recorded as skipped."""
         is_late = time.perf_counter() >= self.deadline
         if is_late:
@@ -295,7 +295,7 @@ def refit_with_effects(
     if not finish.ok:
         return None
     values = own.unknowns.named_values(outcome.x)
-    own = problem.problem_with_relinearized_held_out_filters(own, effects, values)
+    own = problem.relinearize_held_out_filters_of_problem(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
     ranges = ((name, *ends) for effect in effects for name, ends in effect.prior_ranges.items())
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
@@ -312,7 +312,7 @@ def _evaluated(
     """The problem with effects at known values, and its evaluation there."""
     own = problem.problem_with_effects_and_relinearized_filters(effects, values)
     finish = own.evaluate(own.pack_unknowns(values))
-    return problem.problem_with_relinearized_held_out_filters(own, effects, values), finish
+    return problem.relinearize_held_out_filters_of_problem(own, effects, values), finish
 
 
 def reevaluate_refit_with_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
@@ -432,7 +432,7 @@ def refit_with_each_effect(
     # a batch is cheaper than single refits, which a deadline needs
     size = len(tried) if search.deadline == math.inf else 1
     for i in range(0, len(tried), size):
-        if search.record_skip_if_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
+        if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break
         fits += map_with_merged_calls(one, tried[i : i + size])
     return [fit for fit in filter(None, fits) if math.isfinite(fit.held_out_loss.total_chi2)]

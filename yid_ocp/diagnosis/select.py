@@ -85,7 +85,7 @@ def _leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
     return fit.held_out_loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
 
 
-def held_out_chi2_decrease_and_std_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
+def chi2_per_sample_decrease_and_std_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
     """Compute the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
     total = float(before.block_sample_counts.sum())
     difference = before.block_chi2 - after.block_chi2
@@ -107,7 +107,7 @@ def bic_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
 
 
-def relative_bic_difference(fit: RefitStatistics, other: RefitStatistics, more: int, limits: Thresholds) -> float:
+def bic_difference_per_threshold(fit: RefitStatistics, other: RefitStatistics, more: int, limits: Thresholds) -> float:
     """Compute the BIC of `fit`, which has `more` parameters beside its effects', minus that of `other`; ±1 decides."""
     difference = bic_difference(fit, other) + more * math.log(max(fit.residual_count, 1))
     return difference / (2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor)
@@ -154,7 +154,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     The larger of both counts, because a few large blocks dominate the error of the sum.
     """
     loss, best = fit.held_out_loss, other.held_out_loss
-    lost, error = held_out_chi2_decrease_and_std_error(loss, best)
+    lost, error = chi2_per_sample_decrease_and_std_error(loss, best)
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
     spread = float(np.std(ratios, ddof=1)) / math.sqrt(len(ratios))
     return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
@@ -163,7 +163,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better."""
     before, after = without.held_out_loss, fit.held_out_loss
-    gained, error = held_out_chi2_decrease_and_std_error(before, after)
+    gained, error = chi2_per_sample_decrease_and_std_error(before, after)
     is_clear = gained > error
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
@@ -236,7 +236,7 @@ def select_effects(
         rest = f"the residual gap next to {beside}"
         search.progress.begin_stage(f"explained by {beside}: {closed.text}".rstrip(": "))
         is_full = len(base) >= limits.max_effects
-        if is_full or _leaves_noise(better, limits) or search.record_skip_if_past_deadline(rest):
+        if is_full or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
             break
         search.progress.begin_stage(f"scoring {rest}", 3.0, 13.0)
         seen = search.screen(base, better.values, f"beside {beside}")
@@ -261,7 +261,7 @@ def select_effects(
 def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
     """Candidates refitted from the earlier run's parameters; the nominal fit supplies missing parameters."""
     where = "from the earlier run's parameters"
-    if search.record_skip_if_past_deadline(f"candidates {where}"):
+    if search.is_skipped_past_deadline(f"candidates {where}"):
         return []
     screened = search.screen((), {}, where)
     return refit_with_each_effect(search, (), _refit_shortlist(screened, search.thresholds), {}, where)
@@ -288,7 +288,7 @@ def _reconsidered(search: RefitContext, nominal: RefitStatistics, chosen: _Choic
     while len(chosen.fit.effects) > 1:
         labels = frozenset(effect.label for effect in chosen.fit.effects)
         own = next((effect for effect in chosen.fit.effects if labels - {effect.label} not in tried), None)
-        if own is None or search.record_skip_if_past_deadline("each effect without the others' company"):
+        if own is None or search.is_skipped_past_deadline("each effect without the others' company"):
             break
         tried.add(labels - {own.label})
         chosen = _revised(search, nominal, chosen, own)
@@ -357,7 +357,7 @@ def _equivalents_and_shares(
     return tuple(effects[i] for i in kept), tuple(shares[kept].tolist())
 
 
-def selected_effect_alone(
+def effect_with_its_equivalents(
     entry: SelectedEffect, nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> SelectedEffect:
     """Return `entry` as the only selected effect, with its equivalent effects among the `fits` of single effects."""
@@ -366,7 +366,7 @@ def selected_effect_alone(
     return replace(entry, equivalent_effects=effects, shares=shares)
 
 
-def refit_with_model_error_in_stds(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:
+def widen_refit_stds_by_model_error(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:
     """Return the refit of `entry`, with stds of at least the rms change of a value by one effect more.
 
     This holds if the refit leaves a gap, in which any further effect may have a part.

@@ -44,7 +44,7 @@ class EffectAmplitudeTransferCheck:
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
-    def std_of_disagreement_or_zero(self) -> float:
+    def significant_disagreement_as_std(self) -> float:
         """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
         apart = abs(self.estimation_value - self.held_out_value)
         spread = math.hypot(self.estimation_std, self.held_out_std)
@@ -178,7 +178,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     fits, added = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...]()
     if evidence.warrants_effect_search(limits):
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
-    search.record_stage_end("refits")
+    search.record_stage_end_time("refits")
 
     def judged(chosen: tuple[SelectedEffect, ...]) -> Judgement:
         carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
@@ -186,8 +186,8 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             last = chosen[-1].refitted_model
             explained = _explained_fraction(nominal, last, limits)
             carried = _check_effect_amplitude_transfer(search, last)
-            last = select.refit_with_model_error_in_stds(chosen[-1], limits)
-            least = {f"{e.effect_label}.{e.parameter}": e.std_of_disagreement_or_zero for e in carried}
+            last = select.widen_refit_stds_by_model_error(chosen[-1], limits)
+            least = {f"{e.effect_label}.{e.parameter}": e.significant_disagreement_as_std for e in carried}
             last = replace(last, std={name: max(std, least.get(name, 0.0)) for name, std in last.std.items()})
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
         said = Judgement("", "", fits, chosen, explained, carried, 0.0)
@@ -197,9 +197,9 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     said = judged(added)
     if said.verdict == "unknown" and len(added) > 1:
         # a further effect that only corrects errors of the first is no reason to doubt this one
-        alone = judged((select.selected_effect_alone(added[0], nominal, fits, limits),))
+        alone = judged((select.effect_with_its_equivalents(added[0], nominal, fits, limits),))
         said = alone if alone.verdict != "unknown" else said
-    search.record_stage_end("transfer")
+    search.record_stage_end_time("transfer")
     return said
 
 
@@ -250,7 +250,7 @@ def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
         entry = EffectAmplitudeTransferCheck(*what, *own, True)
-        least = _DISAGREEMENT_Z * entry.std_of_disagreement_or_zero
+        least = _DISAGREEMENT_Z * entry.significant_disagreement_as_std
         away.append(abs(entry.estimation_value - effect.neutral_values[name]) > least)
         found.append(entry)
     return [replace(entry, is_consistent=any(away)) for entry in found]

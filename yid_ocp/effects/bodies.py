@@ -67,7 +67,7 @@ class _Density(_ScaledBodies):
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on mass and inertia"),)
 
     def _joints(self, system: System) -> tuple[str, ...]:
-        return tuple(joint for link in system.segment_layout_by_name(self.location).link_joints for joint in link)
+        return tuple(joint for link in system.find_segment_layout(self.location).link_joints for joint in link)
 
 
 def _joints_with_mass(system: System) -> tuple[str, ...]:
@@ -294,7 +294,7 @@ class _AerodynamicDrag(EffectBase):
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         system, kinematics = state.system, state.kinematics
-        tree, segment = system.mechanism, system.segment_layout_by_name(self.location)
+        tree, segment = system.mechanism, system.find_segment_layout(self.location)
         velocity = _velocities(kinematics, state.v)
         wrenches, slopes = {}, {}
         for link, length in zip(segment.link_joints, segment.link_lengths, strict=True):

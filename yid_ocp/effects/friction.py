@@ -68,7 +68,7 @@ def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Eff
     return replace(effect, sign_smoothing_speed=speed)
 
 
-def effect_with_min_smoothing_speed_at_joint(effect: EffectBase, system: System) -> EffectBase:
+def lower_smoothing_speed_to_joint_min(effect: EffectBase, system: System) -> EffectBase:
     """Return a joint friction with the lowest smoothing speed of all at its joint. Other effects are unchanged."""
     if not isinstance(effect, _JointFriction):
         return effect

@@ -94,7 +94,7 @@ class _SurfaceOffset(_CameraEffect):
         if segment is None:
             return point
         ray = camera.translation - point
-        return point + self["fraction"] * state.system.segment_layout_by_name(segment).radius * ray / ca.norm_2(ray)
+        return point + self["fraction"] * state.system.find_segment_layout(segment).radius * ray / ca.norm_2(ray)
 
 
 @EFFECTS.register("camera_latency")

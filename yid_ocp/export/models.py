@@ -48,7 +48,7 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
-    gravity = mjcf.ExpressionEvaluator(system, values)(system.gravity)
+    gravity = mjcf.CasadiEvaluator(system, values)(system.gravity)
     SubElement(world, "gravity").text = mjcf.format_xml_numbers(gravity)
     model = SubElement(world, "model", name="model")
     for i, joint in enumerate(tree.joints):
@@ -69,7 +69,7 @@ def _xml_text(root: Element) -> str:
 def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, mjcf.JointDynamicsTerms]]:
     """Return the mechanism with numbers and without separate weights of bodies, and the dynamics of its joints."""
     tree = system.mechanism_with_values(values).with_gravity_fraction(None)
-    return tree, mjcf.system_joint_dynamics_terms(system, mjcf.ExpressionEvaluator(system, values))
+    return tree, mjcf.system_joint_dynamics_terms(system, mjcf.CasadiEvaluator(system, values))
 
 
 def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
@@ -150,7 +150,7 @@ _UNUSED = FeatureExportSupport("native", "it has no influence on this model")
 
 def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:
     """Return by label `kind@location` how well the format `form` (`mjcf`, `urdf` or `sdf`) supports each effect."""
-    value, found = mjcf.ExpressionEvaluator(system, values), dict[str, FeatureExportSupport]()
+    value, found = mjcf.CasadiEvaluator(system, values), dict[str, FeatureExportSupport]()
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
         if value.is_effect_neutral(effect):

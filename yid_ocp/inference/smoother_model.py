@@ -31,7 +31,7 @@ from yid_ocp.inference.linearized_residual import (
 )
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import (
-    driven_joint_torques_of_rollout,
+    actuated_joint_torques_of_rollout,
     reachable_and_observable_state_mask,
     rollout_step_derivatives,
 )
@@ -164,7 +164,7 @@ def _loads(course: _LinearizedEpisode) -> Array:
         values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.nominal.theta)).ravel()
         for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-    torque = driven_joint_torques_of_rollout(course.problem.step, course.nominal.theta, rollout)
+    torque = actuated_joint_torques_of_rollout(course.problem.step, course.nominal.theta, rollout)
     for indices, force in (
         (system.actuated_coordinate_indices, torque),
         (system.prescribed_coordinate_indices, rollout.effort),

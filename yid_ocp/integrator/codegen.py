@@ -53,8 +53,8 @@ def build_casadi_step_functions(equations: DiscreteEquations) -> StepFunctions:
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
-    if e.closed_form_force_impulses is not None:
-        bodies = [part + push for part, push in zip(bodies, e.closed_form_force_impulses, strict=True)]
+    if e.force_with_derivatives_impulses is not None:
+        bodies = [part + push for part, push in zip(bodies, e.force_with_derivatives_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)
@@ -168,7 +168,7 @@ def step_elimination_tables(functions: StepFunctions) -> StepSparsityTables:
     nt, nqz = n + nz + m, n + nz
 
     def at(key: str) -> tuple[IntArray, IntArray]:
-        return nonzero_rows_and_columns(functions.sparsity_patterns[key])
+        return rows_and_columns_of_nonzeros(functions.sparsity_patterns[key])
 
     related = np.zeros((n, n), bool)
     ancestors = tuple(np.array(system.mechanism.ancestor_joint_indices(j), np.int32) for j in range(n))
@@ -277,7 +277,7 @@ def _kernel_tables(functions: StepFunctions, tables: StepSparsityTables) -> list
     ragged("p1_old", "col", tables.p1_old_columns)
     ragged("p1_new", "col", tables.p1_new_columns)
     for key, pattern in functions.sparsity_patterns.items():
-        row, column = nonzero_rows_and_columns(pattern)
+        row, column = rows_and_columns_of_nonzeros(pattern)
         table(f"{key}_row", row)
         table(f"{key}_col", column)
     return lines
@@ -300,7 +300,7 @@ def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
     return generator.dump()
 
 
-def nonzero_rows_and_columns(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
+def rows_and_columns_of_nonzeros(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
     """Return the row and column indices (nnz,) of the structural nonzeros in a sparsity pattern."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)

@@ -27,7 +27,7 @@ import platformdirs
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
-from yid_ocp.integrator.codegen import casadi_c_source, nonzero_rows_and_columns
+from yid_ocp.integrator.codegen import casadi_c_source, rows_and_columns_of_nonzeros
 from yid_ocp.integrator.interpreted import function_bound_to_arrays
 from yid_ocp.integrator.step_model import NewtonStatusCode, out_of_memory_error
 from yid_ocp.parallel import CasadiLockedCache
@@ -315,7 +315,7 @@ int yid_map(int count, const double **in, double **out) {{
                 dense.append(value.reshape(count, sparsity.size2(), sparsity.size1()).transpose(0, 2, 1))
                 continue
             full = np.zeros((count, *sparsity.shape))
-            row, column = nonzero_rows_and_columns(sparsity)
+            row, column = rows_and_columns_of_nonzeros(sparsity)
             full[:, row, column] = value
             dense.append(full)
         return dense

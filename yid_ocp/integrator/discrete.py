@@ -121,7 +121,7 @@ class DiscreteEquations:
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
-    def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
+    def force_with_derivatives_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """The impulses of `force_with_derivatives` in `momentum_balance` and `p1`, each (n, 1) [N m s], or None."""
         if self.force_with_derivatives is None:
             return None
@@ -396,7 +396,7 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
 
 
 @dataclass(frozen=True, eq=False)
-class NlpStepConstraints:
+class OneStepNlpEqualities:
     """The symbolic equality constraints of one step in a nonlinear program (NLP), with their Jacobians.
 
     `residual_jacobians` and `effort_jacobians` are the sparse derivatives of `residual` (nr, 1) and `prescribed_effort`
@@ -422,7 +422,7 @@ class NlpStepConstraints:
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)
 
 
-def one_step_nlp_constraints(equations: DiscreteEquations, time_step: float) -> NlpStepConstraints:
+def one_step_nlp_constraints(equations: DiscreteEquations, time_step: float) -> OneStepNlpEqualities:
     """Build the equality constraints of one time step [s] for a nonlinear program, with their Jacobians.
 
     The state is x = (q, p, z), and p1 is the momentum after the step. The constraint rows are scaled to order one:
@@ -456,7 +456,7 @@ def one_step_nlp_constraints(equations: DiscreteEquations, time_step: float) -> 
     rows, effort, *values = ca.cse([ca.sparsify(expression) for expression in made])
     by = [dict(zip(groups, part, strict=True)) for part in (values[: len(groups)], values[len(groups) :])]
     dense = ca.densify(rows), ca.densify(effort)
-    return NlpStepConstraints(e, h, x0, x1, e.lam, e.u, e.theta, dense[0], tuple(names), by[0], dense[1], by[1])
+    return OneStepNlpEqualities(e, h, x0, x1, e.lam, e.u, e.theta, dense[0], tuple(names), by[0], dense[1], by[1])
 
 
 def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
@@ -473,7 +473,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
         1: {"q0": bent, "q1": bent - pulls.midpoint_share * pulls.after_force_by_q},
     }
-    impulses = e.closed_form_force_impulses or (ca.SX(n, 1), ca.SX(n, 1))
+    impulses = e.force_with_derivatives_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
     apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
     for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):

@@ -13,7 +13,7 @@ import scipy.linalg.lapack
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.integrator.codegen import nonzero_rows_and_columns
+from yid_ocp.integrator.codegen import rows_and_columns_of_nonzeros
 from yid_ocp.integrator.discrete import RIGID_HOLD_STIFFNESS, EquilibriumEquations, equilibrium_equations
 from yid_ocp.integrator.step import Step, float_array_with_checked_shape
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
@@ -258,7 +258,7 @@ class EquilibriumSolver:
             inner, at = slice(n, n + nz), (q, q, none, z, z, lam, u, theta, step.time_step)
             residual, nonzeros = (np.array(x).ravel() for x in step.functions.function("resting")(*at))
             slopes = np.zeros((nz, n + nz + m + nu))
-            slopes[nonzero_rows_and_columns(step.functions.sparsity_patterns["resting"])] = nonzeros
+            slopes[rows_and_columns_of_nonzeros(step.functions.sparsity_patterns["resting"])] = nonzeros
             rows[0][inner], by_rows[inner], rows[2][inner] = residual, slopes[:, : n + nz + m], slopes[:, n + nz + m :]
             by_rows[inner, driven] -= hold.stiffness * rows[2][inner]
             if names:
@@ -391,7 +391,7 @@ def _solved(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
-def steady_state_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
+def steady_effect_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
     """Compute the relaxed internal coordinates (nz,) of a system held at the configuration `q` for a long time."""
     e = step.equations
     nz = e.z0.numel()

@@ -20,8 +20,8 @@ from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquati
 from yid_ocp.integrator.interpreted import InterpretedKernel
 from yid_ocp.integrator.step_model import (
     Rollout,
-    RolloutConvergenceInfo,
     RolloutInputs,
+    RolloutNewtonSummary,
     SensitivityDirections,
     StepEquationsAndFunctions,
     TrackingFeedback,
@@ -95,7 +95,7 @@ class Step(ReprMixin):
         theta: ArrayLike,
         prescribed: tuple[ArrayLike, ArrayLike] | None = None,
         internal: ArrayLike | None = None,
-    ) -> tuple[Array, Array, Array, RolloutConvergenceInfo]:
+    ) -> tuple[Array, Array, Array, RolloutNewtonSummary]:
         """Compute one DEL step. Returns q_{k+1}, p_{k+1}, the multipliers lam (m,) and a status.
 
         Parameters
@@ -302,7 +302,7 @@ def checked_rollout_inputs(
     return RolloutInputs(check("theta", theta, (sizes["ntheta"],)), begin, inputs, course, feedback, directions)
 
 
-def driven_joint_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
+def actuated_joint_torques_of_rollout(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
     """Return the torque on the driven joints in every step, (N, nu) [N m]: the input, or the torque of the servos."""
     system, h = step.system, step.clock_scaled_time_step(np.asarray(theta, float))
     if not system.servos:

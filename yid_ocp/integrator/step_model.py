@@ -95,7 +95,7 @@ _INSTABILITY_HINT = (
 
 
 @dataclass(frozen=True)
-class RolloutConvergenceInfo:
+class RolloutNewtonSummary:
     """The outcome of a rollout: status code, last Newton correction [rad or m], and counts over all steps.
 
     `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
@@ -198,7 +198,7 @@ class Rollout:
     state_sensitivity: Array | None
     multipliers_sensitivity: Array | None
     effort_sensitivity: Array | None
-    status: RolloutConvergenceInfo
+    status: RolloutNewtonSummary
 
 
 CostDerivativesByRolloutOutputs = tuple[Array, Array | None, Array | None]
@@ -251,7 +251,7 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
         shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, np.empty)
     values: dict[str, Any] = dict.fromkeys(names) | arrays
-    return Rollout(**values, status=RolloutConvergenceInfo(NewtonStatusCode.OK, 0, 0.0, 0, 0))
+    return Rollout(**values, status=RolloutNewtonSummary(NewtonStatusCode.OK, 0, 0.0, 0, 0))
 
 
 def allocate_step_linearizations(
@@ -292,4 +292,4 @@ def attach_status_to_rollout(
             getattr(rollout, name)[first_missing.get(name, step) :] = np.nan
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
-    return replace(rollout, status=RolloutConvergenceInfo(NewtonStatusCode(code), step, error, *counts, last, inner))
+    return replace(rollout, status=RolloutNewtonSummary(NewtonStatusCode(code), step, error, *counts, last, inner))

@@ -21,7 +21,7 @@ from yid_ocp.model.mechanism import (
     Joint,
     Mechanism,
     Placement,
-    rotation_from_axis_sin_cos,
+    numeric_axis_sin_cos_rotation,
     snap_near_integer_entries,
 )
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -87,7 +87,7 @@ class ElasticJoint:
 
 
 @dataclass(frozen=True)
-class SegmentLayout:
+class SingleSegmentLayout:
     """The layout of one segment in the mechanism: joints, link lengths, radius, mass and parent segment."""
 
     name: str
@@ -108,7 +108,7 @@ class FlexibleObject(ReprMixin):
 
     mechanism: Mechanism
     elastic_joints: tuple[ElasticJoint, ...]
-    segment_layouts: tuple[SegmentLayout, ...]
+    segment_layouts: tuple[SingleSegmentLayout, ...]
 
     def _summary(self) -> ReprTexts:
         names, tree = ", ".join(segment.name for segment in self.segment_layouts), self.mechanism
@@ -154,7 +154,7 @@ class _Parts:
     parameters: list[Parameter] = field(default_factory=list)
     joints: list[Joint] = field(default_factory=list)
     elastic: list[ElasticJoint] = field(default_factory=list)
-    layouts: dict[str, SegmentLayout] = field(default_factory=dict)
+    layouts: dict[str, SingleSegmentLayout] = field(default_factory=dict)
     chains: dict[str, ArcLengthChain] = field(default_factory=dict)
 
 
@@ -210,7 +210,7 @@ def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravi
         parts.frames[f"{segment.name}_{i}_tip"] = carrier
     parts.frames[f"w_{segment.name}"] = carrier
     parts.chains[segment.name] = ArcLengthChain(tuple(f"{segment.name}_{i}_tip" for i in range(len(shares))), shares)
-    parts.layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
+    parts.layouts[segment.name] = SingleSegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
 
 
 def edge_to_edge_rotations_from_vertices(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
@@ -238,7 +238,7 @@ def edge_to_edge_rotations_from_vertices(vertices: ArrayLike, initial_frame: Arr
         if sine < 1e-12:
             rotations.append(np.diag([1.0, math.copysign(1.0, cosine), math.copysign(1.0, cosine)]))
         else:
-            rotations.append(rotation_from_axis_sin_cos(axis / sine, sine, cosine))
+            rotations.append(numeric_axis_sin_cos_rotation(axis / sine, sine, cosine))
         frame = frame @ rotations[-1]
     return rotations
 
@@ -275,7 +275,7 @@ def _segment_parameters(segment: FlexibleSegment) -> dict[str, Parameter]:
     }
 
 
-def _check(segment: FlexibleSegment, known: Mapping[str, SegmentLayout]) -> None:
+def _check(segment: FlexibleSegment, known: Mapping[str, SingleSegmentLayout]) -> None:
     parent, at, axes = segment.parent, segment.parent_link_index, segment.joint_axes
     section, lengths, turns = segment.cross_section_size, segment.link_lengths, segment.link_rest_rotations
     count = segment.links if lengths is None else len(lengths)

@@ -350,7 +350,7 @@ def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
     return math.atan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]), pitch, yaw
 
 
-def rotation_from_axis_sin_cos(axis: ArrayLike, sine: float, cosine: float) -> Array:
+def numeric_axis_sin_cos_rotation(axis: ArrayLike, sine: float, cosine: float) -> Array:
     """Compute the rotation matrix (3, 3) from a unit axis (3,) and the angle's sine and cosine (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew

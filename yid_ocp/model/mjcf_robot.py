@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError, import_optional
 from yid_ocp.files import check_input_file
-from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_axis_sin_cos
+from yid_ocp.model.mechanism import homogeneous_transform, numeric_axis_sin_cos_rotation
 
 log = logging.getLogger(__name__)
 _JOINT_TYPE_NAMES = {2: "prismatic", 3: "revolute"}
@@ -228,4 +228,4 @@ def joint_displacement_transform(axis: Array, amount: float, kind: str) -> Array
     """Compute the pose (4, 4) of a prismatic or revolute joint with unit axis (3,) at position `amount` [m or rad]."""
     if kind == "prismatic":
         return _shift(amount * axis)
-    return homogeneous_transform(rotation_from_axis_sin_cos(axis, math.sin(amount), math.cos(amount)), np.zeros(3))
+    return homogeneous_transform(numeric_axis_sin_cos_rotation(axis, math.sin(amount), math.cos(amount)), np.zeros(3))

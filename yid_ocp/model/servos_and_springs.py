@@ -101,7 +101,7 @@ class MotorKindAndPreset:
 
 
 @dataclass(frozen=True)
-class JointSpringData:
+class StiffnessAndRest:
     """A spring on a robot joint, with its stiffness [N m/rad or N/m] and rest position [rad or m]."""
 
     stiffness: float
@@ -189,7 +189,7 @@ def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
     return x / (1 + tightness * x**p) ** (1 / p)
 
 
-def joint_spring_parameters(tree: Mechanism, joint: str, spring: JointSpringData) -> tuple[Parameter, Parameter]:
+def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: StiffnessAndRest) -> tuple[Parameter, Parameter]:
     """Make the parameters `JOINT.stiffness` and `JOINT.rest` for the spring of a robot joint."""
     unit = tree.joints[tree.joint_index(joint)].coordinate_unit
     per = "N m/rad" if unit == "rad" else "N/m"

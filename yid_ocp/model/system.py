@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, require_known_names
 from yid_ocp.model import servos_and_springs
-from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
+from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SingleSegmentLayout
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -239,7 +239,7 @@ class SystemBuildArguments(TypedDict, total=False):
     """Shape (3,) [m/s^2]; default: 9.81 along -z."""
     point_frames: Sequence[str] | None
     """Frames that sensors may measure, or points of a segment such as `T1:40%`; default: the segment tips `w_*`."""
-    springs: Mapping[str, servos_and_springs.JointSpringData]
+    springs: Mapping[str, servos_and_springs.StiffnessAndRest]
     """Springs by robot joint; they become the parameters `JOINT.stiffness` and `JOINT.rest`."""
     servos: servos_and_springs.ServoModelOptions | None
     """Servos whose commands are the inputs of driven joints; adds `JOINT.servo_gain`, `JOINT.servo_damping`, ..."""
@@ -272,7 +272,7 @@ class System(ReprMixin):
     joint_relaxation_times: Mapping[str, float] = field(default_factory=dict)
     """T of some compliant coordinates in q + T dq/dt = compliance x torque [s]. Without mass, a coordinate needs it to
     forget an initial value that does not fit its load."""
-    segment_layouts: tuple[SegmentLayout, ...] = ()
+    segment_layouts: tuple[SingleSegmentLayout, ...] = ()
     point_frames: tuple[str, ...] = ()
     """Frames that a sensor may measure."""
     effects: tuple[Effect, ...] = ()
@@ -300,13 +300,13 @@ class System(ReprMixin):
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in options.get("springs", {}).items():
-            stiffness, rest = servos_and_springs.joint_spring_parameters(tree, joint, spring)
+            stiffness, rest = servos_and_springs.stiffness_and_rest_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         moved, own = ({}, []) if servos is None else servos_and_springs.build_joint_servos(tree, driven, servos)
         if servos is not None and servos.has_gravity_compensation:
             tree = tree.with_gravity_fraction(ca.SX(0))
-        segments: list[SegmentLayout] = []
+        segments: list[SingleSegmentLayout] = []
         for item, frame, placement in options.get("objects", ()):
             tree = tree.with_attached_mechanism(item.mechanism, frame, placement)
             elastic += item.elastic_joints
@@ -375,7 +375,7 @@ class System(ReprMixin):
         """The symbols of effects' internal coordinates by name, in the order of z. Grasps and placements use them."""
         return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
-    def segment_layout_by_name(self, name: str) -> SegmentLayout:
+    def find_segment_layout(self, name: str) -> SingleSegmentLayout:
         """Return the layout of a segment. Raises `ModelError`, with the nearest name, if there is no such segment."""
         found = {layout.name: layout for layout in self.segment_layouts}
         require_known_names([name], found, "segment", "segments of the model", ModelError)

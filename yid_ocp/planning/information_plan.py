@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from yid_ocp.analysis.experiment_design import step_with_frames_and_measurable_points
+from yid_ocp.analysis.experiment_design import step_and_measurable_points_with_frames
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import NULL_PROGRESS, Progress
@@ -250,7 +250,7 @@ def _check_seen(
 def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
     """Hint on a sensor or grasp with which the parameter `name` would be observable."""
     mover, n = experiment.simulator, experiment.simulator.step.system.n_coordinates
-    wide, seen = step_with_frames_and_measurable_points(mover.step)
+    wide, seen = step_and_measurable_points_with_frames(mover.step)
     w = _PROBE_AMPLITUDE * w / max(float(np.abs(w).max()), _PROBE_AMPLITUDE)
     rolled = mover.simulate_path(w, names=[name])
     if rolled.state_sensitivity is None or not rolled.status.is_converged:

@@ -346,7 +346,7 @@ def _samples(
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
 
 
-def episode_with_encoder_effort_noise(step: Step, episode: Episode, options: ProblemOptions, theta: Array) -> Episode:
+def with_encoder_noise_in_effort_std(step: Step, episode: Episode, options: ProblemOptions, theta: Array) -> Episode:
     """Return an episode whose encoder noise is converted to noise of compared efforts at the parameters `theta`."""
     again = _samples(step, episode.recording, options, theta, episode.grid, False, {})
     found = {samples.sensor.group_name: samples for samples in again if samples.sensor.effort_joints}

@@ -37,8 +37,8 @@ from yid_ocp.problem.evaluation import (
     check_unique_recording_names,
     episode_residual_and_jacobian,
     estimated_initial_state_names,
-    initial_internal_state_offset_limits,
     initial_unknown_vector_and_bounds,
+    max_abs_initial_internal_offsets,
     positive_unknowns_mask,
     stated_prior_stds_of_unknowns,
     stated_rms_noise_of_data_residuals,
@@ -387,7 +387,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
     short = _beginning(episode, max(round(_HELD_OUT_START_WINDOW / predictor.integrator_step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
-    limit = initial_internal_state_offset_limits(predictor.system, predictor.unknowns.initial_state_names)
+    limit = max_abs_initial_internal_offsets(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

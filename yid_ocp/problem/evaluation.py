@@ -153,7 +153,7 @@ def stated_rms_noise_of_data_residuals(episodes: Sequence[Episode], options: Pro
 
 
 INITIAL_STATE_UNKNOWN_PREFIX = "start."
-WEAK_PRIOR_LOG_MIN_RATIO = 1e-3
+LOG_PRIOR_PARABOLA_RATIO = 1e-3
 """Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
 
 
@@ -213,7 +213,7 @@ def initial_unknown_vector_and_bounds(
 ) -> tuple[Array, Array, Array]:
     """Return the initial unknown vector and its lower and upper bounds, (nx,) each. Initial states have offset zero."""
     parameters, pack = system.parameters, unknowns.pack_same_for_all_recordings
-    wide = initial_internal_state_offset_limits(system, unknowns.initial_state_names)
+    wide = max_abs_initial_internal_offsets(system, unknowns.initial_state_names)
     start = pack(lambda name: theta[parameters.index(name)], np.zeros(len(wide)))
     return start, pack(lambda name: parameters[name].lower, -wide), pack(lambda name: parameters[name].upper, wide)
 
@@ -326,7 +326,7 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
     return {name: size for effect in effects for name, size in effect.max_abs_initial_internal_coordinates.items()}
 
 
-def initial_internal_state_offset_limits(system: System, names: Sequence[str]) -> Array:
+def max_abs_initial_internal_offsets(system: System, names: Sequence[str]) -> Array:
     """Return the largest absolute initial offset of each effect's internal coordinate, infinite for other names."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
@@ -374,9 +374,9 @@ def check_initial_values_and_bounds(system: System, free: Sequence[str], theta: 
 
 
 def _soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
-    """Return the logarithm of a ratio and its derivative, continued by a parabola below `WEAK_PRIOR_LOG_MIN_RATIO`."""
-    below = (ratio - WEAK_PRIOR_LOG_MIN_RATIO) / WEAK_PRIOR_LOG_MIN_RATIO
+    """Return the logarithm of a ratio and its derivative, continued by a parabola below `LOG_PRIOR_PARABOLA_RATIO`."""
+    below = (ratio - LOG_PRIOR_PARABOLA_RATIO) / LOG_PRIOR_PARABOLA_RATIO
     small = below < 0
-    kept = np.where(small, WEAK_PRIOR_LOG_MIN_RATIO, ratio)
+    kept = np.where(small, LOG_PRIOR_PARABOLA_RATIO, ratio)
     value = np.log(kept) + np.where(small, below - below**2 / 2, 0.0)
-    return value, np.where(small, (1 - below) / WEAK_PRIOR_LOG_MIN_RATIO, 1 / kept)
+    return value, np.where(small, (1 - below) / LOG_PRIOR_PARABOLA_RATIO, 1 / kept)

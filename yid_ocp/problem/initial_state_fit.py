@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.statics import steady_state_internal_coordinates
+from yid_ocp.integrator.statics import steady_effect_internal_coordinates
 from yid_ocp.integrator.step import Step, generalized_momentum_from_velocity
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
@@ -161,7 +161,7 @@ class InitialStateFitter:
         q0 = q - velocity * first * step.time_step
         q0[list(system.prescribed_coordinate_indices)] = path[0]
         momentum = generalized_momentum_from_velocity(step, q0, velocity, theta)
-        state = np.concatenate([q0, momentum, steady_state_internal_coordinates(step, q0, theta)])
+        state = np.concatenate([q0, momentum, steady_effect_internal_coordinates(step, q0, theta)])
         own = dict(zip(self.fitted_parameters, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
         if INITIAL_RMS_SPEED_PARAMETER in system.parameters:
             own[INITIAL_RMS_SPEED_PARAMETER] = _speed(frames[first], frames[then], (then - first) * step.time_step)

@@ -247,7 +247,7 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
     return [f"{name} [{kinds[name]}]" for name in group.values_by_quantity]
 
 
-def importable_file_summary_lines(contents: FilePreview) -> list[str]:
+def importable_file_contents_lines(contents: FilePreview) -> list[str]:
     """Return lines of text that describe a file of another tool: a table of what `import` finds, and notes."""
     rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
     alike: dict[tuple[str, ...], list[Sequence[str]]] = {}  # rows that only differ in a number

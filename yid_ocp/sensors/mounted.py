@@ -49,7 +49,7 @@ class MountedSensor(base.Sensor):
         raise NotImplementedError
 
 
-def register_reader_of_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
+def register_class_of_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
     """Register a reader for a class of mounted sensors. The reader makes one `SensorData` for each recorded group."""
     base.SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
     return kind
@@ -144,7 +144,7 @@ def _with_encoder_noise(
 _XYZ = ("x", "y", "z")
 
 
-@register_reader_of_mounted_sensor
+@register_class_of_mounted_sensor
 class _Gyroscope(MountedSensor):
     """Angular velocity of a frame relative to the world, along the frame's axes."""
 
@@ -157,7 +157,7 @@ class _Gyroscope(MountedSensor):
         return kinematics.frame_pose(frame).rotation.T @ (kinematics.angular_jacobian(frame) @ state.v)
 
 
-@register_reader_of_mounted_sensor
+@register_class_of_mounted_sensor
 class _Accelerometer(MountedSensor):
     """Acceleration of a frame's origin minus gravity, along the frame's axes. At rest it is 9.81 m/s^2 upwards."""
 

@@ -18,13 +18,13 @@ from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_deriva
 from yid_ocp.model.mechanism import Inertia, Placement
 from yid_ocp.model.system import MidpointStateSymbols, NodeStateSymbols, System, six_joint_floating_mechanism
 from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelSpec
-from yid_ocp.sensors.mounted import MountedSensor, register_reader_of_mounted_sensor
+from yid_ocp.sensors.mounted import MountedSensor, register_class_of_mounted_sensor
 
 _XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
 _N_LOCKED_JOINTS = 6
 
 
-@register_reader_of_mounted_sensor
+@register_class_of_mounted_sensor
 class _WristForceSensor(MountedSensor):
     """Force that the part beyond the sensor exerts on it, along the sensor frame's axes."""
 
@@ -34,7 +34,7 @@ class _WristForceSensor(MountedSensor):
         return _wrench_on_sensor(state, frame)[:3]
 
 
-@register_reader_of_mounted_sensor
+@register_class_of_mounted_sensor
 class _WristTorqueSensor(MountedSensor):
     """Torque that the part beyond the sensor exerts on it about the origin of its frame, along the frame's axes."""
 

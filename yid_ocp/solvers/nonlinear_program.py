@@ -327,7 +327,7 @@ class NonlinearProgram(ReprMixin):
         equalities = count_with_noun(sum(term.n_values for term in self.constraint_terms), "equation")
         return ReprTexts(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
-    def block_indices_rows_and_unit(self, name: str) -> _VectorBlock:
+    def find_vector_block(self, name: str) -> _VectorBlock:
         """Find a named block's indices, row names and unit. With one recording, `[NAME]` can be omitted.
 
         Raises `SolverError` if there is no such block, or more than one.
@@ -344,7 +344,7 @@ class NonlinearProgram(ReprMixin):
 
     def __getitem__(self, name: str) -> ca.MX:
         """Block of variables or parameters as an MX matrix of its shape."""
-        block = self.block_indices_rows_and_unit(name)
+        block = self.find_vector_block(name)
         vector = self.w if any(block is own for own in self.variables.values()) else self.p
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 

@@ -6,7 +6,7 @@ The unknowns are, in this order,
 
 with x = (q, p, z). `rest` is the equilibrium at the first posture (free coordinates, internal coordinates, grasp
 forces), and x_0 is a function of it; a given initial state has no `rest`. The constraints are the equations of the
-equilibrium and those of every step (`NlpStepConstraints`). The objective contains the whitened samples, interpolated
+equilibrium and those of every step (`OneStepNlpEqualities`). The objective contains the whitened samples, interpolated
 between nodes, and the priors. Recorded inputs and measurements are parameters. With process noise, the errors of
 torques and angles are unknowns too, after the states of their recording, with Gaussian priors. At the optimum the
 objective then corresponds to the likelihood of `inference.whitening`, up to the linearisation there.
@@ -26,13 +26,13 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.discrete import NlpStepConstraints, one_step_nlp_constraints
+from yid_ocp.integrator.discrete import OneStepNlpEqualities, one_step_nlp_constraints
 from yid_ocp.integrator.statics import joint_hold_spring_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episode_prediction import sensor_not_predictable_at_nodes_error
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.problem.evaluation import WEAK_PRIOR_LOG_MIN_RATIO
+from yid_ocp.problem.evaluation import LOG_PRIOR_PARABOLA_RATIO
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 from yid_ocp.solvers.initial_guess import (
@@ -171,7 +171,7 @@ class _DrivenStage(NamedTuple):
 
 
 def _driven_stage(
-    stage: NlpStepConstraints,
+    stage: OneStepNlpEqualities,
     freed: _FreeParameterSymbols,
     followed: Sequence[int],
     momentum: Array,
@@ -473,9 +473,9 @@ class _Maker:
         _, slopes = problem.priors.residual_and_jacobian(problem.initial_unknowns)
         v, about = ca.SX.sym("v"), ca.SX.sym("about")
         ratio = v / about
-        below = (ratio - WEAK_PRIOR_LOG_MIN_RATIO) / WEAK_PRIOR_LOG_MIN_RATIO
-        bent = ca.if_else(ratio < WEAK_PRIOR_LOG_MIN_RATIO, below - below**2 / 2, 0)
-        soft = ca.log(ca.fmax(ratio, WEAK_PRIOR_LOG_MIN_RATIO)) + bent
+        below = (ratio - LOG_PRIOR_PARABOLA_RATIO) / LOG_PRIOR_PARABOLA_RATIO
+        bent = ca.if_else(ratio < LOG_PRIOR_PARABOLA_RATIO, below - below**2 / 2, 0)
+        soft = ca.log(ca.fmax(ratio, LOG_PRIOR_PARABOLA_RATIO)) + bent
         stated = problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start
         found = []
         kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))

@@ -21,7 +21,7 @@ from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo
 from yid_ocp.virtual import joint_motion
-from yid_ocp.virtual.mjcf import ExpressionEvaluator, import_mujoco
+from yid_ocp.virtual.mjcf import CasadiEvaluator, import_mujoco
 from yid_ocp.virtual.mujoco_simulation import (
     InjectedSimulatorTerms,
     SimulationOptions,
@@ -309,7 +309,7 @@ def _camera_error(
         inside = late <= duration
         std = None if group.std is None else group.std[inside]
         return replace(group, t=late[inside], position=position[inside], std=std)
-    value = ExpressionEvaluator(system, {})
+    value = CasadiEvaluator(system, {})
     radius = {s.name: float(value(s.radius)[0]) for s in system.segment_layouts}
     own = np.array([radius.get(name.removeprefix("w_").partition(":")[0], 0.0) for name in group.names])
     ray = centre - position

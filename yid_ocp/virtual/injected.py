@@ -23,7 +23,7 @@ from yid_ocp.effects.base import EffectBase, object_joint_names
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperimentSettings, recording_with_sensor_error, run_virtual_experiment
-from yid_ocp.virtual.mjcf import ExpressionEvaluator, import_mujoco
+from yid_ocp.virtual.mjcf import CasadiEvaluator, import_mujoco
 
 _ForceCallback = Callable[[Any, Any], None]  # function of MuJoCo's model and data that adds to `qfrc_passive`
 _Values = Mapping[str, float]
@@ -61,25 +61,25 @@ class _EffectContext:
 
     def __init__(self, system: System, values: Mapping[str, float]) -> None:
         self.system, self.has_motion_begun = system, False
-        self.value, springs = ExpressionEvaluator(system, values), system.elastic_joints
+        self.value, springs = CasadiEvaluator(system, values), system.elastic_joints
         self.joint_stiffness = {s.joint_name: float(self.value(s.stiffness)[0]) for s in springs}  # [N m/rad]
         self.rest_angles = {s.joint_name: float(self.value(s.rest_angle)[0]) for s in springs}  # [rad]
 
     def segment_springs(self, model: Any, segment: str) -> tuple[Array, Array, Array]:
         """MuJoCo ids, stiffnesses [N m/rad] and rest angles [rad] of a segment's elastic joints."""
-        links = self.system.segment_layout_by_name(segment).link_joints
+        links = self.system.find_segment_layout(segment).link_joints
         joints = [joint for link in links for joint in link if joint in self.joint_stiffness]
         stiffness, rest = (np.array([of[j] for j in joints]) for of in (self.joint_stiffness, self.rest_angles))
         return np.array([model.joint(j).id for j in joints]), stiffness, rest
 
     def bend_joint_ids(self, model: Any, segment: str) -> Array:
         """MuJoCo ids of the joints that bend a segment about x, then of those that bend it about y."""
-        links = self.system.segment_layout_by_name(segment).link_joints
+        links = self.system.find_segment_layout(segment).link_joints
         return np.array([model.joint(link[axis]).id for axis in (0, 1) for link in links])
 
     def link_body_ids(self, model: Any, segment: str) -> list[int]:
         """MuJoCo ids of the bodies of a segment's links, in the order of the links."""
-        links = self.system.segment_layout_by_name(segment).link_joints
+        links = self.system.find_segment_layout(segment).link_joints
         return [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in links]
 
     def end_body_id(self, model: Any, place: str) -> int:
@@ -212,7 +212,7 @@ def _memory_law(
 
 
 def _aerodynamic_drag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    mujoco, segment = import_mujoco(), scene.system.segment_layout_by_name(place)
+    mujoco, segment = import_mujoco(), scene.system.find_segment_layout(place)
     radius = float(scene.value(segment.radius)[0])
 
     def drag(body: int, length: float) -> Callable[[Any], Array]:
@@ -390,7 +390,7 @@ def _gusts(scene: _EffectContext, model: Any, segment: str, size: float) -> _For
 
 
 def _crease(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    joints = scene.system.segment_layout_by_name(segment).link_joints[_CREASED_LINK][:2]
+    joints = scene.system.find_segment_layout(segment).link_joints[_CREASED_LINK][:2]
     at, rest = np.array([model.joint(j).id for j in joints]), np.array([scene.rest_angles.get(j, 0.0) for j in joints])
 
     def law(q: Array, v: Array, t: float) -> Array:

@@ -17,7 +17,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
-from yid_ocp.virtual.mjcf import ExpressionEvaluator
+from yid_ocp.virtual.mjcf import CasadiEvaluator
 
 BAXTER_JOINT_NAMES_WITHOUT_SIDE = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 _ELBOW_UP_ANGLES: Mapping[str, float] = {
@@ -207,7 +207,7 @@ def grasping_joint_angles(
         hold the undeformed Y are fully stretched, a singular posture. Offsets that bring the grippers closer avoid it.
     """
     tree = system.mechanism_with_values(values)
-    value = ExpressionEvaluator(system, values)
+    value = CasadiEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
     elastic = {spring.joint_name for spring in system.elastic_joints}
     holders = (tree.frame(grasp.holder_frame).joint_index for grasp in system.grasps)
@@ -219,7 +219,7 @@ def grasping_joint_angles(
     return {tree.joints[j].name: float(posture[j]) for j in wanted}
 
 
-def _undeformed(system: System, tree: Mechanism, value: ExpressionEvaluator, start: Mapping[str, float]) -> Array:
+def _undeformed(system: System, tree: Mechanism, value: CasadiEvaluator, start: Mapping[str, float]) -> Array:
     """Configuration (n,) with an undeformed object and the other joints at the start of the search."""
     posture, elastic = np.zeros(system.n_coordinates), {spring.joint_name for spring in system.elastic_joints}
     for spring in system.elastic_joints:
@@ -233,7 +233,7 @@ def _undeformed(system: System, tree: Mechanism, value: ExpressionEvaluator, sta
 
 
 def _gap_function(
-    system: System, tree: Mechanism, value: ExpressionEvaluator, offsets: Mapping[str, ArrayLike], sought: Sequence[int]
+    system: System, tree: Mechanism, value: CasadiEvaluator, offsets: Mapping[str, ArrayLike], sought: Sequence[int]
 ) -> ca.Function:
     """Function of q: gaps [m] between grippers and the held points, and their derivatives by the searched joints."""
     q = ca.SX.sym("q", system.n_coordinates)

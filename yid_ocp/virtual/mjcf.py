@@ -66,7 +66,7 @@ class JointDynamicsTerms:
         return JointDynamicsTerms(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
 
 
-class ExpressionEvaluator:
+class CasadiEvaluator:
     """An evaluator of CasADi expressions at parameter `values` (default: nominal). It flattens matrices by columns."""
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
@@ -120,7 +120,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 
 
 def effect_joint_terms_and_changed_aspects(
-    system: System, effect: Effect, value: ExpressionEvaluator
+    system: System, effect: Effect, value: CasadiEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
     """Find the terms that an effect adds to each joint, and the model aspects that it changes, by key."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
@@ -146,7 +146,7 @@ def effect_joint_terms_and_changed_aspects(
     return terms, aspects or {"reading"}
 
 
-def system_joint_dynamics_terms(system: System, value: ExpressionEvaluator) -> dict[str, JointDynamicsTerms]:
+def system_joint_dynamics_terms(system: System, value: CasadiEvaluator) -> dict[str, JointDynamicsTerms]:
     """Return the springs, dampers, rotor inertia and friction of each joint, from description and joint effects."""
     found: dict[str, JointDynamicsTerms] = {}
 
@@ -172,7 +172,7 @@ def system_joint_dynamics_terms(system: System, value: ExpressionEvaluator) -> d
 
 
 def _actuation(
-    system: System, effects: Sequence[Effect], joint: str, value: ExpressionEvaluator
+    system: System, effects: Sequence[Effect], joint: str, value: CasadiEvaluator
 ) -> tuple[float, float, float, float]:
     """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
 
@@ -189,7 +189,7 @@ def _actuation(
     return gain, offset, delay, time_constant
 
 
-def _joint_terms(system: System, effect: Effect, value: ExpressionEvaluator) -> dict[str, JointDynamicsTerms] | None:
+def _joint_terms(system: System, effect: Effect, value: CasadiEvaluator) -> dict[str, JointDynamicsTerms] | None:
     """Springs, dampers and rotors that are equivalent to an effect's equations, by joint. None if none are."""
     n = system.n_coordinates
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
@@ -271,7 +271,7 @@ def mujoco_xml(
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml: time_step", allowed="a number above 0 [s]")
     tree, weights = _weighed(system.mechanism_with_values(values))
-    value = ExpressionEvaluator(system, values)
+    value = CasadiEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
 
     root = Element("mujoco", model=tree.name)
@@ -376,7 +376,7 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
     return attributes | {name: format_xml_numbers(values) for name, values in numbers.items()}
 
 
-def _add_grasps(system: System, value: ExpressionEvaluator, root: Element, time_step: float) -> None:
+def _add_grasps(system: System, value: CasadiEvaluator, root: Element, time_step: float) -> None:
     equality = SubElement(root, "equality")
     firm = {"solref": format_xml_numbers([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
     for grasp in system.grasps:
@@ -399,7 +399,7 @@ def _add_grasps(system: System, value: ExpressionEvaluator, root: Element, time_
             SubElement(equality, kind, {"name": f"grasp_{grasp.name}{suffix}", **sites, **firm})
 
 
-def _add_actuators(system: System, value: ExpressionEvaluator, actuator: Element, time_step: float) -> None:
+def _add_actuators(system: System, value: CasadiEvaluator, actuator: Element, time_step: float) -> None:
     for joint in system.driven:
         gain, offset, delay, lag = _actuation(system, system.effects, joint, value)
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
@@ -438,7 +438,7 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
         raise ModelError(what, where="MJCF text", allowed="MJCF that MuJoCo compiles", hint=hint) from error
 
 
-def _refuse_inexpressible(system: System, value: ExpressionEvaluator, emulate: bool) -> None:
+def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool) -> None:
     native = elements_by_aspect_and_file_format().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
     able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
     for effect in system.effects:
@@ -477,7 +477,7 @@ def _shares_body(tree: Mechanism, j: int) -> bool:
     return alone and bool(np.array_equal(np.array(ca.DM(joint.placement.homogeneous_matrix())), np.eye(4)))
 
 
-def _sites(system: System, tree: Mechanism, value: ExpressionEvaluator) -> list[tuple[str, Frame]]:
+def _sites(system: System, tree: Mechanism, value: CasadiEvaluator) -> list[tuple[str, Frame]]:
     sites = [(name, tree.frame(name)) for name in system.point_frames]
     for grasp in system.grasps:
         holder, held = tree.frame(grasp.holder_frame), tree.frame(grasp.held_frame)

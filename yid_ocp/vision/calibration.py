@@ -372,7 +372,7 @@ class _Calibrator:
             return robust_cost_derivatives(rows, reach)
 
         for _ in range(rounds):
-            hessian, gradient, _ = cost(state).reweighted_hessian_gradient_and_weight(self.precision)
+            hessian, gradient, _ = cost(state).scaled_hessian_gradient_and_data_weight(self.precision)
             pull = gradient + self.precision @ state.state_increment_from(self.told)
             step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
             state = state.with_state_increment(step)

@@ -238,7 +238,7 @@ class RobustCostDerivatives:
     # (counted twice), and at least the last sum (two-way clusters of Cameron, Gelbach and Miller 2011)
     score_covariance: Array
 
-    def reweighted_hessian_gradient_and_weight(self, precision: Array) -> tuple[Array, Array, float]:
+    def scaled_hessian_gradient_and_data_weight(self, precision: Array) -> tuple[Array, Array, float]:
         """Return weighted Hessian and gradient, and this weight of the data. `precision`: inverse prior covariance."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
@@ -248,7 +248,7 @@ class RobustCostDerivatives:
 
     def state_covariance(self, precision: Array) -> Array:
         """Compute the covariance (10, 10) of the state that minimises the cost of data and prior."""
-        hessian, _, weight = self.reweighted_hessian_gradient_and_weight(precision)
+        hessian, _, weight = self.scaled_hessian_gradient_and_data_weight(precision)
         bread = np.linalg.inv(self.curvature_ratio * hessian + precision)
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 

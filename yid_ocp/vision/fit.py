@@ -35,7 +35,7 @@ from yid_ocp.vision.shape_evidence import (
     ShapeFitQuality,
     ShapeFitQualityAndPointClasses,
     TubeLinks,
-    tube_link_projections,
+    nearest_link_axis_projections,
 )
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd, ShapeGuessFinder
 from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segment
@@ -178,7 +178,7 @@ class ShapeFitter:
             # a part of the object is misplaced: something similar was nearer to the initial guess
             if left[0].any() and left[1].any():
                 other = self._attempt(cloud, [self._rested(best.q, failed), *begun], left)
-                covered = [own.covered_fraction_of_visible_links(self._lengths) for own in (evidence, other[1])]
+                covered = [own.covered_fraction_of_visible_length(self._lengths) for own in (evidence, other[1])]
                 if covered[1] > covered[0]:
                     best, evidence = other
         return self._judged(best, evidence, self._rivals(best, evidence, cloud), cloud)
@@ -204,7 +204,7 @@ class ShapeFitter:
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
         tubes = self.tube_links_at_configuration(best.q)
-        touched = tube_link_projections(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
+        touched = nearest_link_axis_projections(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
         found = []
         for name in dict.fromkeys(self.link_segments[k] for k in sorted(set(touched.tolist()))):
             mine = self._links_of({name})
@@ -219,7 +219,7 @@ class ShapeFitter:
     def _failed(self, evidence: ShapeFitQualityAndPointClasses) -> set[str]:
         """Names of the tubes that have points on too small a part of their visible length."""
         own = {name: self._lengths * self._links_of({name}) for name in self.link_segments}
-        empty, covered = evidence.visibly_empty_fraction, evidence.covered_fraction_of_visible_links
+        empty, covered = evidence.visibly_empty_fraction, evidence.covered_fraction_of_visible_length
         return {name for name, mine in own.items() if mine @ empty > 0 and covered(mine) < _MIN_TUBE_COVERAGE}
 
     def _without(
@@ -227,9 +227,11 @@ class ShapeFitter:
     ) -> _Left:
         """Masks of the nodes and points that are not on the links of the mask `links`."""
         tubes, nodes = self.tube_links_at_configuration(best.q), sight.skeleton_nodes
-        link = tube_link_projections(tubes.link_ends, tubes.radius, sight.points)[0]
+        link = nearest_link_axis_projections(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (evidence.is_own | evidence.is_contested)
-        node_link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
+        node_link, _, _, distance = nearest_link_axis_projections(
+            tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION
+        )
         return ~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong
 
     def _attempt(

@@ -51,7 +51,7 @@ def _read_npz(path: Path) -> _Cloud:
     allowed += " to 255 if wanted"
     try:
         with zipfile.ZipFile(path) as packed:
-            files.check_input_number_count(sum(entry.file_size for entry in packed.infolist()), str(path))
+            files.check_not_too_many_numbers(sum(entry.file_size for entry in packed.infolist()), str(path))
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
@@ -101,7 +101,7 @@ def _read_depth_image(path: Path) -> Array:
     o3d = frames.import_open3d()
     with files.check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
         head = file.read(24)  # the last eight bytes are a PNG's width and height
-    files.check_input_number_count(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
+    files.check_not_too_many_numbers(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:

@@ -228,7 +228,7 @@ _SAME_ROOT_FRACTION = 0.1  # of the length between the ends; closer roots are th
 _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends; height difference that makes one end higher
 
 
-def align_object_root_of_frames(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
+def choose_root_end_of_frames(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
     """Return the frames with the object's root at the same end in all fits, and a text on how this end was chosen.
 
     A choice is needed if a shape fits equally well with its root at another end. Ends are first followed from frame to

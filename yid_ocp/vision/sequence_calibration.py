@@ -25,7 +25,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import MAD_TO_STD
-from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, tube_link_projections
+from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, nearest_link_axis_projections
 from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segment
 
 _BACKGROUND_NOISE_STDS = 3.0  # stds of a point within which it belongs to the background
@@ -71,7 +71,7 @@ class BackgroundPoints:
         often = 1.0 if shapes is None else max(2.0, _MIN_STILL_FRAME_FRACTION * len(clouds))
         points: Array = np.asarray((place[count >= often] + 0.5) * voxel)
         for tubes in shapes or ():
-            link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, points)
+            link, _, _, distance = nearest_link_axis_projections(tubes.link_ends, tubes.radius, points)
             points = points[distance > tubes.radius[link] + near]
         return BackgroundPoints(points, _BACKGROUND_NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
 

@@ -45,7 +45,7 @@ class TubeLinks:
     tube_lengths: Array  # (K,), length of the tube of each link [m]
 
 
-def tube_link_projections(
+def nearest_link_axis_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
     """Project points (N, 3) on the axis of the nearest link. Axes have ends `corners` (K, 2, 3), radii are (K,) [m].
@@ -105,7 +105,7 @@ class ShapeFitQuality:
     end_offsets: Array
     foreign_clusters: tuple[ForeignCluster, ...]  # foreign clusters near the shape, the largest first
 
-    def covered_fraction_of_visible_links(self, lengths: Array) -> float:
+    def covered_fraction_of_visible_length(self, lengths: Array) -> float:
         """Return the fraction of the links' visible length on which points were measured; 0 if no link is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
@@ -156,7 +156,7 @@ def fit_quality_and_point_classes(
     tubes: TubeLinks, seen: ProcessedFrameCloud, near: float
 ) -> ShapeFitQualityAndPointClasses:
     """Classify a frame's points by a fitted shape, and assess the fit by points within `near` [m] of its surface."""
-    link, along, normal, distance = tube_link_projections(tubes.link_ends, tubes.radius, seen.points)
+    link, along, normal, distance = nearest_link_axis_projections(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
     close = size < near
@@ -327,7 +327,7 @@ def nearest_surface_residuals(
     f = `share` scales the radius r. Axis ends `corners` are (K, 2, 3), radii (K,), `camera` (3,) [m]. A point on the
     far side of a tube, which the camera cannot see, is compared with the near side: e = -|p - c| - f r.
     """
-    link, along, normal, distance = tube_link_projections(corners, radius, points, share)
+    link, along, normal, distance = nearest_link_axis_projections(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
     error = sign * distance - share * radius[link]
     # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
@@ -343,7 +343,7 @@ def surface_residuals_along_sight(corners: Array, radius: Array, points: Array, 
     to the camera than the axis. Errors along the surface normal would give the same tube position, but a radius too
     small by several times noise^2/r. Points near the rim, where depth is not informative, are omitted.
     """
-    link, along, normal, distance = tube_link_projections(corners, radius, points)
+    link, along, normal, distance = nearest_link_axis_projections(corners, radius, points)
     axis = unit_link_axes(corners)[link]
     sight = camera - points
     front = sight - np.einsum("ij,ij->i", sight, axis)[:, None] * axis
@@ -390,4 +390,4 @@ class FrameShapeFit(ShapeFitQuality):
     def visible_length_coverage(self) -> float:
         """The fraction of the shape's visible length that has points."""
         lengths = np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1)
-        return self.covered_fraction_of_visible_links(lengths)
+        return self.covered_fraction_of_visible_length(lengths)

@@ -285,7 +285,7 @@ def _diagnose_case_from_recordings_task(
     begun = time.perf_counter()
     evidence = None
     try:
-        finding = blind.diagnose_blind_case(ensemble, case, candidates, run.diagnosis)
+        finding = blind.diagnose_unlabelled_case(ensemble, case, candidates, run.diagnosis)
         result, evidence = finding.to_dict(), blind_scores.diagnosis_evidence_to_dict(finding)
     except YidError as error:
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
@@ -294,7 +294,7 @@ def _diagnose_case_from_recordings_task(
     if experiment["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
         wide = blind_scores.thresholds_always_accepting_best_candidate(run.diagnosis)
         try:
-            anything = blind.diagnose_blind_case(ensemble, case, candidates, wide)
+            anything = blind.diagnose_unlabelled_case(ensemble, case, candidates, wide)
             found["open"] = to_json_types(diagnosis_decision_statistics(anything))
         except YidError as error:
             found["open"] = {"message": str(error)}

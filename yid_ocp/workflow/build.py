@@ -21,8 +21,8 @@ from yid_ocp.effects.bodies import system_with_mass_scale_parameters
 from yid_ocp.effects.friction import (
     EFFECT_KINDS_BY_FRICTION_LAW,
     TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED,
-    effect_with_min_smoothing_speed_at_joint,
     effect_with_sign_smoothing_speed,
+    lower_smoothing_speed_to_joint_min,
 )
 from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
@@ -32,14 +32,14 @@ from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transfo
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, JointSpringData
+from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import (
     add_setting_location_to_errors,
+    check_names_in_setting,
     read_recordings_of_role,
-    require_setting_names,
     unknown_name_error,
 )
 
@@ -73,7 +73,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     with add_setting_location_to_errors(run, "model", "object"):
         objects = [] if item is None else [(item.build(of_object, link_division), *item.parent_frame_and_root_pose)]
     mode = "driven" if are_arm_states_estimated(run) else arms.mode
-    require_setting_names(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
+    check_names_in_setting(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
     moved = tuple(name for name in joints if name not in arms.passive_joints)
     for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
         if given and robot is None:
@@ -100,7 +100,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             damping=damping,
             gravity=model.gravity,
             point_frames=model.measured_points,
-            springs={name: JointSpringData(s.stiffness, s.rest_position) for name, s in model.joint_springs.items()},
+            springs={name: StiffnessAndRest(s.stiffness, s.rest_position) for name, s in model.joint_springs.items()},
             servos=arms.servo if mode == "servo" else None,
         )
     if any(said.use_recorded_straight_position for said in model.frames.values()) and run.recordings.estimate:
@@ -159,7 +159,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     of_file = {name: own["damping"] for name, own in _robot_file_constants(run).items() if "damping" in own}
     if isinstance(said, Mapping):
         known = (*joints, _OBJECT_DAMPING_KEY) if has_object else joints
-        require_setting_names(run, "joint", said, known, "model", "damping")
+        check_names_in_setting(run, "joint", said, known, "model", "damping")
         if has_object and _OBJECT_DAMPING_KEY not in said:
             allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
             what = "model.damping lists dampings of joints, but not that of the object"
@@ -170,7 +170,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     else:
         damping, of_object = {name: of_file.get(name, said) for name in joints}, said
     springs = run.model.joint_springs
-    require_setting_names(run, "joint", springs, joints, "model", "joint_springs")
+    check_names_in_setting(run, "joint", springs, joints, "model", "joint_springs")
     return damping | {name: own.damping for name, own in springs.items() if own.damping is not None}, of_object
 
 
@@ -230,7 +230,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
             allowed, hint = "`law_csv` and `depends_on` with kind: law", "leave them out, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         made = make_effect(said.kind, said.location, system, dict(said.values))
-        return effect_with_min_smoothing_speed_at_joint(made, system)
+        return lower_smoothing_speed_to_joint_min(made, system)
     if said.law_csv is None or said.depends_on is None or said.values:
         what, hint = "the law lacks `law_csv` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
         allowed = "`law_csv` and `depends_on`, without `values`"
@@ -290,7 +290,7 @@ def friction_joint_names(run: RunSettings, system: System) -> tuple[str, ...]:
         return ()
     known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
     chosen = known if run.model.friction.joints is None else run.model.friction.joints
-    require_setting_names(run, "joint", chosen, known, "model", "friction", "joints")
+    check_names_in_setting(run, "joint", chosen, known, "model", "friction", "joints")
     return chosen
 
 

@@ -36,7 +36,7 @@ from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
-from yid_ocp.workflow.run_inputs import read_recordings_of_role, require_setting_names
+from yid_ocp.workflow.run_inputs import check_names_in_setting, read_recordings_of_role
 
 log = logging.getLogger(__name__)
 _START_FRAMES = 2  # frames of a cable's free points from which predictions start
@@ -63,7 +63,7 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
     parameters = system.parameters
     chosen = build.settings_by_parameter_name(run, parameters)
     where, wanted = ("problem", "initial_state_fit_parameters"), run.problem.initial_state_fit_parameters
-    require_setting_names(run, "parameter", wanted, parameters.names, *where)
+    check_names_in_setting(run, "parameter", wanted, parameters.names, *where)
     sensors = dict(run.sensors)
     groups = [group for recording in recordings for group in recording.points]
     if build.are_arm_states_estimated(run):
@@ -358,7 +358,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
         own = problem.unpack_episode_unknowns(problem.initial_unknowns, i)
         result = problem.predictor.predict_episode(episode, *own, False, None)
         if isinstance(result, EpisodePrediction):
-            found += point_checks.object_point_correction_issues(episode, result, size)
+            found += point_checks.correctable_object_point_issues(episode, result, size)
     return found
 
 

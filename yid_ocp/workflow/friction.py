@@ -51,7 +51,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
                 continue
-            fits.append(friction_law_comparison.cross_validate_over_motion_kinds(law, problem, solution, kinds))
+            fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds))
             solved[law] = (settings, problem, solution)
         if not fits:
             what, hint = "no friction law could be fitted", "run `yid-ocp check` with this configuration"

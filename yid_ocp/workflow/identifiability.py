@@ -210,7 +210,7 @@ class _IdentifiabilityTasks:
         found = self._done(_profile_likelihood_task, {name: {"name": name} for name in names})
         parameters, profiles = dict(analysis.parameters), dict(analysis.profiles)
         for name, told in zip(names, found, strict=True):
-            parameters[name] = dataclass_from_plain_data(fisher.ParameterStdsAndVerdict, told["parameter"])
+            parameters[name] = dataclass_from_plain_data(fisher.StdsAndVerdictOfParameter, told["parameter"])
             profiles[name] = dataclass_from_plain_data(ParameterProfileLikelihood, told["profile"])
         return replace(analysis, parameters=parameters, profiles=profiles)
 

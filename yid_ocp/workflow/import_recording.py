@@ -20,7 +20,7 @@ from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.options import class_options_by_key, mapping_value_type
-from yid_ocp.report.terminal import importable_file_summary_lines, recording_summary_lines
+from yid_ocp.report.terminal import importable_file_contents_lines, recording_summary_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
@@ -80,7 +80,7 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
             sources = [attributes_to_dict(own, keys) for own in contents.sources]
             options = {**contents.reader_options, **asked}
             found.append({"sources": sources, "options": contents.reader_options, "notes": contents.notes})
-            lines = importable_file_summary_lines(contents)
+            lines = importable_file_contents_lines(contents)
             if not has_native_recording_suffix(file):
                 lines += _proposal_lines([file], options, progress)
         said += [*([f"{file}:"] if len(arguments.files) > 1 else []), *lines, ""]

@@ -183,7 +183,7 @@ def _dependence(
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepResidualsAndJacobians,
-) -> tuple[step_diagnostics.ParameterEquationsAndSensors, ...]:
+) -> tuple[step_diagnostics.EquationsAndSensorsOfParameter, ...]:
     """Return the equations and sensors that depend on each parameter; for free ones also over whole recordings."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
     found = step_diagnostics.equations_and_sensors_per_parameter(step, symbols, episode, point.state, point.theta, rows)

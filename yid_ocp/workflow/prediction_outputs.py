@@ -25,7 +25,7 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import Solution
-from yid_ocp.virtual.mjcf import ExpressionEvaluator, system_joint_dynamics_terms
+from yid_ocp.virtual.mjcf import CasadiEvaluator, system_joint_dynamics_terms
 
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
@@ -122,7 +122,7 @@ def _found_joint_terms(system: System, theta: Array, names: Iterable[str]) -> di
     """Return the attributes of each joint in MJCF that depend on the parameters `names`."""
     values, found = dict(zip(system.parameters.names, theta, strict=True)), {}
     moved = values | {name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in names}
-    terms, others = (system_joint_dynamics_terms(system, ExpressionEvaluator(system, own)) for own in (values, moved))
+    terms, others = (system_joint_dynamics_terms(system, CasadiEvaluator(system, own)) for own in (values, moved))
     for joint, own in terms.items():
         changed = {key for key, size in vars(own).items() if size != getattr(others[joint], key)}
         sizes = {"damping": own.damping, "armature": own.armature, "dry_friction": own.dry_friction}
@@ -233,7 +233,7 @@ def write_diagnosis_hdf5(
         for force in result.events.force_estimates:
             group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit
-            _store(group, {"t": force.t, "value": force.max_likelihood_force, "allowed": force.assumed_model_error})
+            _store(group, {"t": force.t, "value": force.most_likely_force_signal, "allowed": force.assumed_model_error})
 
 
 def _store_sensor(

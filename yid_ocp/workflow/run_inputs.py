@@ -130,7 +130,7 @@ def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[s
     return run.config_error(f"there is no {noun} '{name}'", *path, **unknown_name_error_arguments(name, known))
 
 
-def require_setting_names(
+def check_names_in_setting(
     run: RunSettings, noun: str, names: Iterable[str], known: Collection[str], *path: str | int
 ) -> None:
     """Raise `unknown_name_error` if a list, or a section by name, under the key `path` has a name that is not known."""

@@ -129,7 +129,7 @@ def solution_to_result_dict(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> dict[str, Any]:
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
-    errors, units, residuals = estimation.prediction_errors_units_and_fit_errors(problem, solution, held_out)
+    errors, units, residuals = estimation.prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
     worse = estimation.channels_worse_than_naive_prediction(errors, units)
     return {

@@ -38,7 +38,7 @@ from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import data_quality_issues_of_recording, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, require_setting_names, resolve_recording_path
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, check_names_in_setting, resolve_recording_path
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
@@ -195,7 +195,7 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         raise run.config_error(what, "track", "virtual_frames", allowed=allowed, hint=hint)
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
     offsets, key = settings.gripper_start_offset_from_object_end, "gripper_start_offset_from_object_end"
-    require_setting_names(run, "grasp", offsets, grasps, "track", "virtual_frames", key)
+    check_names_in_setting(run, "grasp", offsets, grasps, "track", "virtual_frames", key)
     with add_setting_location_to_errors(run, "track", "virtual_frames"):
         posture = grasping_joint_angles(system, offsets=offsets)
         simulation = SimulationOptions(settings.duration)

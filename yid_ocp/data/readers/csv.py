@@ -29,7 +29,7 @@ from yid_ocp.data.recording import (
     SensorChannelGroup,
 )
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
-from yid_ocp.files import check_input_file, check_input_number_count, file_sha256, os_error_reason
+from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, os_error_reason
 from yid_ocp.sensors import CHANNEL_KINDS
 
 _VECTORS = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
@@ -252,7 +252,7 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
             count = 0
             for cells in lines:
                 count += len(cells) + _LINE_COST
-                check_input_number_count(count, str(path))
+                check_not_too_many_numbers(count, str(path))
                 if len(cells) > _MAX_COLUMNS:
                     what, hint = f"the table has {len(cells)} columns", "check the --delimiter: comma, semicolon or tab"
                     raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)

@@ -18,7 +18,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, import_optional
-from yid_ocp.files import check_input_file, check_input_number_count, file_sha256, read_input_json
+from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, read_input_json
 
 _STATE, _ACTION = "observation.state", "action"
 _CHANNELS = {
@@ -229,7 +229,7 @@ def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     held = (group.column(i) for group in groups for i in range(group.num_columns))
     count = sum(column.num_values for column in held if column.path_in_schema.split(".list.")[0] in columns)
-    check_input_number_count(count + 3 * metadata.num_rows, where)  # a row is a list of its own
+    check_not_too_many_numbers(count + 3 * metadata.num_rows, where)  # a row is a list of its own
 
 
 def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:

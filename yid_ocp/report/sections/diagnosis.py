@@ -202,7 +202,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         courses = (shape, force.assumed_model_error, -force.assumed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
-        plot = TimePlotData(title, lines, force.t, force.max_likelihood_force, None, spans, dots_name="estimated")
+        plot = TimePlotData(title, lines, force.t, force.most_likely_force_signal, None, spans, dots_name="estimated")
         by_recording.setdefault(force.recording, []).append(plot)
     return "Brief disturbances", sentences, _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
 
