@@ -228,6 +228,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "explained_fraction": 1.0,
         "probability": 0.9,
         "transfer_checks": (),
+        "confusable_parameter_changes": (),
         "smoother_result": smoothed({FORCE: 9.0, BIAS: 9.0}, evidence={"plant": 9.0, "sensor": 9.0, "both": 20.0}),
         "gap_locations": (place(),),
         "nominal_model": fit(lost=loss(2.0, 2.2)),

@@ -65,6 +65,10 @@ def beam(tmp_path_factory):
     swing(folder, "loaded", 2, f"[{{kind: point_mass, location: w_beam, values: {{mass: {LOAD}}}}}]")
     swing(folder, "again", 3)
     swing(folder, "softer", 4, **{"beam.bend": SOFTER})
+    swing(folder, "little_softer", 5, **{"beam.bend": 0.0195})
+    swing(folder, "hardly_softer", 6, **{"beam.bend": 0.01985})
+    bent = "[{kind: rest_curvature, location: beam, values: {qy: 0.1}}]"
+    swing(folder, "softer_and_bent", 7, bent, **{"beam.bend": SOFTER})
     swing(folder, "bare", 1)
     run_solve(load_config(folder / "beam.yaml"), folder / "old")
     return folder
@@ -95,6 +99,25 @@ def test_a_parameter_that_has_left_the_baseline_is_estimated_without_it(beam, tm
     [shift] = outcome.output.baseline_comparison.significant_parameter_shifts
     assert (outcome.result["verdict"], shift.name) == ("no_gap", "beam.bend")
     assert abs(shift.current_value - SOFTER) < 4 * shift.current_std
+
+
+def test_a_change_that_an_effect_imitates_worse_is_a_change(beam, tmp_path):
+    result = diagnosed(beam, "little_softer", tmp_path / "new").result
+    shift = result["baseline"]["parameters"]["beam.bend"]
+    assert result["verdict"] == "no_gap"
+    assert abs(shift["now"] - 0.0195) < 4 * shift["now_std"]
+
+
+def test_a_change_that_explains_as_much_as_an_effect_is_told_and_shares_its_probability(beam, tmp_path):
+    finding = diagnosed(beam, "hardly_softer", tmp_path / "new").output
+    assert finding.confusable_parameter_changes[:1] == ("beam.bend",)
+    assert finding.probability < 0.7
+    assert "a change of beam.bend explains" in finding.summary
+
+
+def test_a_prior_stays_where_the_model_does_not_explain_the_recordings_without_it(beam, tmp_path):
+    final = diagnosed(beam, "softer_and_bent", tmp_path / "new").output.final_model
+    assert "beam.bend" in final.problem.options.multivariate_prior.parameter_names
 
 
 def test_nothing_differs_where_nothing_changed(beam, tmp_path):

@@ -48,7 +48,7 @@ def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
         noise_floor=tuple(AssumedChannelNoiseLevel(*own) for own in levels),
     )
     size = math.sqrt(0.02**2 - 3 * 0.001**2)
-    said = f"exceeds noise by 0 N m (rms) at joints.effort.elbow, {size:.2g} m (rms) at points.end."
+    said = f"exceeds noise; without noise it is 0 N m (rms) at joints.effort.elbow, {size:.2g} m (rms) at points.end."
     assert said in diagnosis_summary_text(made)  # noise alone gives the torque's
 
 

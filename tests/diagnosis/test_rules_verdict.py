@@ -172,7 +172,7 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
 
 def test_equivalent_effects_share_the_probability_of_their_set():
     entry = replace(added(ONE, [OTHER]), shares=(0.7, 0.3))
-    said = Judgement("confusable", "", (), (entry, added(THIRD)), 1.0, (), 0.9)
+    said = Judgement("confusable", "", (), (entry, added(THIRD)), 1.0, (), 0.9, ())
     expected = {ONE.label: 0.63, OTHER.label: 0.27, THIRD.label: 0.9}
     assert said.selected_effect_and_equivalent_probabilities == pytest.approx(expected)
 

@@ -172,7 +172,12 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             what = f"begin and end of {group.name} minus those of the joints are {late:+.3g} s and {over:+.3g} s"
             advice = f"shift the times of {group.name} to the joints' clock"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
-        elif late_notes and options(group.name).clock_offset_std is None and group.clock_offset_std is None:
+        elif (
+            len(recording.points) == 1  # a note does not say which of several groups is late
+            and late_notes
+            and options(group.name).clock_offset_std is None
+            and group.clock_offset_std is None
+        ):
             lag = late_notes[0].partition(LATE_POINTS_WORDS)[2]
             setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0]}"
             what, advice = LATE_POINTS_WORDS + lag, f"if the object does not lag behind, set {setting}: a fit finds it"

@@ -43,7 +43,7 @@ class _ParameterShift:
     unit: str
     baseline_value: float
     baseline_std: float
-    current_value: float  # estimate from the baseline and the recordings together
+    current_value: float  # estimate from the recordings and, if it has a prior, the baseline
     current_std: float
     z_score: float | None  # shift in standard deviations; None if the recordings do not inform the parameter
     p_value: float  # p-value of the shift if nothing changed
@@ -139,11 +139,6 @@ class EarlierRunsBaseline:
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, own)
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
-
-    def fit_parameters_differ_from_baseline(self, fit: RefittedModel, limits: Thresholds) -> bool:
-        """Return whether a parameter of `fit` differs significantly from the earlier runs. False without runs."""
-        found = self.parameter_shifts_of_fit(fit, limits)
-        return found is not None and bool(found.significant_parameter_shifts)
 
     def parameters_shifted_since_baseline(self, fit: RefittedModel, limits: Thresholds) -> list[str]:
         """List the significantly changed parameters of `fit` that earlier runs still hold, most changed first."""

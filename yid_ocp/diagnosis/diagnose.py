@@ -225,25 +225,34 @@ def _without_priors_of(problem: AllCandidatesProblem, released: Sequence[str]) -
     return replace(problem, problem=problem.problem.with_replaced_multivariate_prior(kept))
 
 
-def _with_changed_parameters(seen: _Examined, judged: Judgement, earlier: EarlierRunsBaseline) -> _Examined | None:
+def _with_changed_parameters(
+    seen: _Examined, judged: Judgement, earlier: EarlierRunsBaseline
+) -> tuple[_Examined | None, Judgement]:
     """The nominal model, examined again without the priors of parameters that have left the earlier runs.
 
     None if it does not explain the recordings, or decidedly worse than rejected or not decidedly better than accepted
-    effects.
+    effects. Changes that explain as much as accepted effects enter the returned judgement and its probability.
     """
     search, fit, released = seen.search, seen.nominal, list[str]()
-    with contextlib.suppress(SolverError):
-        while left := earlier.parameters_shifted_since_baseline(fit, search.thresholds):
-            search.progress.begin_stage(f"trying a change of {' and '.join([*released, left[0]])}", 1.0, 8.5)
-            free = _without_priors_of(search.problem, [*released, left[0]])
-            fit = _fitted_nominal_model(search.restarted_with(free), fit.values)
-            released.append(left[0])
+    while left := earlier.parameters_shifted_since_baseline(fit, search.thresholds):
+        search.progress.begin_stage(f"trying a change of {' and '.join([*released, left[0]])}", 1.0, 8.5)
+        free = _without_priors_of(search.problem, [*released, left[0]])
+        refitted = refit_with_effects(free, (), fit.values)
+        if refitted is None:
+            break
+        released.append(left[0])
+        fit = refitted
     best = [seen.nominal, *(entry.refitted_model for entry in judged.selected_effects)][-1]
-    limits, most = search.thresholds, 1.0 if judged.verdict == "unknown" else -1.0
-    if not released or select.bic_difference_per_threshold(fit, best, len(released), limits) > most:
-        return None
-    anew = _examined_with(seen, _without_priors_of(seen.with_events.problem, released))
-    return None if anew.evidence.residual_exceeds_noise(limits) else anew
+    difference = select.bic_difference_per_threshold(fit, best, len(released), search.thresholds)
+    if not released or difference > 1.0:
+        return None, judged
+    if judged.accepted_selected_effects and difference > -1.0:
+        return None, judged.with_confusable_parameter_changes(released, difference)
+    with contextlib.suppress(SolverError):
+        anew = _examined_with(seen, _without_priors_of(seen.with_events.problem, released))
+        if not anew.evidence.residual_exceeds_noise(search.thresholds):
+            return anew, judged
+    return None, judged
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
@@ -367,12 +376,14 @@ def _excess_of(residual: Array) -> float:
 
 def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
-    evidence = replace(seen.evidence, has_left_baseline=earlier.fit_parameters_differ_from_baseline(nominal, limits))
+    shifted = earlier.parameters_shifted_since_baseline(nominal, limits)
+    evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
     judged = judge(search, evidence)
     # after the deadline a search that begins anew would find nothing
-    is_early = time.perf_counter() < search.deadline
-    if is_early and (anew := _with_changed_parameters(seen, judged, earlier) or _examined_anew(seen, judged)):
-        return _diagnosed(problem, anew, earlier)
+    if time.perf_counter() < search.deadline:
+        anew, judged = _with_changed_parameters(seen, judged, earlier)
+        if anew := anew or _examined_anew(seen, judged):
+            return _diagnosed(problem, anew, earlier)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):
@@ -401,7 +412,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     search.record_stage_end_time("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
-    law = find_gap_law(search, problem, final, places, seen.events)
+    prior = nominal.problem.options.multivariate_prior
+    law = find_gap_law(search, problem.with_replaced_multivariate_prior(prior), final, places, seen.events)
     search.record_stage_end_time("law")
     ends = search.stage_ends
     finding = DiagnosisResult(

@@ -113,6 +113,11 @@ def bic_difference_per_threshold(fit: RefitStatistics, other: RefitStatistics, m
     return difference / (2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor)
 
 
+def relative_probability(bic_difference: float) -> float:
+    """Compute the probability of a model beside another one with a BIC that is larger by a relative difference."""
+    return 1.0 / (1.0 + math.exp(-_LOG_ODDS_PER_DISTANCE * bic_difference))
+
+
 def _near_best_models(
     nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
 ) -> list[tuple[RefitStatistics, float]]:

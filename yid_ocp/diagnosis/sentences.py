@@ -81,7 +81,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
     used = f"Only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of '{cut.recording}' are used"
-    return f"{used}: the nominal model cannot be simulated any further."
+    return f"{used}: the simulation of the nominal model fails later on."
 
 
 def overspeed_truncation_messages(events: EventSet) -> list[str]:
@@ -231,7 +231,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
     what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
     said = "is within noise and the uncertainty of the parameters"
     if result.remaining_test.p_value < result.thresholds.significance_level:
-        said = f"exceeds noise by {', '.join([*worst.values(), *mostly])}"
+        said = f"exceeds noise; without noise it is {', '.join([*worst.values(), *mostly])}"
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g}"
         for name, own in result.nominal_parameters_before_and_after.items()
@@ -249,7 +249,10 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
             now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
             moved.append(f"{own.name} goes from {before} to {now} {own.unit}")
-        text.append(_listed("Against the baseline, ", moved or ["no parameter has changed detectably"]))
+        rivals = abbreviated_names_text(result.confusable_parameter_changes)
+        alike = [f"a change of {rivals} explains the recordings about as well as the effects"] * bool(rivals)
+        moved = [*moved, *alike] or ["no parameter has changed detectably"]
+        text.append(_listed("Against the baseline, ", moved))
         differ = f"The runs of the baseline differ among themselves (p = {since.between_runs_p_value:.2g})"
         small = "The model did not explain the baseline's recordings, so its ± may be too small."
         notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}; their ± includes this.")

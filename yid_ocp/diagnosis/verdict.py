@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -99,6 +100,7 @@ class Judgement:
     explained_fraction: float  # decrease of r'r by the effects over its excess over noise
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
+    confusable_parameter_changes: tuple[str, ...]  # changes since a baseline that explain as much as the effects
 
     @property
     def closure_by_selected_effects(self) -> HeldOutGapClosure:
@@ -109,6 +111,11 @@ class Judgement:
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
         """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
+
+    def with_confusable_parameter_changes(self, names: Sequence[str], bic_difference: float) -> Judgement:
+        """Return this judgement if changes of parameters explain as much; their BIC minus the effects' is relative."""
+        share = select.relative_probability(bic_difference)
+        return replace(self, confusable_parameter_changes=tuple(names), probability=self.probability * share)
 
     @property
     def failed_transfer_checks(self) -> tuple[EffectAmplitudeTransferCheck, ...]:
@@ -190,7 +197,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
             least = {f"{e.effect_label}.{e.parameter}": e.significant_disagreement_as_std for e in carried}
             last = replace(last, std={name: max(std, least.get(name, 0.0)) for name, std in last.std.items()})
             chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
-        said = Judgement("", "", fits, chosen, explained, carried, 0.0)
+        said = Judgement("", "", fits, chosen, explained, carried, 0.0, ())
         verdict, reason = _verdict(said, evidence.residual_exceeds_noise(limits), evidence.are_data_sufficient, limits)
         return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 

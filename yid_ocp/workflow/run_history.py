@@ -60,7 +60,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         names = tuple(str(name) for name in known["names"])
         values = np.array([float(parameters[name]["value"]) for name in names])
         matrix = np.array(known["matrix"], float).reshape(len(names), len(names))
-        # noise that moves an object differs from run to run; errors of links and time step are the same in all runs
+        # errors of links and time step are the same in all runs; shifts by encoder noise depend on the motions
         shifts = [result.get("discretisation", {}).get(name, {}).get("encoder_noise") or 0.0 for name in names]
         spread = 2 * np.array(shifts, float)
         matrix += np.outer(spread, spread)
