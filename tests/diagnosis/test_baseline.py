@@ -111,6 +111,7 @@ def test_a_change_that_an_effect_imitates_worse_is_a_change(beam, tmp_path):
 def test_a_change_that_explains_as_much_as_an_effect_is_told_and_shares_its_probability(beam, tmp_path):
     finding = diagnosed(beam, "hardly_softer", tmp_path / "new").output
     assert finding.confusable_parameter_changes[:1] == ("beam.bend",)
+    assert finding.verdict == "confusable"
     assert finding.probability < 0.7
     assert "a change of beam.bend explains" in finding.summary
 

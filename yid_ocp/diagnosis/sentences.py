@@ -49,6 +49,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
         "unknown": mostly or "Record other motions, faster and larger.",
         "no_gap": f"None needed: no relevant gap was found.{_listed(' These motions cannot show ', unseen)}",
+        "confusable": "Record other motions, in which effects and changed parameters act differently.",
         "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
     }
     return texts[result.verdict]

@@ -115,7 +115,8 @@ class Judgement:
     def with_confusable_parameter_changes(self, names: Sequence[str], bic_difference: float) -> Judgement:
         """Return this judgement if changes of parameters explain as much; their BIC minus the effects' is relative."""
         share = select.relative_probability(bic_difference)
-        return replace(self, confusable_parameter_changes=tuple(names), probability=self.probability * share)
+        rivals, probability = tuple(names), self.probability * share
+        return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
     @property
     def failed_transfer_checks(self) -> tuple[EffectAmplitudeTransferCheck, ...]:
