@@ -32,9 +32,11 @@ from yid_ocp.solvers import GaussNewton
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
-# Ratio of the distance to the limit of many links or short steps to the shift of one halving, for an error proportional
-# to their size: m + m/2 + m/4 + ...
-_EXTRAPOLATION_FACTOR = 2.0
+EXTRAPOLATION_FACTOR = 2.0
+"""Ratio of the distance to the limit of many links, short steps or no encoder noise to the shift of one refinement.
+
+It is exact for an error proportional to their size: m + m/2 + m/4 + ...
+"""
 _N_NOISE_DRAWS = 6  # of encoder noise
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MAX_FINER_FIT_ITERATIONS, _MAX_LINEAR_CHANGE = 3, 10.0  # of r'r, below which a linear step decides
@@ -361,7 +363,7 @@ def estimates_widened_by_discretisation_error(
     for name, own in found.items():
         entry = counted[name]
         shifts = [move for move in astuple(own) if move is not None and abs(move) > entry.std]
-        std = math.hypot(entry.std, *(_EXTRAPOLATION_FACTOR * move for move in shifts))
+        std = math.hypot(entry.std, *(EXTRAPOLATION_FACTOR * move for move in shifts))
         if not entry.free or not std > entry.std:
             continue
         verdict, said = entry.verdict, verdict_by_relative_std(entry.value, std, sizes.get(name, 0.0))

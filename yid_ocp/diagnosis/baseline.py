@@ -140,7 +140,7 @@ class EarlierRunsBaseline:
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
-    def parameters_shifted_since_baseline(self, fit: RefittedModel, limits: Thresholds) -> list[str]:
+    def shifted_parameters_with_prior(self, fit: RefittedModel, limits: Thresholds) -> list[str]:
         """List the significantly changed parameters of `fit` that earlier runs still hold, most changed first."""
         found, held = self.parameter_shifts_of_fit(fit, limits), fit.problem.options.multivariate_prior.parameter_names
         return [entry.name for entry in found.significant_parameter_shifts if entry.name in held] if found else []

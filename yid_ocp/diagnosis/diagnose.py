@@ -148,7 +148,8 @@ def _examined(
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     composed.changes_by_encoder_noise.clear()
     loss = held_out_loss(own, nominal.unknowns, nominal.evaluation, spread, predicted)
-    nominal, predicted = replace(nominal, held_out_loss=loss), []
+    nominal = replace(nominal, held_out_loss=loss)
+    del predicted  # its derivatives would fill the memory
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, *tests, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
@@ -234,14 +235,13 @@ def _with_changed_parameters(
     effects. Changes that explain as much as accepted effects enter the returned judgement and its probability.
     """
     search, fit, released = seen.search, seen.nominal, list[str]()
-    while left := earlier.parameters_shifted_since_baseline(fit, search.thresholds):
-        search.progress.begin_stage(f"trying a change of {' and '.join([*released, left[0]])}", 1.0, 8.5)
-        free = _without_priors_of(search.problem, [*released, left[0]])
-        refitted = refit_with_effects(free, (), fit.values)
+    while left := earlier.shifted_parameters_with_prior(fit, search.thresholds):
+        tried = [*released, left[0]]
+        search.progress.begin_stage(f"trying a change of {' and '.join(tried)}", 1.0, 8.5)
+        refitted = refit_with_effects(_without_priors_of(search.problem, tried), (), fit.values)
         if refitted is None:
             break
-        released.append(left[0])
-        fit = refitted
+        fit, released = refitted, tried
     best = [seen.nominal, *(entry.refitted_model for entry in judged.selected_effects)][-1]
     difference = select.bic_difference_per_threshold(fit, best, len(released), search.thresholds)
     if not released or difference > 1.0:
@@ -376,7 +376,7 @@ def _excess_of(residual: Array) -> float:
 
 def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
     search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
-    shifted = earlier.parameters_shifted_since_baseline(nominal, limits)
+    shifted = earlier.shifted_parameters_with_prior(nominal, limits)
     evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
     judged = judge(search, evidence)
     # after the deadline a search that begins anew would find nothing

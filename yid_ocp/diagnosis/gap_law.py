@@ -143,7 +143,8 @@ def find_gap_law(
         runner_up = (rival.location, "+".join(rival.quantities), closed.fraction)
     # the model without the law may move far beyond the recorded range: new knots for the visited range
     visited = {quantity: _visited_range(best.fit, best.law.location, quantity) for quantity in best.law.quantities}
-    if any(b - a < _MIN_VISITED_PART * float(np.ptp((best.law.knots or {})[name])) for name, (a, b) in visited.items()):
+    before_knots = best.law.knots or {}
+    if any(np.ptp(ends) < _MIN_VISITED_PART * np.ptp(before_knots[name]) for name, ends in visited.items()):
         finer = _neutral_law(best.fit, best.law.location, best.law.quantities, last.problem.system)
         again, better = _refitted_families(search, problem, last, [finer], events, best.law.quantities)
         if again is not None and better and better[0].loss.chi2_per_sample <= best.loss.chi2_per_sample:

@@ -96,21 +96,24 @@ def chi2_per_sample_decrease_and_std_error(before: HeldOutLoss, after: HeldOutLo
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
-def bic_difference(fit: RefitStatistics, other: RefitStatistics) -> float:
+def bic_difference(fit: RefitStatistics, other: RefitStatistics, more: int = 0) -> float:
     """Compute the BIC (Bayesian information criterion) of `fit` minus that of `other`; negative if `fit` is better.
 
     The BIC is the smallest r'r of a fit to estimation and held-out recordings (r: whitened residual) plus log(n) per
-    effect parameter, with n residuals (Schwarz 1978, doi:10.1214/aos/1176344136).
+    effect parameter, with n residuals (Schwarz 1978, doi:10.1214/aos/1176344136). `more` parameters of `fit` count too.
     """
     held = fit.held_out_loss.added_joint_fit_chi2 - other.held_out_loss.added_joint_fit_chi2
-    more = fit.total_effect_parameter_count - other.total_effect_parameter_count
+    more += fit.total_effect_parameter_count - other.total_effect_parameter_count
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
 
 
 def bic_difference_per_threshold(fit: RefitStatistics, other: RefitStatistics, more: int, limits: Thresholds) -> float:
     """Compute the BIC of `fit`, which has `more` parameters beside its effects', minus that of `other`; ±1 decides."""
-    difference = bic_difference(fit, other) + more * math.log(max(fit.residual_count, 1))
-    return difference / (2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor)
+    return bic_difference(fit, other, more) / _decisive_bic_difference(limits)
+
+
+def _decisive_bic_difference(limits: Thresholds) -> float:
+    return 2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor
 
 
 def relative_probability(bic_difference: float) -> float:
@@ -134,7 +137,7 @@ def _near_best_models(
         # chi2 would be found by a test
         samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
         errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
-        decisive = max(2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor, errors)
+        decisive = max(_decisive_bic_difference(limits), errors)
         distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:

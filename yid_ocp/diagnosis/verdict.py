@@ -113,7 +113,10 @@ class Judgement:
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     def with_confusable_parameter_changes(self, names: Sequence[str], bic_difference: float) -> Judgement:
-        """Return this judgement if changes of parameters explain as much; their BIC minus the effects' is relative."""
+        """Return this judgement if changes explain as much, with the BIC of the changes minus that of the effects.
+
+        The difference of the BIC is divided by the threshold (`select.bic_difference_per_threshold`).
+        """
         share = select.relative_probability(bic_difference)
         rivals, probability = tuple(names), self.probability * share
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)

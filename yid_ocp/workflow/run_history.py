@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from yid_ocp.analysis.discretisation import EXTRAPOLATION_FACTOR
 from yid_ocp.analysis.run_estimates import (
     DriftAndOutlierTestResults,
     RunEstimates,
@@ -62,7 +63,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         matrix = np.array(known["matrix"], float).reshape(len(names), len(names))
         # errors of links and time step are the same in all runs; shifts by encoder noise depend on the motions
         shifts = [result.get("discretisation", {}).get(name, {}).get("encoder_noise") or 0.0 for name in names]
-        spread = 2 * np.array(shifts, float)
+        spread = EXTRAPOLATION_FACTOR * np.array(shifts, float)
         matrix += np.outer(spread, spread)
         units = {name: str(parameters[name]["unit"]) for name in names}
         explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
