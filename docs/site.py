@@ -36,7 +36,7 @@ def public() -> list[str]:
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Fill the navigation."""
-    config.nav = ["index.md", *({title: pages(shelf)} for title, shelf in SHELVES.items())]
+    config.nav = ["index.md", "glossary.md", *({title: pages(shelf)} for title, shelf in SHELVES.items())]
     config.nav.append({"Design": chapters()})
     config.nav.append({"Python": [{name: f"api/{name}.md"} for name in public()]})
     return config
