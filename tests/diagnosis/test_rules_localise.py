@@ -9,7 +9,7 @@ from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, cases, place, smoothed, 
 
 from yid_ocp.inference.smoother import (
     gap_locations_by_smoother_evidence,
-    gap_locations_from_effects_and_smoother,
+    gap_locations_from_closures_and_smoother,
     interval_edges_names_and_z_scores,
     merge_time_intervals,
     smoothed_unknown_units,
@@ -87,7 +87,7 @@ T1, T2, T3 = place("T1"), place("T2"), place("T3")
     },
 )
 def test_places_of_effects_share_by_what_they_close(before, closed, rest, expected):
-    found = described(gap_locations_from_effects_and_smoother([before], closed, rest, ()))
+    found = described(gap_locations_from_closures_and_smoother([before], closed, rest, ()))
     assert sorted(found, key=lambda p: p[0]) == sorted(expected, key=lambda p: p[0])
     shares = [share.expected for _, share, _ in found]
     assert shares == sorted(shares, reverse=True)
@@ -98,10 +98,10 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
     before = [place("T1", windows=seen), place("T2")]
     found = {
         p.location: p.time_windows
-        for p in gap_locations_from_effects_and_smoother(before, {"T1": 0.5, "world": 0.2}, [place("T3")], residual)
+        for p in gap_locations_from_closures_and_smoother(before, {"T1": 0.5, "world": 0.2}, [place("T3")], residual)
     }
     assert found == {"T1": seen, "world": residual, "T2": (), "T3": ()}
-    [whole] = gap_locations_from_effects_and_smoother([place("T2")], {"T2": 1.0}, [], residual)
+    [whole] = gap_locations_from_closures_and_smoother([place("T2")], {"T2": 1.0}, [], residual)
     assert whole.time_windows == residual
 
 

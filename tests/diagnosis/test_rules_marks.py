@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.workflow import blind_slices
-from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, write_slice
+from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, write_slice_results
 
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
@@ -395,7 +395,7 @@ def written_slice(tmp_path, part, cases, **changes):
     found["labels_sha256"] = labels_json_and_sha256(labels)[1]
     folder = tmp_path / part.replace("/", "-") / str(len(list(tmp_path.iterdir())))
     folder.mkdir(parents=True)
-    write_slice(found | changes, folder)
+    write_slice_results(found | changes, folder)
     return folder
 
 

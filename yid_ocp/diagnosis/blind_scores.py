@@ -35,7 +35,7 @@ from yid_ocp.effects.base import ParameterDefinition
 from yid_ocp.errors import DataError
 from yid_ocp.files import dataclass_from_plain_data, to_json_types, to_lossless_plain_data
 from yid_ocp.inference.null_test import NullTestResult
-from yid_ocp.inference.smoother import GapLocation, gap_locations_from_effects_and_smoother
+from yid_ocp.inference.smoother import GapLocation, gap_locations_from_closures_and_smoother
 from yid_ocp.model.parameters import Parameter, Parameters
 
 _FORMAT = "yid-blind/1"
@@ -568,5 +568,5 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     where = case.located_gap
     if judged.accepted_selected_effects:
         rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
-        where = gap_locations_from_effects_and_smoother(where, judged.accepted_effects_closure_by_location, rest, ())
+        where = gap_locations_from_closures_and_smoother(where, judged.accepted_effects_closure_by_location, rest, ())
     return judgement_to_dict(judged, case.evidence, where)

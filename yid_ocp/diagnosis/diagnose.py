@@ -406,7 +406,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
             rest = smoother.gap_locations_by_smoother_evidence(left)
         flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
-        where = smoother.gap_locations_from_effects_and_smoother(where, closed, rest, windows)
+        where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
         events = _happened(seen.with_events.problem.problem_fitting_all_samples, final, limits)[0]
     search.record_stage_end_time("remaining")

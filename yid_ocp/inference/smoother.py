@@ -530,7 +530,7 @@ def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[fl
     return tuple(joined)
 
 
-def gap_locations_from_effects_and_smoother(
+def gap_locations_from_closures_and_smoother(
     before: Sequence[GapLocation],
     closed: Mapping[str, float],
     rest: Sequence[GapLocation],

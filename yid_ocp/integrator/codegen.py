@@ -225,7 +225,7 @@ def kernel_cache_key_text(functions: StepFunctions, tables: StepSparsityTables) 
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
-    """Generate the C source of the stepping kernel from `simd.c`, CasADi's functions, sizes, tables and `kernel.c`.
+    """Join `simd.c`, CasADi's functions, sizes and tables, and `kernel.c` to the C source of the stepping kernel.
 
     With `batched`, the kernel integrates `yid_simd_width` rollouts at once; None if a function has no SIMD form.
     """

@@ -263,7 +263,7 @@ def central_difference_velocity(q: Array, nodes: IntArray, time_step: float) -> 
 
 
 def central_difference_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Return the transpose of `central_difference_velocity` times `pull` (len(nodes), n), for all `count` nodes."""
+    """Apply the transpose of the map `central_difference_velocity` to `pull` (len(nodes), n). Returns (count, n)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
     scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))
     np.add.at(result, after, scaled)

@@ -62,7 +62,7 @@ class ZeroPhaseLowPassFilter:
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 
     def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeValueSmoother:
-        """Make a matrix filter that smooths values at `nodes` out of `count` nodes, `step` [s] apart.
+        """Make a matrix filter that gives smoothed values at `nodes`, from values at `count` nodes `step` [s] apart.
 
         The filter does not use the value at node 0. The signal is constant before node 1 and after the last node.
         """

@@ -142,7 +142,7 @@ def filtered_effort_sensor_data(
     time. Raises `DataError` if the recording is too short for the filter.
     """
     # the mean of an interval belongs to its centre
-    kept, measured = node_indices_and_low_pass_values(inputs, t, values, "efforts", at_centres=not is_sample)
+    kept, measured = decorrelated_nodes_and_low_pass_values(inputs, t, values, "efforts", at_centres=not is_sample)
     measured[_may_stick(inputs, sensor.joint_names, inputs.node_times[kept])] = np.nan
     times, last = inputs.node_times[kept], len(inputs.node_times) - 1
     unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
@@ -153,7 +153,7 @@ def filtered_effort_sensor_data(
     return SensorData(sensor, times, measured, *more, smoothing_filter=inputs.effort_filter)
 
 
-def node_indices_and_low_pass_values(
+def decorrelated_nodes_and_low_pass_values(
     inputs: SensorDataInputs, t: Array, values: Array, noun: str, *, at_centres: bool = False, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).

@@ -17,7 +17,7 @@ from yid_ocp.sensors.joints import (
     JOINT_POSITION_GROUP_NAME,
     is_noise_std_stated,
     joint_angle_noise_std,
-    node_indices_and_low_pass_values,
+    decorrelated_nodes_and_low_pass_values,
 )
 
 _Kind = TypeVar("_Kind", bound="MountedSensor")
@@ -99,7 +99,7 @@ def _measured(
         kept = (group.t >= last[0] - 1e-9) & (group.t <= last[1] + 1e-9)
         own = np.broadcast_to(by_output[0], values[kept].shape)
         return base.SensorData(sensor, group.t[kept], values[kept], own, inner, by_output[1])
-    nodes, measured = node_indices_and_low_pass_values(around, group.t, values, key, like_path=True)
+    nodes, measured = decorrelated_nodes_and_low_pass_values(around, group.t, values, key, like_path=True)
     times, period = around.node_times[nodes], float(np.median(np.diff(group.t)))
     own = by_output[0] * around.path_filter.noise_gains_of_value_and_rates(period)[0]
     total, correlation = _with_encoder_noise(around, sensor, own, times)

@@ -302,7 +302,7 @@ _DEFAULT_OPTIONS = SkeletonOptions()
 def extract_skeleton_graph(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULT_OPTIONS
 ) -> CloudSkeleton:
-    """Extract the skeleton of a cloud, from its lowest point on. Connected parts with few points are omitted."""
+    """Extract the skeleton of a cloud, which is thinned from its lowest point on. Small connected parts are omitted."""
     nodes, size, label = _thin_to_nodes(cloud, rng, options)
     edges, part = _spanning_forest(nodes, options)
     if not len(nodes):

@@ -33,7 +33,7 @@ from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_ta
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmImperfections
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
-from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, score_whole_ensemble, write_slice
+from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, score_whole_ensemble, write_slice_results
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
@@ -136,7 +136,7 @@ def run_blind(
         "answers": answers,
         "best": best,
     }
-    return score_whole_ensemble([write_slice(found, proof.folder)], proof.folder, runs, progress)
+    return score_whole_ensemble([write_slice_results(found, proof.folder)], proof.folder, runs, progress)
 
 
 @dataclass(frozen=True)

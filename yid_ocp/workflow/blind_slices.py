@@ -26,7 +26,7 @@ from yid_ocp.workflow.run_folder import current_local_time_text
 _SLICE_FORMAT = "yid-blind-slice/1"
 
 
-def write_slice(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def write_slice_results(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Write a slice of a blind validation (labels, answers, hashes) to `slice.json`, and return what was written."""
     written: dict[str, Any] = to_json_types({"format": _SLICE_FORMAT, **found})
     written["ensemble_sha256"] = _ensemble_sha256(written)

@@ -40,7 +40,7 @@ from yid_ocp.workflow.solve import solve_and_choose_cable_shape_memory
 
 @dataclass(frozen=True)
 class IdentifiabilityOptions:
-    """The options of an identifiability analysis beyond the run's settings.
+    """The options of an identifiability analysis that are not part of the run's settings.
 
     `evaluation_point`: parameter values of the analysis, from a solve or the `initial` ones. `start_knowledge`: initial
     states are `assumed` as in the settings, so that verdicts equal those of `solve`, or all `unknown` and estimated.

@@ -225,7 +225,7 @@ class ObjectBuilder:
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
-        """Return the factor on a parameter that keeps a segment's stiffness or damping if its links are divided."""
+        """Return the factor on a parameter that keeps its segment as stiff and damped if each link is divided."""
         owner, _, quantity = parameter.rpartition(".")
         per_joint = {segment.name for segment in self.segment_definitions() if not segment.values_given_as_rigidities}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
