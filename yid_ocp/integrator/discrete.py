@@ -122,7 +122,7 @@ class DiscreteEquations:
 
     @property
     def force_with_derivatives_impulses(self) -> tuple[ca.SX, ca.SX] | None:
-        """The impulses of `force_with_derivatives` in `momentum_balance` and `p1`, each (n, 1) [N m s], or None."""
+        """The impulses (n, 1) [N m s] that `force_with_derivatives` adds to `momentum_balance` and `p1`, or None."""
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares

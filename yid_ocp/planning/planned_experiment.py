@@ -249,7 +249,7 @@ class SplineMotionExperiment:
         return np.vstack([found, np.eye(len(std))])
 
     def sensitivities_to_unknowns(self, w: Array) -> Array | None:
-        """Return whitened sensitivities (nr, columns) to relative changes of unknowns, or None if the rollout fails."""
+        """Return derivatives of whitened residuals (nr + no, columns) by relative changes of unknowns, or None."""
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None

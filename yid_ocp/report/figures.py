@@ -248,7 +248,7 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> _Figur
 
 
 def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
-    """Plot each method's cost over its lowest one, minus 1, against wall time. `costs`: (seconds, costs) by method."""
+    """Plot (cost / lowest cost of the same method) - 1 against wall time. `costs`: (seconds, costs) by method."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     _set_axis(figure, "yaxis", type="log")
     least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}

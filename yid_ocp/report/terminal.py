@@ -132,7 +132,7 @@ def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
 
 
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield the found values of a result in the formats of other programs, to copy. Nothing if none is found."""
+    """Yield the found values of a result to copy, as text, YAML, MJCF and LaTeX. Nothing if none is found."""
     if use := result.get("to_use"):
         left_out = " and ".join(use["uncounted_errors"])
         stated = f"± is one standard deviation{f', without the error {left_out}' if left_out else ''}"

@@ -15,9 +15,9 @@ from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
 from yid_ocp.sensors.joints import (
     JOINT_POSITION_GROUP_NAME,
+    decorrelated_nodes_and_low_pass_values,
     is_noise_std_stated,
     joint_angle_noise_std,
-    decorrelated_nodes_and_low_pass_values,
 )
 
 _Kind = TypeVar("_Kind", bound="MountedSensor")
