@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from yid_ocp.arrays import Array
+from yid_ocp.display import PartsDoneCounter
 from yid_ocp.effects.law import torque_law_quantity_at_midpoints
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.problem import EstimationProblem
@@ -57,15 +58,22 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 
 
 def cross_validate_law_by_motion_kind(
-    law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
+    law: str,
+    problem: EstimationProblem,
+    solution: Solution,
+    kinds: Mapping[str, Sequence[str]],
+    parts: PartsDoneCounter | None = None,
 ) -> CrossValidatedFrictionLawFit:
-    """Fit a friction law without each of the `kinds` of motion in turn, and compute its errors on the omitted kind."""
+    """Fit a friction law without each of the `kinds` of motion in turn, and compute its errors on the omitted kind.
+
+    `parts` counts the fits.
+    """
     errors: dict[str, float] = {}
     used = (e.measurements for e in problem.episodes)
     is_whitened = {own[i].sensor.unit for own in used for i in _indices_of_sensors_of_friction(own)} != {"rad"}
     pairs = list(zip(problem.episodes, problem.whitening_filters, strict=True))
     known = problem.unknowns.named_values(solution.x)
-    for own in kinds.values():
+    for kind, own in kinds.items():
         inside, outside = ([pair for pair in pairs if (pair[0].name in own) == out] for out in (False, True))
         (episodes, filters), (left, left_filters) = zip(*inside, strict=True), zip(*outside, strict=True)
         fold = problem.with_episodes(episodes, left, filters, left_filters)
@@ -83,6 +91,8 @@ def cross_validate_law_by_motion_kind(
             else:
                 rows = np.vstack([p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)])
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
+        if parts is not None:
+            parts.count_done(f"{law} without {kind}")
     free = {name: entry for name, entry in solution.parameters.items() if name in problem.free}
     unit = "std" if is_whitened else "rad"
     return CrossValidatedFrictionLawFit(law, free, errors, unit, solution.status.value == "converged")

@@ -10,7 +10,7 @@ from typing import Any
 from yid_ocp.analysis import friction_law_comparison
 from yid_ocp.analysis.friction_law_comparison import CrossValidatedFrictionLawFit, mean_and_std_error_over_motion_kinds
 from yid_ocp.config.settings import FrictionLawSettings, RunSettings
-from yid_ocp.display import Progress
+from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem
@@ -45,13 +45,16 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             what = "a law is tested on recordings that are not fitted, but fewer than two can be used"
             raise DataError(what, where=run.setting_location("recordings"), allowed=allowed, hint=hint)
         problems = friction_law_comparison.problems_with_common_samples(problems)
+        progress.begin_stage("fitting the friction laws, each also with one kind of motion left out in turn")
+        parts = PartsDoneCounter(progress, len(problems) * (1 + len(kinds)), next(iter(by_law)))
         for (law, settings), problem in zip(by_law.items(), problems, strict=True):
-            progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
             solution = fit_problem(problem, run.solver, restarts=not problem.system.driven)
             if solution.status == Status.FAILED:
-                progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
+                for _ in range(1 + len(kinds)):
+                    parts.count_done(f"{law} could not be fitted: {solution.message}")
                 continue
-            fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds))
+            parts.count_done(law)
+            fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds, parts))
             solved[law] = (settings, problem, solution)
         if not fits:
             what, hint = "no friction law could be fitted", "run `yid-ocp check` with this configuration"
