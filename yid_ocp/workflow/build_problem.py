@@ -123,7 +123,7 @@ def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> No
         of_arm = i in driven or name in run.model.arms.passive_joints
         if not of_arm and driven.intersection(tree.ancestor_joint_indices(i)):
             what = f"{name} of the object is mounted on a driven arm; the tracking filter needs the arm's own momentum"
-            hint = "set model.arms.mode: prescribed; or hold the object by `model.grasp`, not by `model.object.mount`"
+            hint = "set problem.arm_tracking_feedback: proportional, or model.arms.mode: prescribed; or use model.grasp"
             allowed = "a driven arm that holds its object by a grasp"
             raise run.config_error(what, "model", "object", "mount", allowed=allowed, hint=hint)
 
