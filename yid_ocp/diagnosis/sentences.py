@@ -34,11 +34,12 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     for rivals in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
-        varied = f"Vary {' and '.join(aspects)} independently of each other, over a wide range, in one recording."
+        vary = next((f"At {place}, vary" for place in places if place not in _IMMOVABLE_LOCATIONS), "Vary")
+        varied = f"{vary} {' and '.join(aspects)} independently and over a wide range, in one recording."
         advice = (
             (aspects, varied),
             (places, f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."),
-            (rivals, f"Vary {aspects[0]} over a wider range."),
+            (rivals, f"{vary} {aspects[0]} over a wider range."),
         )
         if told := [text for several, text in advice if len(several) > 1]:
             return told[0]
