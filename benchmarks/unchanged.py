@@ -2,10 +2,13 @@
 
     python benchmarks/unchanged.py [NAME ...] [--workers 2] [--keep DIR]   compare with benchmarks/unchanged.json
     python benchmarks/unchanged.py --record [NAME ...] ...                 write what is found into that file
+    python benchmarks/unchanged.py --minimum diagnose:CASE ...             both, seen from the minimum of the cost
 
 A NAME is `solve:CONFIGURATION` (a file of `configs/` without its suffix) or `diagnose:CASE` (of `diagnosis_cases.py`);
 without names all are run. An estimate may move by a hundredth of its recorded standard deviation, a verdict not at all.
 With `--keep`, what a folder holds is not done again; it counts for one version of the package only.
+A fit stops near the minimum of its cost. With `--minimum`, the fits of a diagnosis go on until they no longer move, and
+it is printed how far the recorded and the new estimates lie from there.
 """
 
 from __future__ import annotations
@@ -25,11 +28,13 @@ from yid_ocp import cli
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
+from yid_ocp.solvers import GaussNewton
 from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 REPOSITORY = Path(__file__).parents[1]
 RECORDED = Path(__file__).with_suffix(".json")
 MOTION_SEEDS = (1, 7)
+SHARP = GaussNewton(max_iterations=100, step_tolerance=1e-9, cost_tolerance=1e-12)
 MOST = 0.01
 """How far an estimate may move, in recorded standard deviations."""
 
@@ -79,6 +84,19 @@ def diagnosed(name: str) -> dict[str, Any]:
     return {"status": said["verdict"], "effects": effects, "parameters": parameters, **judged}
 
 
+def from_minimum(case: str) -> None:
+    """Print how far the recorded and the new estimates of a case lie from the minimum, in recorded stds."""
+    finding, _, _ = found(case, MOTION_SEEDS, truth=False)
+    recorded = json.loads(RECORDED.read_text(encoding="utf-8"))[f"diagnose:{case}"]["parameters"]
+    for model, of_effects in ((finding.final_model, True), (finding.nominal_model, False)):
+        sharp = SHARP.minimize_cost(model.problem, model.unknowns, None)
+        least = model.problem.unknowns.named_values(sharp.x)
+        for name, own in recorded.items():
+            if ("@" in name) == of_effects and own["std"] and name in least:
+                before, now = ((value - least[name]) / own["std"] for value in (own["value"], model.values[name]))
+                print(f"{case}: {name}: recorded {before:+.3f} std from the minimum, now {now:+.3f}", flush=True)
+
+
 def number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
@@ -116,11 +134,16 @@ def main() -> int:
     everything = [*(f"solve:{name}" for name in configurations()), *(f"diagnose:{name}" for name in CASES)]
     parser.add_argument("names", nargs="*", default=everything, help="solve:CONFIGURATION, diagnose:CASE")
     parser.add_argument("--record", action="store_true", help="write into unchanged.json instead of comparing")
+    parser.add_argument("--minimum", action="store_true", help="distances from the minimum of the cost, of diagnoses")
     parser.add_argument("--workers", type=int, default=1, help="runs at once")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="folder of results, which are not worked out again")
     arguments = parser.parse_args()
     if unknown := sorted(set(arguments.names) - set(everything)):
         parser.error(f"unknown: {', '.join(unknown)}; allowed are {', '.join(everything)}")
+    if arguments.minimum:
+        for name in arguments.names:
+            from_minimum(name.removeprefix("diagnose:"))
+        return 0
     recorded = json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.is_file() else {}
     with tempfile.TemporaryDirectory() as folder:
         tasks = [Task(name, {"name": name}) for name in arguments.names]

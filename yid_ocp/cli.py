@@ -524,6 +524,6 @@ def _failed(error: Exception, as_json: bool) -> int:
     with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
         traceback.print_exception(error, file=file)
     what = f"{type(error).__name__}: {error}"
-    print(f"bug: {what}\n  please report it with {file.name}", file=sys.stderr)
+    print(f"bug in yid_ocp: {what}\n  please report it to the project, with the log {file.name}", file=sys.stderr)
     _told(as_json, "bug", what, _EXIT_BUG, where=file.name)
     return _EXIT_BUG

@@ -53,7 +53,7 @@ def test_points_that_are_late_on_a_shared_clock_are_said_but_not_shifted(late: f
     merged = merge_recordings([ROBOT, camera(late)])
     assert np.array_equal(merged.points[0].t, FRAMES)
     [note] = merged.notes
-    assert "later" in note
+    assert "if shifted by -" in note
     offset = float(note.partition("--clock-offset camera=")[2].rstrip(")"))
     assert offset == pytest.approx(-late, abs=0.05)
     [issue] = recording_quality_issues(merged, lambda group: SensorOptions())

@@ -113,7 +113,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     first += "`yid-ocp diagnose`"
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    sure = "if no effect is missing (`yid-ocp diagnose`), these are known to 10 %, misfit in the ±: a = 2 ± 0.1"
+    sure = "if no effect is missing (`yid-ocp diagnose`), these are known to within 10 %, misfit counted: a = 2 ± 0.1"
     assert lines[:2] == [first, f"{sure} N m/rad"]
     unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
     assert "no value is known to within 10 %" in told("yid-solve/1", unsure)[1]
@@ -143,7 +143,7 @@ def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(
     entry = {"recording": "r", "rmse": {channel: error}, "baselines": {"stays": {channel: 0.03}}}
     residuals = {channel: {"rmse": 0.0018, "unit": "m", "n": 9}}
     lines = told("yid-solve/1", solved(fit=fit, residuals=residuals, held_out=[entry | {"expected": {channel: noise}}]))
-    head = f"held-out errors of points are {1e3 * error:.3g} mm (rms), 1.8 mm on the fitted recordings, and 30"
+    head = f"errors of points (rms): {1e3 * error:.3g} mm on held-out recordings, 1.8 mm on fitted ones; without "
     text = " ".join(line.strip() for line in lines[:5])
     assert (head in text) == (said is not None)
     assert said is None or said in text
@@ -162,8 +162,8 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
-    said = "these estimates change by more than their standard deviation"
-    at = lines.index(f"with twice the links {said}: p.a by -5.5 (± 0.073 from the data)")
+    said = "these estimates change by more than their ± from the data"
+    at = lines.index(f"with twice the links {said}: p.a by -5.5 (± 0.073)")
     assert lines[at + 1].startswith("with half the time step no estimate changes ")
     assert lines.index("it snaps") < at
     moved = {name: own | {"links": None} for name, own in moved.items()}

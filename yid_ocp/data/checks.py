@@ -183,8 +183,9 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             and group.clock_offset_std is None
         ):
             lag = late_notes[0].partition(LATE_POINTS_WORDS)[2]
-            setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0]}"
-            what, advice = LATE_POINTS_WORDS + lag, f"if the object does not lag behind, set {setting}: a fit finds it"
+            setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0].lstrip('+-')}"
+            advice = f"unless the object swings behind, import again with this option, or set {setting} for a fit of it"
+            what = LATE_POINTS_WORDS + lag
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
 
 

@@ -108,9 +108,11 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         if best is None or best.explained < _MIN_EXPLAINED or abs(best.lag) < _MIN_SAID_LAG:
             return 0.0, said
         if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
-            late = f"{abs(best.lag):.2g} s {'later' if best.lag > 0 else 'earlier'}"
-            said += f"; {LATE_POINTS_WORDS}{late} ({best.explained:.1%} of the motion): the sensor is "
-            said += f"late, the object lags behind, or clocks differ (--clock-offset {other.name}={-best.lag:.2g})"
+            said += (
+                f"; {LATE_POINTS_WORDS}{-best.lag:+.2g} s (which explains {best.explained:.0%} of their motion): the "
+            )
+            said += "sensor is late, the clocks differ, or the object swings behind the arm "
+            said += f"(--clock-offset {other.name}={-best.lag:.2g})"
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"

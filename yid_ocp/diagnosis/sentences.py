@@ -23,9 +23,9 @@ _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is 
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 _GAP_ORIGIN_PHRASES = {
-    "plant": ", in the mechanics rather than in what sensors read",
-    "sensor": ", in what sensors read",
-    "either": ", in the mechanics or in what the effort sensor reads (efforts alone cannot distinguish them)",
+    "plant": "; its origin is the mechanics, not a sensor",
+    "sensor": "; its origin is a sensor, not the mechanics",
+    "either": "; its origin is the mechanics or the effort sensor, which efforts alone cannot distinguish",
 }
 
 
@@ -45,11 +45,10 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
             return told[0]
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
     mostly = _listed("Record motions in which ", place, " moves most: slow, fast, with pauses in several postures.")
-    unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
     texts = {
         "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
         "unknown": mostly or "Record other motions, faster and larger.",
-        "no_gap": f"None needed: no relevant gap was found.{_listed(' These motions cannot show ', unseen)}",
+        "no_gap": "None is needed.",
         "confusable": "Record other motions, in which effects and changed parameters act differently.",
         "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
     }
@@ -57,7 +56,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
-    """Summarise a diagnosis as text about the gap, locations, effects, events and the next experiment."""
+    """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
     text = [_gap(result)]
     if result.verdict not in ("insufficient_data", "no_gap"):
         text += [_places(result), *_causes(result), *_remains(result)]
@@ -75,9 +74,9 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         (result.is_split_in_blocks, "No recording could be held out, so every second block of time is held out."),
     )
     text += _applying(notes)
-    events = [f"{e.channel} of {e.recording} at {e.start_time:.2f} s" for e in result.events.disturbances]
-    text += [_listed("Excluded as brief disturbances: ", events), *overspeed_truncation_messages(result.events)]
-    return " ".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
+    events = [f"{e.channel} at {e.start_time:.2f} s of '{e.recording}'" for e in result.events.disturbances]
+    text += [_listed("Brief disturbances were left out: ", events), *overspeed_truncation_messages(result.events)]
+    return "\n".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
 
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
@@ -111,13 +110,14 @@ def _gap(result: DiagnosisResult) -> str:
     """Sentence on whether there is a gap."""
     tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
     fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
-    sizes, p_value = f"chi2 per degree of freedom {fitted}, held out {other}", min(test.p_value for test in tests)
+    sizes = f"chi2 per degree of freedom {fitted}, held out {other}; noise alone gives 1"
+    p_value = min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
     p_text, detectable = _p_value_relation(p_value), f"{sum(seen)} of {len(seen)} candidates are detectable"
     said = f"{tests[0].degrees_of_freedom:.0f} effective samples for {unknowns} unknowns; {detectable}"
     texts = {
         "insufficient_data": f"The data are insufficient: {said}.",
-        "no_gap": " ".join([f"There is no relevant gap ({sizes}; p {p_text}).", *_why_no_gap(result)]),
+        "no_gap": "\n".join([f"The recordings show no relevant gap ({sizes}; p {p_text}).", *_why_no_gap(result)]),
     }
     if result.verdict in texts:
         return texts[result.verdict]
@@ -131,7 +131,7 @@ def _gap(result: DiagnosisResult) -> str:
 
 
 def _why_no_gap(result: DiagnosisResult) -> list[str]:
-    """Sentences on why a significant residual does not count as a gap."""
+    """Sentences on why a significant residual does not count as a gap, and on effects that could be overlooked."""
     limits, tests = result.thresholds, (result.nominal_test, result.nominal_held_out_test)
     scores, level = result.screening.candidate_scores, limits.gap_significance_level
     best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
@@ -141,7 +141,9 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     seen = f"A residual along {''.join(best)} is significant (p {_p_value_relation(along)})"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but it counts as a gap only with an accepted effect."
-    return _applying([(is_significant, small), (along < level, narrow)])
+    unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
+    blind = _listed("These motions would not show the following effects, even if they exist: ", unseen)
+    return _applying([(is_significant, small), (along < level, narrow), (bool(unseen), blind)])
 
 
 def _places(result: DiagnosisResult) -> str:
@@ -152,7 +154,7 @@ def _places(result: DiagnosisResult) -> str:
         return "These data cannot locate it."
     assert result.smoother_result is not None  # it found the locations
     rest = 1 - sum(place.gap_share for place in where)
-    named += [f"other places ({100 * rest:.0f} %)"] * (rest >= 0.005)
+    named += [f"elsewhere ({100 * rest:.0f} %)"] * (rest >= 0.005)
     side = _GAP_ORIGIN_PHRASES.get(result.smoother_result.plant_or_sensor_origin, "")
     return f"It lies in {', '.join(named)}{side}."
 
@@ -162,20 +164,21 @@ def _causes(result: DiagnosisResult) -> list[str]:
     added, total = result.selected_effects, result.closure_by_selected_effects
     limits, text = result.thresholds, list[str]()
     if added:
-        names = " and ".join(_named(entry.effect, added[-1].refitted_model, limits) for entry in added)
-        verb, part = "closes" if len(added) == 1 else "together close", "an unknown part of it on held-out motions"
+        *first, last = (entry.effect.label for entry in added)
+        names = f"{', '.join(first)} and {last} together close" if first else f"{last} closes"
+        part = "an unknown part of the gap on held-out motions"
         if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
             part += ", because the nominal model's error there is within noise"
         if math.isfinite(total.ci_low):
             interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
-            part = f"{100 * total.fraction:.3g} % of it on held-out motions ({interval})"
-        text.append(f"{names} {verb} {part}.")
+            part = f"{100 * total.fraction:.3g} % of the gap on held-out motions ({interval})"
+        text += [f"{names} {part}:", *(_named(entry.effect, added[-1].refitted_model, limits) for entry in added)]
     for own, *others in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         text.append(_listed(f"These recordings cannot distinguish {own.label} from ", [o.label for o in others]))
     explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
     reasons = {
-        "": f"This names the cause with a probability of {100 * result.probability:.0f} %.",
+        "": f"The probability that the true cause is named here is {100 * result.probability:.0f} %.",
         "none": "None of the effects that were tried explains it well enough.",
         "little": f"This explains {explained:.3g} % of the gap in the fitted motions; a cause needs {enough:.3g} %.",
         "stand_in": f"This only imitates the cause, because it changes with the recordings: {'; '.join(apart)}.",
@@ -211,7 +214,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
-    """An effect with its estimates, and warnings if one is far outside its expected range or no size is determined."""
+    """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
     values, odd, neutral = [], "", effect.neutral_values
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
         known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
@@ -220,7 +223,7 @@ def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
         low, high = effect.prior_ranges[name]
         odd = f" (far outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
     is_unsure = all(abs(fit.values[n] - neutral[n]) <= fit.std.get(n, 0.0) for n in effect.amplitude_parameter_names)
-    return f"{effect.label} with {', '.join(values)}{odd}{' (these recordings do not determine its size)' * is_unsure}"
+    return f"  {effect.label}: {', '.join(values)}{odd}{' (these recordings do not determine its size)' * is_unsure}"
 
 
 def _remains(result: DiagnosisResult) -> list[str]:
@@ -228,18 +231,18 @@ def _remains(result: DiagnosisResult) -> list[str]:
     noise = {own.channel: own.noise_rmse for own in result.noise_floor}
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
-    worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms) at {name}" for square, name, unit in beyond}
+    worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms without noise) at {name}" for square, name, unit in beyond}
     mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
     what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
     said = "is within noise and the uncertainty of the parameters"
     if result.remaining_test.p_value < result.thresholds.significance_level:
-        said = f"exceeds noise; without noise it is {', '.join([*worst.values(), *mostly])}"
+        said = f"exceeds noise: {', '.join([*worst.values(), *mostly])}"
     moved = [
-        f"{name} from {own['before']:.3g} to {own['after']:.3g}"
+        f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
         for name, own in result.nominal_parameters_before_and_after.items()
         if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
     ]
-    return [f"{what} {said}.", _listed("The fit with effects changes parameters of the nominal model: ", moved)]
+    return [f"{what} {said}.", _listed("With the effects in the model, these estimates change: ", moved)]
 
 
 def _earlier_runs(result: DiagnosisResult) -> list[str]:

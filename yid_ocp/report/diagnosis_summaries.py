@@ -42,10 +42,8 @@ _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is nam
 def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     verdict = result["verdict"].replace("_", " ")
-    found, _, advice = result["summary"].partition(" Next experiment: ")
-    gap, _, cause = found.partition(". ")
-    planned = f"Next experiment: {advice}" if advice else ""
-    parts = f"Verdict: {verdict}. {gap.removesuffix('.')}.", unused_efforts_sentence(result), cause, planned
+    gap, *others = result["summary"].split("\n")
+    parts = f"Verdict: {verdict}. {gap}", unused_efforts_sentence(result), *others
     yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]

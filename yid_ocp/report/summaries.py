@@ -119,8 +119,8 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))
         sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
-        guess = f", and {sizes[3]} without a model, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
-        text = f"held-out errors of {group} are {sizes[0]} (rms), {sizes[1]} on the fitted recordings{guess}"
+        guess = f"; without a model {sizes[3]}, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
+        text = f"errors of {group} (rms): {sizes[0]} on held-out recordings, {sizes[1]} on fitted ones{guess}"
         if noise is None or error is None or fitted is None:
             continue
         if not result["fit"]["explains"]:
@@ -365,13 +365,13 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"frequencies: {convergence['message']}" if convergence["message"] else ""
     moved = discretisation_shift_sentences(result)
-    yield "if the initial values were the estimates:" if moved else ""
+    yield "at the initial values (`solve` tests its estimates again):" if moved else ""
     yield from moved
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
     ended = "no problem found: a run is possible"
     if result.get("issues") or result["warnings"]:
-        ended = f"a run is possible; see {'the issues' if result.get('issues') else 'the warnings'}"
+        ended = f"a run is possible; see the {'issues' if result.get('issues') else 'warnings'} above"
     yield SummaryStatement(ended, "conclusion")
 
 

@@ -161,8 +161,10 @@ def misfit_summary_blocks(
                     known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "no value is known to within 10 % with the misfit in its ±"
-            said = f"if no effect is missing (`yid-ocp diagnose`), these are known to 10 %, misfit in the ±: {shown}"
+            none = "if this misfit is counted in the ±, no value is known to within 10 %"
+            said = (
+                f"if no effect is missing (`yid-ocp diagnose`), these are known to within 10 %, misfit counted: {shown}"
+            )
             yield SummaryStatement(said if known else none, "conclusion")
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
@@ -179,11 +181,11 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     for key, words in tries:
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
-        changes = ", ".join(f"{n} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for n, own in moved.items())
+        changes = ", ".join(f"{n} by {own[key]:+.2g} (± {own['std']:.2g})" for n, own in moved.items())
         if moved:
-            said.append(f"with {words} these estimates change by more than their standard deviation: {changes}")
+            said.append(f"with {words} these estimates change by more than their ± from the data: {changes}")
         elif tried:
-            said.append(f"with {words} no estimate changes by more than its standard deviation")
+            said.append(f"with {words} no estimate changes by more than its ± from the data")
     return said
 
 

@@ -204,7 +204,9 @@ def _none_good(
     )
     cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFIT_REASONS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
-    hint = "set unit: mm in camera.json" if "metres" in listed else _hint(sizes, things, hint)
+    hint = (
+        "track.point_cloud_unit: mm, or unit: mm in camera.json" if "metres" in listed else _hint(sizes, things, hint)
+    )
     what, allowed = f"{cause}no frame could be used: {listed}", "one usable frame or more"
     return DataError(what, where=source, allowed=allowed, hint=hint)
 

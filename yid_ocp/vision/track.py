@@ -256,7 +256,7 @@ class SingleFrameTracker:
         finite: BoolArray = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points if finite.all() else points[finite]
         if not len(points):
-            raise DataError("the cloud has no finite points", where=where, allowed="finite points", hint="leave it out")
+            raise DataError("the cloud has no finite points", where=where, allowed="finite points", hint="delete it")
         far = float(np.median(np.abs(points[:: 1 + len(points) // _DISTANCE_SAMPLE_POINTS]).max(axis=1)))
         if far > _MAX_DISTANCE:
             what = f"the cloud is not in metres: half of its points are {far:.0f} m away or more"

@@ -459,8 +459,9 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
 
 def _require_compatible(run: RunSettings) -> None:
     if run.diagnosis.noise_fraction_of_stated_std < 1 or any(entry.std is not None for entry in run.sensors.values()):
-        what = "the settings state noise levels, but the synthetic recordings of a blind test have a fixed noise"
-        allowed, hint = "no noise levels", "leave sensors.*.std and diagnosis.noise_fraction_of_stated_std out"
+        what = "a blind test has a noise of its own, so its settings must not state noise levels"
+        allowed = "neither sensors.*.std nor diagnosis.noise_fraction_of_stated_std"
+        hint = "remove them, for example in a copy of the file"
         raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:

@@ -151,7 +151,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this.
     """
     if form not in _MODEL_FORMATS:
-        why = "mjcf: UsdPhysics has no schema for cables yet, nor springs on joints that turn about three axes"
+        why = "write --format mjcf; UsdPhysics has no cables yet, nor springs of joints that turn about three axes"
         hint, allowed = why if form == "usd" else "", ", ".join(_MODEL_FORMATS)
         where = "--format, or the ending of --out"
         raise ConfigError(f"there is no format '{form}'", where=where, allowed=allowed, hint=hint)

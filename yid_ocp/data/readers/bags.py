@@ -437,7 +437,7 @@ def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, 
     for name in wanted:
         if name not in known:
             hint = nearest_name_question(name, known) or "choose recorded joints: --joints NAME,NAME"
-            raise DataError(f"there is no joint '{name}'", where=where, allowed=allowed, hint=hint)
+            raise DataError(f"the bag has no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
     if got != set(wanted):
         what, allowed = "no message has all the chosen joints", f"joints of one of these sets: {allowed}"
