@@ -340,6 +340,7 @@ def test_an_arm_alone_with_efforts_is_identified_as_written(bench: Path, monkeyp
     )
     with pytest.raises(pytest.fail.Exception, match="restarts: True"):
         main(["friction", "run.yaml", "--out", "laws"])
+    assert main(["friction", "run.yaml", "--set", "sensors.joints.effort.use=false"]) == 2, "no torque shows friction"
 
 
 def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
