@@ -428,7 +428,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     for key, group, channel in _mounted_channels(recording):
         other = ("", "no moving link has that name: write frames: {NAME: FRAME} in place of use: false")
         if channel.group == "wrist":
-            other = (holder, "a guess: this link and what hangs on it are what the sensor carries")
+            other = (holder, "a guess: the sensor carries this link and all that is attached to it")
         own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
         found[key] = tuple(
             _PointPlacement(name, name, "a link has that name") if moves else _PointPlacement(name, *other)
