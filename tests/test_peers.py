@@ -47,6 +47,19 @@ def test_a_run_that_fails_is_counted_and_a_tool_without_intervals_has_none(table
     assert table.rows("springs", {"truth": TRUTH, "tools": {"x": {"runs": [{"failed": "no"}]}}})[0][1] == "failed"
 
 
+def test_a_figure_that_is_worse_than_the_stored_one_is_named(table):
+    def results(*runs):
+        runs = [run | {"seed": seed} for seed, run in enumerate(runs)]
+        return {"cases": {"foam": {"truth": TRUTH, "tools": {"yid_ocp": {"runs": runs}}}}}
+
+    stored = results(a_run(["a", "b"], []), a_run(["a", "b"], ["b"]))
+    assert table.worse_figures(stored, stored) == []
+    assert table.worse_figures(results(a_run(["a", "b"], [], (0.1, 0.32))), stored) == []  # within the tolerance
+    worse = table.worse_figures(results(a_run(["a", "b"], ["a"], (0.4, 0.3))), stored)
+    assert worse == ["foam: error is 0.4, stored 0.3", "foam: wrong is 1, stored 0", "foam: holding is 1, stored 2"]
+    assert table.worse_figures(results(), stored) == ["foam: no figures"]
+
+
 @pytest.mark.slow
 def test_a_scaled_torque_is_seen_by_no_tool_and_a_payload_by_all(tmp_path, repository):
     """Both fits predict the held-out motion; the first has numbers 15 % too large, the second the true ones."""

@@ -2,11 +2,14 @@
 
     python benchmarks/peers [--cases NAME ...] [--tools NAME ...] [--seeds N] [--out FILE]
     python benchmarks/peers --table [--out FILE]
+    python benchmarks/peers --against STORED --out FILE
 
 The first adds to FILE (`results.json` beside this script) the figures of cases, tools and seeds that it lacks; delete
-it to begin anew. The second writes table and chart of the documentation from it. `pip install -e '.[peers]'` has what
-is needed but for opty, which needs an installed IPOPT (`pip install opty`). What is not installed is left out and
-named.
+it to begin anew. The second writes table and chart of the documentation from it. The third exits with 1 if a figure of
+this package in FILE is worse than in STORED, beyond a tolerance (`TOLERANCES` in `table.py`).
+
+`pip install -e '.[peers]'` has what is needed but for opty, which needs an installed IPOPT (`pip install opty`). What
+is not installed is left out and named.
 """
 
 from __future__ import annotations
@@ -85,6 +88,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, help="at most so many of each case")
     parser.add_argument("--out", type=Path, default=HERE / "results.json")
     parser.add_argument("--table", action="store_true", help="write table and chart of the documentation, and stop")
+    parser.add_argument("--against", type=Path, help="stored results with which FILE is compared, and stop")
     chosen = parser.parse_args()
     known = json.loads(chosen.out.read_text(encoding="utf-8")) if chosen.out.exists() else {"versions": {}, "cases": {}}
     if chosen.table:
@@ -92,6 +96,12 @@ def main() -> int:
 
         write_documentation(known)
         return 0
+    if chosen.against:
+        from table import worse_figures
+
+        worse = worse_figures(known, json.loads(chosen.against.read_text(encoding="utf-8")))
+        print("\n".join(worse) or "no figure is worse than the stored one")
+        return int(bool(worse))
     from cases import CASES, SERVO_FOLDER
 
     tools = []

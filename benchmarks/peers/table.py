@@ -18,6 +18,8 @@ HEADER = (
     "tool", "confident estimates", "median of the largest error", "confident but wrong",
     "intervals that contain the truth", "held out", "CPU [s]", "lines",
 )  # fmt: skip
+# by which fraction a figure may be worse than the stored one; chosen, as other machines round differently
+TOLERANCES = {"error": 0.1, "held_out": 0.1, "wrong": 0.0, "failed": 0.0, "known": 0.0, "holding": 0.0}
 MADE_BY = {
     "MuJoCo": "recordings by MuJoCo",
     "real": "real recordings; the true values are not known",
@@ -48,6 +50,23 @@ def figures(runs: list[dict[str, Any]], truth: Mapping[str, float]) -> dict[str,
     if "stated" in done[0]:
         found["wrong"] = sum(len(run["known_but_outside"]) for run in done)
         found["holding"], found["stated"] = (sum(run[key] for run in done) for key in ("holding", "stated"))
+    return found
+
+
+def worse_figures(known: Mapping[str, Any], stored: Mapping[str, Any], tool: str = "yid_ocp") -> list[str]:
+    """Figures of one tool that are worse than stored ones by more than `TOLERANCES`, over the seeds that both have."""
+    found = []
+    for case in (name for name in known["cases"] if name in stored["cases"]):
+        truth = stored["cases"][case]["truth"]
+        both = [results["cases"][case]["tools"].get(tool, {"runs": []})["runs"] for results in (known, stored)]
+        seeds = set.intersection(*({run["seed"] for run in runs} for runs in both))
+        now, before = (figures([run for run in runs if run["seed"] in seeds], truth) for runs in both)
+        found += [] if now else [f"{case}: no figures"]
+        for name, tolerance in TOLERANCES.items():
+            new, old = now.get(name), before.get(name)
+            rise = 0.0 if new is None or old is None else new - old
+            if (-rise if name in ("known", "holding") else rise) > tolerance * (old or 0.0):
+                found.append(f"{case}: {name} is {new:.4g}, stored {old:.4g}")
     return found
 
 
