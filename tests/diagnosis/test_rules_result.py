@@ -48,8 +48,8 @@ def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
         noise_floor=tuple(AssumedChannelNoiseLevel(*own) for own in levels),
     )
     size = math.sqrt(0.02**2 - 3 * 0.001**2)
-    said = f"exceeds noise; without noise it is 0 N m (rms) at joints.effort.elbow, {size:.2g} m (rms) at points.end."
-    assert said in diagnosis_summary_text(made)  # noise alone gives the torque's
+    sizes = f"0 N m (rms without noise) at joints.effort.elbow, {size:.2g} m (rms without noise) at points.end."
+    assert f"exceeds noise: {sizes}" in diagnosis_summary_text(made)  # noise alone gives the torque's
 
 
 def test_the_result_holds_what_was_found():

@@ -61,7 +61,7 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert abs(apart.estimation_value - apart.held_out_value) < 4 * np.hypot(apart.estimation_std, apart.held_out_std)
     damping = finding.nominal_parameters_before_and_after["elbow.damping"]
     assert damping["before"] > damping["after"], "friction hides in the damping until it is named"
-    assert "joint_coulomb@elbow with tau_c" in result["summary"]
+    assert "\n  joint_coulomb@elbow: tau_c" in result["summary"]
 
 
 def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkeypatch):
