@@ -73,19 +73,20 @@ def test_clocks_without_anything_in_common_are_aligned_by_the_motion() -> None:
 
 
 def test_what_cannot_be_aligned_is_refused() -> None:
-    rng = np.random.default_rng(3)
-    place = tip(wander(FRAMES, 9)) + 0.3 * rng.random((len(FRAMES), 1, 3))
+    place = tip(wander(FRAMES, 9)) + 0.3 * np.random.default_rng(3).random((len(FRAMES), 1, 3))
     points = PointGroup("points", ("tip",), FRAMES + 1e9, place)
     other = Recording(None, (points,), name="camera")
     with pytest.raises(DataError, match="do not overlap") as caught:
         merge_recordings([ROBOT, other])
     assert "--clock-offset camera=SECONDS" in caught.value.hint
     assert merge_recordings([ROBOT, other], {"camera": -1e9}).points[0].t[0] == 0.0
-    brief = replace(ROBOT, joints=JointGroup(("a",), T[:20] / 10, wander(T[:20], 0)[:, :1]))
-    milliseconds = replace(other, points=(replace(points, t=1e3 * FRAMES),))
-    for robot, seen, what in ((brief, other, "do not overlap"), (ROBOT, milliseconds, "2 of 1900 samples of camera")):
+    for joints, t, what in (
+        (JointGroup(("a",), T[:20] / 10, wander(T[:20], 0)[:, :1]), FRAMES + 1e9, "do not overlap"),
+        (ROBOT.joints, 1e3 * FRAMES, "2 of 1900 samples of camera"),  # milliseconds
+        (replace(ROBOT.joints, t=1e9 * (1.7e9 + T)), FRAMES, "4000 samples of robot .*: its times look like ns"),
+    ):
         with pytest.raises(DataError, match=what):
-            merge_recordings([robot, seen])
+            merge_recordings([replace(ROBOT, joints=joints), replace(other, points=(replace(points, t=t),))])
     with pytest.raises(DataError, match="not one of the files"):
         merge_recordings([ROBOT, camera()], {"kamera": 1.0})
     with pytest.raises(DataError, match="the joint 'a' is in robot and in twin") as caught:

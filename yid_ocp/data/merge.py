@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, mean_sample_rate, median_sample_period
-from yid_ocp.data.readers.base import joints_on_fastest_clock
+from yid_ocp.data.readers.base import guess_non_si_units, joints_on_fastest_clock
 from yid_ocp.data.recording import JointGroup, Recording, validated_recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 
@@ -90,10 +90,10 @@ def _span(recording: Recording) -> tuple[float, float]:
 def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     """Shift [s] to add to the times of `other`, and the reason. Raises `DataError` if the clocks cannot be aligned."""
     (begin, end), (start, stop) = _span(first), _span(other)
-    overlap = min(end, stop) - max(begin, start)
-    shared = overlap >= _MIN_SHARED_FRACTION * min(end - begin, stop - start)
-    for recording in (first, other) if shared else ():
-        _check_time_unit(recording, max(begin, start), min(end, stop))
+    overlap, shortest = min(end, stop) - max(begin, start), min(end - begin, stop - start)
+    shared = overlap >= _MIN_SHARED_FRACTION * shortest
+    for recording in (first, other):
+        _check_time_unit(recording, shortest, default="ms" if shared else "")
     said = f"{first.name} and {other.name} are assumed to have one clock: their times overlap by {overlap:.4g} s"
     seen, joints = _seen_path(other), first.joints
     best = at_zero = None
@@ -124,14 +124,14 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     return begin - start - best.lag, why
 
 
-def _check_time_unit(recording: Recording, begin: float, end: float) -> None:
-    """Raise `DataError` if hardly any of many samples lies in the common time, as for a file in milliseconds."""
+def _check_time_unit(recording: Recording, duration: float, default: str) -> None:
+    """Raise `DataError` if hardly any of many samples lies in `duration` [s] and the unit shows or has a `default`."""
+    name, unit = recording.name, guess_non_si_units(recording)[0].get("t", default)
     total = max(len(group.t) for group in recording.all_groups)
-    inside = max(np.count_nonzero((group.t >= begin) & (group.t <= end)) for group in recording.all_groups)
-    if total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples:
-        name = recording.name
-        what = f"only {inside} of {total} samples of {name} lie in the {end - begin:.4g} s that all files cover"
-        hint = "import a file with another unit alone, for example with --units t=ms, and list its .h5 in its place"
+    inside = max(np.count_nonzero(group.t - group.t[0] <= duration) for group in recording.all_groups)
+    if unit and total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples:
+        what = f"only {inside} of {total} samples of {name} lie in {duration:.4g} s: its times look like {unit}"
+        hint = f"import {name} alone with --units t={unit}, and list its .h5 in its place"
         raise DataError(what, where=name, allowed="files of one run with one unit of time", hint=hint)
 
 
