@@ -451,21 +451,22 @@ def test_what_is_missing_is_named_and_nothing_is_written(case, bench, capsys) ->
 
 
 def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refusal(*files: str, robot: str = "wrist.urdf") -> str:
+        assert main(["init", robot, *files, "--out", "run.yaml", *CABLE]) == 2
+        return capsys.readouterr().err
+
     write_recording(moved(SHORT, parts=()), bench / "one.h5")
-    assert init(*CABLE) == 2
-    assert "no measurement of the object" in capsys.readouterr().err
+    assert "no measurement of the object" in refusal("one.h5")
+    assert "the robot has no joint that can move" in refusal("one.h5", robot="package:quadrotor_base")
     (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))
-    assert init(*CABLE, files=["bag.csv"]) == 2
-    told = capsys.readouterr().err
+    told = refusal("bag.csv")
     assert re.search("(?s)none of the recorded joints is in the URDF: shoulder.*--joints shoulder=roll", told)
     (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
     write_recording(moved(SHORT), bench / "one.h5")
-    assert init(*CABLE, files=["one.h5", "bag.csv"]) == 2
-    assert "the recording lacks joint 'pitch', which one has" in capsys.readouterr().err
+    assert "the recording lacks joint 'pitch', which one has" in refusal("one.h5", "bag.csv")
     assert not (bench / "bag.h5").exists()
     (bench / "run.yaml").write_text("kept: true\n")
-    assert init(*CABLE) == 2
-    assert "already exists" in capsys.readouterr().err
+    assert "already exists" in refusal("one.h5")
     assert (bench / "run.yaml").read_text() == "kept: true\n"
 
 

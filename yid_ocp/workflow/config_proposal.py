@@ -191,11 +191,12 @@ def propose_config_choices(
 
 def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Recording]) -> list[str]:
     """Joints of the URDF that the first recording has. Raises `ConfigError` if it has none or a recording no joints."""
-    for other in recordings:
-        if other.joints is None:
-            hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
-            what, allowed = "the recording has no joints", "a recording with joint states of the robot"
-            raise ConfigError(what, where=other.name, allowed=allowed, hint=hint)
+    for other in (recording for recording in recordings if recording.joints is None):
+        hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
+        what, allowed = "the recording has no joints", "a recording with joint states of the robot"
+        raise ConfigError(what, where=other.name, allowed=allowed, hint=hint)
+    if not whole.joint_names:
+        raise ConfigError("the robot has no joint that can move", where=robot, allowed="a robot with movable joints")
     recorded = recordings[0].joint_names
     if not (known := [name for name in whole.joint_names if name in recorded]):
         what = f"none of the recorded joints is in the URDF: {', '.join(recorded)}"
@@ -404,10 +405,9 @@ def _near(
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
             return "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
-        percent: float = _POSITION_STEP_PERCENT * round(100 * part / _POSITION_STEP_PERCENT)
-        if math.isfinite(exact := 100 * part_when_straight):
-            percent = _POSITION_STEP_PERCENT * round(exact / _POSITION_STEP_PERCENT)
-            percent = percent if abs(exact - percent) <= _MAX_ROUNDED_PERCENT else round(exact, 2)
+        exact = 100 * part_when_straight  # NaN if it never was
+        rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
+        percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
         beyond = " (beyond the end: are length, frame and clocks right?)" if part > 1.05 else ""
         return _along(branch.name, min(100, percent)), f"up to {part:.1%} of the length away from {holder}{beyond}"
     local = poses[0, :3, :3].T @ from_holder[0]
