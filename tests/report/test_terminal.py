@@ -187,11 +187,13 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     """The methods themselves do not, so that nothing of theirs is to be trusted; that is said first."""
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
-    lines = told("yid-compare/1", compared(methods={"single_shooting": doubtful}, judged=sure, disturbed=True))
-    assert lines[0].startswith("values by single_shooting are not trusted, as they ignore the noise that drives the")
-    assert all(fact in lines[1] for fact in ("a is 9 ± 0.1 N m/rad", "not 7", "single_shooting"))
-    assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "solve", "verdict"]
-    assert "a          7                9 ± 0.1  found" in lines
+    methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
+    lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
+    assert lines[0].startswith("values by single_shooting, late are not trusted, as they ignore the noise that drives")
+    assert "a is 9 ± 0.1 N m/rad, not 7 (single_shooting)" in lines
+    assert "stopped before its first iteration, so without values: late" in lines
+    assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "verdict"]
+    assert "a          7                stopped  9 ± 0.1  found" in lines
     assert not any("does not explain" in line or "all methods agree" in line for line in lines)
 
 

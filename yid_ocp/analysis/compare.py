@@ -47,6 +47,11 @@ class _MethodResult:
     cpu_seconds: float
     peak_memory_mib: float
 
+    @property
+    def has_values(self) -> bool:
+        """False if the method was stopped at its start, which is no result."""
+        return self.solution.status != Status.ITERATION_LIMIT or len(self.solution.history) != 1
+
 
 @dataclass(frozen=True)
 class MethodsComparisonResult:
@@ -86,9 +91,7 @@ def compare_methods(
     runs, whole, problem = [], problem, problem_with_exact_inputs(problem)
     deadline = time.perf_counter() + total_time_budget
 
-    def listener(name: str, share: float = math.inf) -> Callable[[Iterate], None] | None:
-        if callback is None and not math.isfinite(share):
-            return None
+    def listener(name: str, share: float = math.inf) -> Callable[[Iterate], None]:
         begun = time.perf_counter()
 
         def told(entry: Iterate) -> None:
@@ -126,11 +129,11 @@ def compare_methods(
 
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
+    if not run.has_values:
+        return ["in that it was stopped before its first iteration and has no values"]
     values = []
-    for name, reference in best.solution.parameters.items():
-        if judged[name].verdict != "identifiable":
-            continue
-        entry = run.solution.parameters[name]
+    for name in (name for name, entry in judged.items() if entry.verdict == "identifiable"):
+        entry, reference = run.solution.parameters[name], best.solution.parameters[name]
         # a fit that stopped early has a large ± from its misfit, which would agree with everything
         std = max(entry.std, reference.std) if run.solution.status == Status.CONVERGED else reference.std
         if abs(entry.value - reference.value) > max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
@@ -147,10 +150,8 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
 def _explanations(
     runs: Sequence[_MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> list[str]:
-    sentences = []
-    for name, reference in judged.items():
-        if not reference.free or reference.verdict == "identifiable":
-            continue
+    runs, sentences = [run for run in runs if run.has_values], []
+    for name, reference in ((n, e) for n, e in judged.items() if e.free and e.verdict != "identifiable"):
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
         is_lost = reference.verdict == "not_identifiable"
@@ -165,15 +166,15 @@ def _descent_errors(
 ) -> str:
     """Return a sentence on the parameters that a method left far from `truth`, and whether the data determine them."""
     known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
-    found = {name: run.solution.parameters[name].value for name in known}
+    own = {name: run.solution.parameters[name] for name in known}
     # the same limit applies to the standard deviation of an identifiable parameter
-    wrong = [n for n in known if abs(found[n] - truth[n]) > MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[n])]
-    verdicts = {name: VERDICT_TABLE_TEXTS[entry.verdict] for name, entry in known.items()}
+    wrong = [n for n in known if abs(own[n].value - truth[n]) > MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[n])]
     hidden = [name for name in known if known[name].verdict != "identifiable"]
+    verdicts = {name: VERDICT_TABLE_TEXTS[(known if name in hidden else own)[name].verdict] for name in known}
     within = f"within {100 * MAX_IDENTIFIABLE_RELATIVE_STD:.0f} % of the truth"
     if not wrong:
         return f"{run.method} ended {within} everywhere"
-    shown = {name: value_and_uncertainty_text(found[name], None, verdict=known[name].verdict) for name in wrong}
+    shown = {name: value_and_uncertainty_text(own[name].value, None, verdict=known[name].verdict) for name in wrong}
     places = ", ".join(f"{name} ({shown[name]} for {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
     text = f"where {run.method} did not end {within}: {places}"
     if wrong == hidden:
@@ -193,7 +194,7 @@ class _Memory:
     """A context manager whose thread samples the resident memory of this process; `peak` is the largest value [MiB]."""
 
     def __enter__(self) -> _Memory:
-        self.peak, self._stop = 0.0, threading.Event()
+        self.peak, self._stop = _resident(), threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
         return self
@@ -203,7 +204,6 @@ class _Memory:
         self._thread.join()
 
     def _watch(self) -> None:
-        self.peak = _resident()
         while not self._stop.wait(_MEMORY_SAMPLING_PERIOD):
             self.peak = max(self.peak, _resident())
 

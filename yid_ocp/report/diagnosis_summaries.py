@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import statistics
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -273,9 +273,9 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> 
 
 @register_summary("yid-compare/1")
 def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    methods: dict[str, Any] = result["methods"]
-    judged, disturbed = result["judged"], result["disturbed"]
+    methods, judged = result["methods"], result["judged"]
     runs = methods | {"solve": judged}
+    stopped = [m for m, e in methods.items() if e["status"] == "iteration_limit" and not e["iterations"]]
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "verdict")]
     for name, own in judged["parameters"].items():
@@ -284,13 +284,15 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             for method, entry in runs.items():
                 found = entry["parameters"][name]
                 # elsewhere, and without noise, the curvature is no measure of uncertainty
-                ended = entry["status"] not in ("stalled", "failed") and not (disturbed and method in methods)
+                ended = entry["status"] not in ("stalled", "failed") and not (result["disturbed"] and method in methods)
                 std, interval = (found["std"], found["interval"]) if ended else (None, None)
-                cells.append(value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"]))
+                text = value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"])
+                cells.append("stopped" if method in stopped else text)
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})
-    yield from (SummaryStatement(text, "conclusion") for text in _objections_to_agreement(result))
+    objections = [*_objections_to_agreement(result, stopped)]
+    yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
@@ -298,25 +300,25 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
-    if not [*_objections_to_agreement(result)]:
-        agree = "all methods agree within their uncertainty on the parameters that are found"
-        yield SummaryStatement(agree, "conclusion")
+    agree = "" if objections else "all methods agree within their uncertainty on the parameters that are found"
+    yield SummaryStatement(agree, "conclusion")
 
 
-def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
+def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]) -> Iterator[str]:
     """Yield sentences on why the methods' estimates cannot be trusted; none if they agree and this is meaningful."""
     methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
-    free = {name: entry for name, entry in own.items() if entry["free"]}
-    found = {name: entry for name, entry in free.items() if entry["verdict"] == "identifiable"}
+    found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
     if result["disturbed"]:
         words = f"values by {', '.join(methods)} are not trusted, as they ignore the noise that drives the motion"
         yield f"{words}; `solve` includes it, and verdict and ± are those of its column"
         for name, entry in found.items():
-            values = {method: one["parameters"][name]["value"] for method, one in methods.items()}
+            values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
             off = {m: v for m, v in values.items() if abs(v - entry["value"]) > 2 * (entry["std"] or 0.0)}
             if off:
                 said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
                 yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
+    if stopped:
+        yield f"stopped before its first iteration, so without values: {', '.join(stopped)}"
     if not fit["explains"]:
         yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
     elif not fit["data_trusted"]:
@@ -330,12 +332,11 @@ def _objections_to_agreement(result: Mapping[str, Any]) -> Iterator[str]:
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     entries = methods.values()
-    costs = (entry["whitened_cost"] for entry in entries)
-    ratios = (entry["fit"]["chi2_per_dof"] for entry in entries)
     yield "", *methods
     yield "status", *(entry["status"] for entry in entries)
-    yield "cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs)
-    yield "chi2 per degree of freedom", *("unknown" if r is None else f"{r:.3g}" for r in ratios)
+    yield "cost (whitened)", *("failed" if (x := e["whitened_cost"]) is None else f"{x:.6g}" for e in entries)
+    chi2 = "chi2 per degree of freedom"
+    yield chi2, *("unknown" if (x := e["fit"]["chi2_per_dof"]) is None else f"{x:.3g}" for e in entries)
     units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
     for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
         unit = channel_or_group_unit(units, channel)

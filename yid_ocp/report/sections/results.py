@@ -93,8 +93,7 @@ def _provenance(findings: ReportData) -> Mapping[str, Any] | None:
     result = findings.result
     if "versions" not in result:
         return None
-    command = result.get("again", result.get("command", ""))
-    return {"date": "", "inputs": {}, "notes": []} | {**result, "command": command}
+    return {"date": "", "inputs": {}, "notes": [], **result, "command": result.get("again", result.get("command", ""))}
 
 
 @register_report_section("pictures", 50, "Pictures")
@@ -123,10 +122,10 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
     comparison: MethodsComparisonResult | None = findings.section_data.get("comparison")
     if comparison is None:
         return
-    rows = []
+    ended, rows = [run.method for run in comparison.method_results if run.has_values], []
     for name, entry in findings.result["judged"]["parameters"].items():
         if entry["free"] and entry["verdict"] != "not_identifiable":
-            own = {method: e["parameters"][name] for method, e in findings.result["methods"].items()}
+            own = {method: findings.result["methods"][method]["parameters"][name] for method in ended}
             values = {m: (e["value"], None if comparison.has_process_noise else e["std"]) for m, e in own.items()}
             rows.append((name, entry["unit"], values | {"solve": (entry["value"], entry["std"])}))
     for _, figure in draw_figure_per_unit(rows, figures.parameter_values_by_source_figure):
