@@ -135,16 +135,16 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
         (0.012, 0.010, GOOD, ". This is no gap: torque noise of the stated size accounts for 10 mm"),
         (0.012, 0.002, GOOD, ". This is a gap: noise accounts for 2 mm; run `yid-ocp diagnose`"),
         (0.003, 0.002, GOOD, None),
+        (0.003, 0.0027, GOOD, ". This is no gap: torque noise of the stated size accounts for 2.7 mm"),
         (0.003, 0.002, BAD, ". Noise accounts for 2 mm"),
     ],
 )
 def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
-    channel = "points.p"
-    entry = {"recording": "r", "rmse": {channel: error}, "baselines": {"stays": {channel: 0.03}}}
-    residuals = {channel: {"rmse": 0.0018, "unit": "m", "n": 9}}
-    lines = told("yid-solve/1", solved(fit=fit, residuals=residuals, held_out=[entry | {"expected": {channel: noise}}]))
+    own = "points.p"
+    entry = {"recording": "r", "rmse": {own: error}, "baselines": {"stays": {own: 0.03}}, "expected": {own: noise}}
+    known = {"residuals": {own: {"rmse": 0.0018, "unit": "m", "n": 9}}, "torque_offsets": {"r": {}}}
     head = f"errors of points (rms): {1e3 * error:.3g} mm on held-out recordings, 1.8 mm on fitted ones; without "
-    text = " ".join(line.strip() for line in lines[:5])
+    text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:5]))
     assert (head in text) == (said is not None)
     assert said is None or said in text
 
