@@ -12,6 +12,7 @@ import scipy.special
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import Issue
+from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -51,8 +52,8 @@ class GoodnessOfFit:
     data_trusted: bool = True  # no serious data issue (`ProblemOptions.data_issues`)
 
 
-@dataclass(frozen=True)
-class ParameterEstimate:
+@dataclass(frozen=True, repr=False)
+class ParameterEstimate(ReprMixin):
     """The estimate of one parameter, with value, standard deviation, bounds and verdict.
 
     The 95 % `interval` is given if `std` does not describe the uncertainty. At a bound, the interval is one-sided. If
@@ -76,6 +77,11 @@ class ParameterEstimate:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
         return -math.inf if lower is None else lower, math.inf if upper is None else upper
+
+    def _summary(self) -> ReprTexts:
+        std = finite_or_none(self.std) if self.free else None
+        text = value_and_uncertainty_text(self.value, std, self.interval, verdict=self.verdict)
+        return ReprTexts(f"{text} {self.unit}, {VERDICT_TABLE_TEXTS[self.verdict]}")
 
 
 @dataclass(frozen=True)
@@ -215,14 +221,12 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
         at = (series.t / length).astype(int)
         for block in np.unique(at):
             blocks.setdefault((series.recording, int(block)), []).append(series.residual_indices[at == block])
-    found: list[list[IntArray]] = []
-    if len(blocks) > 1:
-        found.append([np.concatenate(parts) for parts in blocks.values()])
-    if len(recordings) > 1 and len(channels) >= _MIN_CLUSTER_CHANNELS:
-        found.append([np.concatenate(parts) for parts in channels])
-    if len(recordings) >= _MIN_CLUSTER_RECORDINGS:
-        found.append([np.concatenate(parts) for parts in recordings.values()])
-    return found
+    kinds = (
+        (blocks.values(), len(blocks) > 1),
+        (channels, len(recordings) > 1 and len(channels) >= _MIN_CLUSTER_CHANNELS),
+        (recordings.values(), len(recordings) >= _MIN_CLUSTER_RECORDINGS),
+    )
+    return [[np.concatenate(parts) for parts in clusters] for clusters, are_enough in kinds if are_enough]
 
 
 def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
@@ -332,7 +336,7 @@ def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterva
     std is infinite. Without open ends, the distance from the value to the farther end, divided by 1.96, decides the
     verdict. It replaces std if std is less than half of it.
     """
-    low, high = interval
+    order, (low, high) = ("identifiable", "weak", "not_identifiable"), interval
     if low is None and entry.value - entry.lower <= scale:
         low = entry.lower
     if high is None and entry.upper - entry.value <= scale:
@@ -344,9 +348,7 @@ def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterva
     else:
         wide = max(entry.value - low, high - entry.value) / math.sqrt(CHI2_95_TWO_SIDED)
         std = wide if _MIN_COST_RISE_RATIO * wide > entry.std else entry.std
-        found = verdict_by_relative_std(entry.value, wide, scale)
-        found = "weak" if found == "not_identifiable" else found
-    order = ("identifiable", "weak", "not_identifiable")
+        found = min(verdict_by_relative_std(entry.value, wide, scale), "weak", key=order.index)
     said = max(entry.verdict, found, key=order.index) if entry.verdict in order else entry.verdict
     return replace(entry, std=std, verdict=said, interval=interval)
 
@@ -370,9 +372,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     known = dict(problem.options.prior_stds)
     known |= dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)), strict=True))
     found = {}
-    for entry in entries:
-        if entry.name not in (*problem.shared_parameters, *problem.local_parameters):
-            continue
+    for entry in (e for e in entries if e.name in (*problem.shared_parameters, *problem.local_parameters)):
         alike = [o for o in entries if o.name != entry.name and o.unit == entry.unit and "@" not in o.name]
         own = [o for o in alike if o.name.rpartition(".")[2] == entry.name.rpartition(".")[2]]
         others = [float(sizes[o.name]) for o in own or alike if sizes[o.name] > 0]
@@ -484,10 +484,8 @@ def percent_number_text(part: float) -> str:
 
 def interval_text(lower: float | None, upper: float | None) -> str:
     """Format the ends of a 95 % interval. None is an open end."""
-    if lower is None and upper is None:
-        return "open"
     if lower is None:
-        return f"below {upper:.4g}"
+        return "open" if upper is None else f"below {upper:.4g}"
     return f"above {lower:.4g}" if upper is None else f"{lower:.4g} to {upper:.4g}"
 
 

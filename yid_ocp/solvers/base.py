@@ -162,12 +162,14 @@ class Solution(ReprMixin):
     def parameters_to_dataframe(self) -> pandas.DataFrame:
         """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
-        `lower` and `upper` are the 95 % interval, infinite at an open end. `ConfigError` if pandas is not installed.
+        `lower` and `upper` are the 95 % interval, infinite at an open end. `value` is NaN if it cannot be found. Raises
+        `ConfigError` if pandas is not installed.
         """
         pandas = import_optional("pandas", "pandas", "a data frame needs the package pandas", ConfigError)
         columns, rows = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"], {}
         for name, e in sorted(self.parameters.items(), key=lambda entry: not entry[1].free):
-            rows[name] = (e.value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)
+            value = math.nan if e.verdict == "not_identifiable" else e.value
+            rows[name] = (value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)
         return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
