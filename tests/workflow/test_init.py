@@ -226,7 +226,8 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     text = Path("run.yaml").read_text()
     assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
-    assert "damping: {pitch: 0.4} N m s/rad, as the robot file states" in capsys.readouterr().out
+    assert "damping: {pitch: 0.4} N m s/rad, as the robot file states" in (told := capsys.readouterr().out)
+    assert told.count("diagnose cannot see joint_*, payload and effort_* of the arm: efforts are off") == 2
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:

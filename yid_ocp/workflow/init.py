@@ -197,11 +197,11 @@ def _summary_lines(
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
     for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
         lines.append(f"diagnose does not try {', '.join(kinds)}: nothing was recorded of {signals}")
-    quoted = shlex.quote(str(out))
-    lines += [*picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
-    has_efforts = "joints.effort" in proposal.noise_by_group
+    has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
+    is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
+    unseen = "diagnose cannot see joint_*, payload and effort_* of the arm: efforts are off (sensors.joints.effort.use)"
+    lines += [*[unseen] * is_left_out, *picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
-        is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
         lines.append(f"friction of the arm's joints: yid-ocp friction {quoted}{more}")
     return [*lines, ""]
@@ -233,8 +233,8 @@ def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -
     scene = measured_motion_animation(recording.name, system, values, recording, has_straight_object=True)
     if scene is None:
         return None
-    known: dict[str, Any] = {"animations": [scene], "robot": run.model.robot}
-    data = ReportData(f"{out.stem}: what init guessed", run.description, result, **known)
+    title = f"{out.stem}: what init guessed"
+    data = ReportData(title, run.description, result, animations=[scene], robot=run.model.robot)
     return str(page) if write_report(page, data) else None
 
 
