@@ -547,7 +547,7 @@ def test_the_error_of_links_is_uncounted_where_an_object_has_them_and_nothing_is
     monkeypatch.setattr(estimation.discretisation, "parameter_shifts_at_finer_discretisation", lambda *_: ({}, ["why"]))
     monkeypatch.setattr(estimation, "typical_parameter_magnitudes", lambda *_: {"k": 1.0})
     fit = replace(solution(k=estimate(2.0)), evaluation=SimpleNamespace())
-    found, checks = estimation._with_discretisation_errors(made, fit, None)
+    found, checks = estimation.add_discretisation_errors(made, fit, None)
     assert found.parameters == fit.parameters
     assert checks.notes == ("why",)
     assert checks.uncounted_errors == (("of the object's links",) if links else ()) + ("of the time step",)

@@ -97,7 +97,7 @@ def add_intervals_and_checks(
     solution, stability = _checked_solution_and_step_stability(start, problem, solution)
     solution = solution_with_profile_intervals(problem, solution, progress)
     data_std = solution.std
-    solution, checks = _with_discretisation_errors(problem, solution, progress)
+    solution, checks = add_discretisation_errors(problem, solution, progress)
     progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
     held_out, expected = _predict_held_out_with_expected_errors(problem, solution.x)
     problem = _with_equilibrium_guesses(problem, (), [outcome for _, outcome in held_out])
@@ -123,8 +123,8 @@ def _with_equilibrium_guesses(
     return problem.with_episodes(episodes, held_out, problem.whitening_filters, problem.held_out_whitening_filters)
 
 
-def _with_discretisation_errors(
-    problem: EstimationProblem, solution: Solution, progress: Progress
+def add_discretisation_errors(
+    problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> tuple[Solution, EstimateChecksBeyondFit]:
     """Return the solution with standard deviations that include the discretisation error, and the shifts with notes."""
     if solution.evaluation is None:

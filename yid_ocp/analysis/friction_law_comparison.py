@@ -11,7 +11,6 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.display import PartsDoneCounter
 from yid_ocp.effects.law import torque_law_quantity_at_midpoints
-from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.problem.measurements import SensorMeasurements
@@ -35,7 +34,6 @@ class CrossValidatedFrictionLawFit:
     """
 
     law: str
-    parameters: Mapping[str, ParameterEstimate]  # estimates of the fit to all recordings
     left_out_errors: Mapping[str, float]
     unit: str
     is_converged: bool
@@ -93,9 +91,8 @@ def cross_validate_law_by_motion_kind(
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
         if parts is not None:
             parts.count_done(f"{law} without {kind}")
-    free = {name: entry for name, entry in solution.parameters.items() if name in problem.free}
     unit = "std" if is_whitened else "rad"
-    return CrossValidatedFrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
+    return CrossValidatedFrictionLawFit(law, errors, unit, solution.status.value == "converged")
 
 
 def _indices_of_sensors_of_friction(samples: Sequence[SensorMeasurements]) -> Sequence[int]:

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis import friction_law_comparison
+from yid_ocp.analysis import estimation, friction_law_comparison
 from yid_ocp.analysis.friction_law_comparison import CrossValidatedFrictionLawFit, mean_and_std_error_over_motion_kinds
 from yid_ocp.config.settings import FrictionLawSettings, RunSettings
 from yid_ocp.display import PartsDoneCounter, Progress
@@ -73,7 +73,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             where = run.setting_location("recordings")
             raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
         best = friction_law_comparison.simplest_fit_within_one_std_error(fits, kinds)
-        settings, problem, solution = solved[best.law]
+        settings, problem, fitted = solved[best.law]
+        solution, checks = estimation.add_discretisation_errors(fitted.problem or problem, fitted, progress)
+        solved[best.law] = settings, problem, solution
         names = friction_parameter_names(settings, problem.system.parameters)
         clouds = friction_law_comparison.measured_and_predicted_friction_torques(problem, solution, names)
         result: dict[str, Any] = {
@@ -81,14 +83,15 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             "kinds": {kind: list(own) for kind, own in kinds.items()},
             "joints": list(friction_joint_names(settings, problem.system)),
             "unit": best.unit,
-            "laws": {fit.law: _law_result(fit, best, kinds) for fit in fits},
+            "laws": {fit.law: _law_result(fit, best, kinds, *solved[fit.law][1:]) for fit in fits},
             "warranted": best.law,
             "friction_parameters": [name for name in names if name in problem.free],
         }
         section = f"{{law: {best.law}, joints: [{', '.join(result['joints'])}]}}"
         again = "solve", os.path.relpath(folder.final_path / "config.yaml"), "--set", f"model.friction={section}"
+        model = ["model:", f"  friction: {section}"]
         copied = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0], solution.parameters, again
-        result["to_use"] = copyable_estimate_texts(*copied, model_yaml=["model:", f"  friction: {section}"])
+        result["to_use"] = copyable_estimate_texts(*copied, checks.uncounted_errors, model)
         folder.log_event("end", warranted=best.law)
         known = {"problem": problem, "solution": solution, "section_data": {"friction_clouds": clouds}}
         written = folder.write_result_and_report(run, progress, result, **known)
@@ -96,13 +99,17 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
 
 
 def _law_result(
-    fit: CrossValidatedFrictionLawFit, best: CrossValidatedFrictionLawFit, kinds: dict[str, tuple[str, ...]]
+    fit: CrossValidatedFrictionLawFit,
+    best: CrossValidatedFrictionLawFit,
+    kinds: dict[str, tuple[str, ...]],
+    problem: EstimationProblem,
+    solution: Solution,
 ) -> dict[str, Any]:
     mean, error = mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)
     difference, paired = friction_law_comparison.prediction_error_difference_and_std_error(fit, best, kinds)
     result = {"mean_error": mean, "standard_error": error, "left_out_errors": dict(fit.left_out_errors)}
     result |= {"beyond_warranted": difference, "beyond_warranted_standard_error": paired}
-    parameters = {name: asdict(entry) for name, entry in fit.parameters.items()}
+    parameters = {name: asdict(entry) for name, entry in solution.parameters.items() if name in problem.free}
     return {**result, "converged": fit.is_converged, "parameters": parameters}
 
 
