@@ -14,8 +14,7 @@ from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, Issue
-from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
-from yid_ocp.errors import ConfigError
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
@@ -26,10 +25,9 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME
-from yid_ocp.model.parameters import Parameter
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
-from yid_ocp.problem.estimation_problem import held_out_prediction_arguments
+from yid_ocp.problem.estimation_problem import checked_unknowns, held_out_prediction_arguments
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_count_dicts_by_channel
@@ -66,15 +64,7 @@ def solve(
         Receives every `Iterate`.
     """
     if initial_unknowns is not None:
-        names, known = problem.unknown_names, problem.system.parameters
-        if len(initial_unknowns) != len(names):
-            what, allowed = f"{len(initial_unknowns)} values for {len(names)} unknowns", abbreviated_names_text(names)
-            hint = "use problem.pack_unknowns({NAME: VALUE, ...})"
-            raise ConfigError(what, where="initial_unknowns", allowed=f"values of {allowed}", hint=hint)
-        for name, value, lower, upper in zip(names, initial_unknowns, *problem.bounds, strict=True):
-            shared = name.partition("[")[0]
-            unit = known[shared].unit if shared in known else "1"
-            Parameter(name, float(value), unit, lower, upper)  # checks its bounds
+        checked_unknowns(problem, initial_unknowns, "initial_unknowns")
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)

@@ -20,13 +20,14 @@ from yid_ocp.analysis.profile import (
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import ConfigError, SolverError, failed_rollout_error, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, failed_rollout_error, unknown_name_error_arguments
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.estimation_problem import checked_unknowns
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers.base import Solution
@@ -125,7 +126,8 @@ def identifiability(
     whitened residual r with respect to the unknowns x. The standard deviation of an unknown is the root of the
     corresponding diagonal entry of the inverse of I, which includes all nuisances (Ljung 1999, System Identification,
     section 7.4; Raue et al. 2009, Bioinformatics 25:1923, doi:10.1093/bioinformatics/btp358). Raises `SolverError` if
-    the rollout at the point fails, and `ConfigError` if `intervals` contains a name that is not a free parameter.
+    the rollout at the point fails, and `ConfigError` if the point is beyond a bound, or if `intervals` contains a name
+    that is not a free parameter.
 
     Parameters
     ----------
@@ -210,22 +212,13 @@ def system_with_grasp_offset_effects(system: System) -> System:
 
 
 def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
-    """Return the vector of unknowns from a solution or an array; by default, return the initial values.
-
-    Raises `SolverError` for a wrong shape or a value that is not finite.
-    """
+    """Return the vector of unknowns from a solution or an array (see `checked_unknowns`); default: initial values."""
     if solution is None:
         return problem.initial_unknowns
     if isinstance(solution, Solution):
-        return map_unknowns_to_problem(solution.x, solution.unknown_names, problem)
-    x = np.array(solution, float)
-    if x.shape != (len(problem.unknown_names),):
-        shape = f"shape ({len(problem.unknown_names)},), one value for each of problem.unknown_names"
-        raise SolverError(f"the array of unknowns has shape {x.shape}", where="solution", allowed=shape)
-    if not np.all(np.isfinite(x)):
-        what = f"{problem.unknown_names[int(np.argmin(np.isfinite(x)))]} is not finite"
-        raise SolverError(what, where="solution", allowed="finite values of all unknowns")
-    return x
+        # solvers may round beyond a bound
+        return np.clip(map_unknowns_to_problem(solution.x, solution.unknown_names, problem), *problem.bounds)
+    return checked_unknowns(problem, solution, "solution")
 
 
 def with_free_starts_and_grasps(

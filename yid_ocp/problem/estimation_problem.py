@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
-from yid_ocp.errors import DataError
+from yid_ocp.display import ReprMixin, ReprTexts, abbreviated_names_text, count_with_noun
+from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import Step
+from yid_ocp.model.parameters import Parameter
 from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_equilibrium_guess
 from yid_ocp.problem.episodes import (
     Episode,
@@ -283,7 +284,7 @@ class EstimationProblem(ReprMixin):
     ) -> Recording:
         """Simulate a synthetic recording with the inputs of an existing recording.
 
-        Raises `ConfigError` if a parameter does not exist, and `SolverError` if the rollout fails.
+        Raises `ConfigError` if a parameter does not exist or exceeds a bound, and `SolverError` if the rollout fails.
 
         Parameters
         ----------
@@ -302,8 +303,12 @@ class EstimationProblem(ReprMixin):
         return self._changed(free=tuple(names))
 
     def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
-        """Return a problem with other fixed values and other initial values of free parameters. Filters are kept."""
+        """Return a problem with other fixed values and other initial values of free parameters. Filters are kept.
+
+        Raises `ConfigError` for an unknown name or a value beyond its bounds.
+        """
         theta = self.theta.copy()
+        self.system.parameters.with_nominal_values(values)  # checks names and bounds
         theta[[self.system.parameters.index(name) for name in values]] = list(values.values())
         return self._changed(theta=theta)
 
@@ -365,6 +370,18 @@ def held_out_prediction_arguments(problem: EstimationProblem, x: ArrayLike) -> l
         std = problem.priors.initial_state_stds
         found.append((episode, theta, _estimated_initial_state_offset(predictor, episode, theta, std)))
     return found
+
+
+def checked_unknowns(problem: EstimationProblem, values: ArrayLike, where: str) -> Array:
+    """Return an unknown vector (nx,). Raises `ConfigError` for another number of values, or one beyond its bounds."""
+    x, names, known = np.array(values, float).ravel(), problem.unknown_names, problem.system.parameters
+    if len(x) != len(names):
+        what, hint = f"{len(x)} values for {len(names)} unknowns", "use problem.pack_unknowns({NAME: VALUE, ...})"
+        raise ConfigError(what, where=where, allowed=f"values of {abbreviated_names_text(names)}", hint=hint)
+    for name, value, lower, upper in zip(names, x.tolist(), *problem.bounds, strict=True):
+        shared = name.partition("[")[0]
+        Parameter(name, value, known[shared].unit if shared in known else "1", lower, upper)  # checks its bounds
+    return x
 
 
 def held_out_parameter_vector(problem: EstimationProblem, x: Array, held: Episode) -> Array:
