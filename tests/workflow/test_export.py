@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -192,10 +193,14 @@ def test_wrong_input_leaves_nothing(printed, found, pendulum_data, tmp_path) -> 
     assert set(tmp_path.rglob("*")) == before
 
 
-def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
+def test_no_model_without_its_manifest_and_no_replay_without_mujoco(cli, found, tmp_path, monkeypatch) -> None:
     (tmp_path / "y.urdf.manifest.json").mkdir()
     assert cli("export", found, "--format", "urdf", "--lossy", "--out", tmp_path / "y.urdf").code == 2
     assert not (tmp_path / "y.urdf").exists()
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    done = cli("export", found, "--out", tmp_path / "y.xml")
+    assert "not replayed: the replay needs MuJoCo; pip install '.[blind]'" in done.out
+    assert "replaying" not in done.err
 
 
 def test_a_format_that_cannot_hold_all_is_refused_before_anything_is_replayed(printed, found, tmp_path) -> None:

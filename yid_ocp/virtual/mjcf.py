@@ -424,9 +424,9 @@ def _add_actuators(system: System, value: CasadiEvaluator, actuator: Element, ti
         SubElement(actuator, "general", attributes)
 
 
-def import_mujoco() -> ModuleType:
-    """Import the mujoco package. Raises `DataError` if it is not installed."""
-    return import_optional("mujoco", "blind", "virtual experiments need MuJoCo")
+def import_mujoco(what: str = "virtual experiments need MuJoCo") -> ModuleType:
+    """Import the mujoco package. Raises `DataError` with the text `what` if it is not installed."""
+    return import_optional("mujoco", "blind", what)
 
 
 def mujoco_model_from_mjcf_text(text: str) -> Any:

@@ -33,7 +33,7 @@ from yid_ocp.model.system import System
 from yid_ocp.report.summaries import summarize_export
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.virtual.mjcf import mujoco_xml
+from yid_ocp.virtual.mjcf import import_mujoco, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
     REPLAY_FEEDBACK_BANDWIDTH,
     ReplayErrorAgainstRecording,
@@ -194,7 +194,6 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         "versions": software_and_plugin_versions(),
     }
     if form == "mjcf":
-        progress.begin_stage("replaying recordings in MuJoCo")
         manifest["gate"] = _gate(calibrated, system, text, progress)
     manifest = to_json_types(manifest)
     write_text(out, text)
@@ -257,6 +256,8 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         recordings = read_recordings_of_role(calibrated.settings, which)
         if not recordings:
             return {"status": "not done", "reason": "the run has no recordings"}
+        import_mujoco("the replay needs MuJoCo")
+        progress.begin_stage("replaying recordings in MuJoCo")
         nominal = calibrated.system([f"{e.kind}@{e.location}" for e in system.effects], nominal=True)
         recordings = [_with_configured_noise(own, nominal, calibrated.settings.sensors) for own in recordings]
         before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
