@@ -178,6 +178,6 @@ def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without
         ({"position": "/hand.q"}, "no messages on the topic '/hand'"),
         ({"position": "/arm"}, "names no field"),
         ({"effort": "/arm.state.torque"}, "the channel position has no field"),
-        ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "not a joint channel"),
+        ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "no joint channel 'effect'"),
     ):
         refused(path, what, message_fields=fields)

@@ -87,7 +87,7 @@ def test_what_cannot_be_aligned_is_refused() -> None:
     ):
         with pytest.raises(DataError, match=what):
             merge_recordings([replace(ROBOT, joints=joints), replace(other, points=(replace(points, t=t),))])
-    with pytest.raises(DataError, match="not one of the files"):
+    with pytest.raises(DataError, match="there is no recording"):
         merge_recordings([ROBOT, camera()], {"kamera": 1.0})
     with pytest.raises(DataError, match="the joint 'a' is in robot and in twin") as caught:
         merge_recordings([ROBOT, replace(ROBOT, name="twin")])

@@ -246,8 +246,8 @@ def test_a_status_says_what_to_try(single_step, golden, theta_golden):
     ("arguments", "words"),
     [
         *(({"time_step": h}, [f"time_step = {h}", "a number above 0 [s]"]) for h in (0.0, -0.01, math.nan, math.inf)),
-        ({"force_split": "right"}, ["force_split = 'right'", "symmetric, left"]),
-        ({"constraint_force_at": "end"}, ["constraint_force_at = 'end'", "node, midpoint"]),
+        ({"force_split": "right"}, ["no rule 'right'", "force_split", "symmetric, left"]),
+        ({"constraint_force_at": "end"}, ["no rule 'end'", "constraint_force_at", "node, midpoint"]),
     ],
 )
 def test_a_step_that_cannot_be_is_refused(refused_with, hinge, arguments, words):

@@ -144,7 +144,7 @@ def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
         ({"controller_rate": 150.0, "effort_kind": "mean"}, "150 Hz is not a multiple of sample_rate = 100 Hz"),
         ({"controller_rate": 50.0}, "50 Hz is not a multiple"),
         ({"controller_rate": 1000.0}, "1000 Hz. changes commands within a sample"),
-        ({"effort_kind": "average"}, "effort_kind = 'average'"),
+        ({"effort_kind": "average"}, "no kind 'average'"),
     ],
 )
 def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) -> None:

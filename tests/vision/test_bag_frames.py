@@ -146,7 +146,7 @@ def test_messages_of_one_time_are_told_apart(tmp_path):
     [
         (lambda bag: bag.cloud(0, CLOUDS[0]), {"pose": None}, "pose of the camera is missing"),
         (lambda bag: bag.cloud(0, CLOUDS[0]), {"topic": "/camera/point"}, "no clouds or depth images on the topic"),
-        (lambda bag: bag.cloud(0, CLOUDS[0]), {"unit": "cm"}, "the unit is 'cm'"),
+        (lambda bag: bag.cloud(0, CLOUDS[0]), {"unit": "cm"}, "there is no unit 'cm'"),
         (lambda bag: bag.joints(0), {}, "no clouds and no depth images"),
         (lambda bag: [bag.cloud(0, CLOUDS[0], topic=name) for name in ("/a", "/b")], {}, "2 topics of clouds"),
         (lambda bag: bag.image(0, DEPTH, "16UC1"), {}, "intrinsics of the camera are unknown"),

@@ -20,7 +20,7 @@ from yid_ocp.analysis.profile import (
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import ConfigError, failed_rollout_error, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, failed_rollout_error, require_known_names
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
@@ -146,9 +146,7 @@ def identifiability(
     """
     names = uncertainty.parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
-    for name in (own for own in wanted if own not in names):
-        said = unknown_name_error_arguments(name, names)
-        raise ConfigError(f"'{name}' is not a free parameter", where="intervals", **said)
+    require_known_names(wanted, names, "free parameter", "intervals", ConfigError)
     given = unknown_vector_from_solution(problem, solution)
     wide = with_free_starts_and_grasps(problem, start, grasp_std)
     x = map_unknowns_to_problem(given, problem.unknown_names, wide)

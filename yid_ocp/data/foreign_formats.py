@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, PointGroup
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
 
 AXES = ("x", "y", "z")
 ColumnMeaning = tuple[str, str] | None
@@ -280,10 +280,8 @@ def joint_values_from_message_fields(content: Any, paths: Mapping[str, str], whe
     Joints are named 1, 2 and so on. Raises `DataError` if a channel is unknown, or a path is missing or not numeric.
     """
     found: dict[str, Any] = {}
+    require_known_names(paths, JOINT_CHANNEL_UNITS, "joint channel", where, DataError)
     for channel, path in paths.items():
-        if channel not in JOINT_CHANNEL_UNITS:
-            what = f"'{channel}' is not a joint channel"
-            raise DataError(what, where=where, **unknown_name_error_arguments(channel, JOINT_CHANNEL_UNITS))
         value = content
         for part in path.split("."):
             if not hasattr(value, part):

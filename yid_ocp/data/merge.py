@@ -13,7 +13,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, mean_sample_rate, median_sample_period
 from yid_ocp.data.readers.base import guess_non_si_units, joints_on_fastest_clock
 from yid_ocp.data.recording import JointGroup, Recording, validated_recording
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, require_known_names
 
 _MIN_SHARED_FRACTION = 0.5  # overlap over the shorter recording; clocks with less are unrelated
 _MIN_EXPLAINED = 0.9  # explained fraction of point motion required to align two clocks
@@ -42,10 +42,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     """
     offsets, names = dict(clock_offsets or {}), [recording.name for recording in recordings]
     where = ", ".join(names)
-    for name in offsets:
-        if name not in names:
-            what = f"a clock offset is given for '{name}', which is not one of the files"
-            raise DataError(what, where="--clock-offset", **unknown_name_error_arguments(name, names))
+    require_known_names(offsets, names, "recording", "--clock-offset", DataError)
     lead = next((recording for recording in recordings if recording.joints is not None), recordings[0])
     first = _with_times_shifted(lead, offsets.get(lead.name, 0.0))
     shifted, notes = list[Recording](), list[str]()

@@ -12,7 +12,7 @@ from pkgutil import iter_modules
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS as EFFECTS
 from yid_ocp.effects.base import EffectBase as EffectBase
-from yid_ocp.errors import ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ModelError, require_known_names, unknown_name_error_arguments
 from yid_ocp.model.system import System
 
 # kinds of recorded signals on which candidates depend; `nominal_clock` means times computed as sample index x period
@@ -53,9 +53,8 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
     measurement. Raises `ModelError` for another signal.
     """
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
-    for name in sorted(name for name in present - known if ":" not in name):
-        said = unknown_name_error_arguments(name, sorted(known))
-        raise ModelError(f"there is no kind of recorded signal '{name}'", where="argument recorded_sensors", **said)
+    named = sorted(name for name in present if ":" not in name)
+    require_known_names(named, sorted(known), "kind of recorded signal", "argument recorded_sensors", ModelError)
     unseen = set() if "joints.effort" in present else set(system.prescribed)
     found = []
     for kind in EFFECTS:

@@ -10,7 +10,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, require_known_names
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -180,10 +180,8 @@ def make_effect_unchecked(kind: str, location: str, system: System, values: Mapp
     definitions = cls.parameter_definitions(location, system)
     names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
     given: dict[str, float] = {}
+    require_known_names(values, names, "parameter", label, ConfigError)
     for name, value in values.items():
-        if name not in names:
-            said = unknown_name_error_arguments(name, names)
-            raise ConfigError(f"the effect {kind} has no parameter '{name}'", where=label, **said)
         definition = names[name]
         if name != definition.name:
             signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]

@@ -15,7 +15,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data import JointGroup, Recording
-from yid_ocp.errors import OutputError, missing_package_error
+from yid_ocp.errors import OutputError, import_optional
 from yid_ocp.files import atomic_write, make_folder, os_error_reason
 
 _SignalKind = Literal["joints", "point", "vector", "wrench"]
@@ -51,11 +51,10 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
     `OutputError` if `rosbags` is not installed, if there are no samples, or if the file cannot be written.
     """
     path = Path(path)
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise missing_package_error(OutputError, "writing MCAP needs the package rosbags", "bags") from None
+    import_optional("rosbags", "bags", "writing MCAP needs the package rosbags", OutputError)
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
     if not any(len(signal.t) for signal in signals):
         what, hint = "the signals have no samples", "export a recording or run that has samples"
         raise OutputError(what, where=str(path), allowed="signals with one sample or more", hint=hint)

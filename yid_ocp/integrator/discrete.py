@@ -23,7 +23,7 @@ from typing import Literal, get_args
 
 import casadi as ca
 
-from yid_ocp.errors import ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ModelError, require_known_names
 from yid_ocp.model.kinematics import (
     Kinematics,
     LagrangianFirstDerivatives,
@@ -153,11 +153,9 @@ def discrete_equations(
     Marsden and West (2001), Acta Numerica 10:357, section 3, doi:10.1017/S096249290100006X.
     Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
     """
-    places = "constraint_force_at", constraint_force_at, ConstraintForcePlacement
-    for name, said, known in (("force_split", force_split, ForceSplit), places):
-        if said not in get_args(known):
-            choice = unknown_name_error_arguments(said, get_args(known))
-            raise ModelError(f"{name} = '{said}' is not a known rule", where=name, **choice)
+    require_known_names([force_split], get_args(ForceSplit), "rule", "force_split", ModelError)
+    places = get_args(ConstraintForcePlacement)
+    require_known_names([constraint_force_at], places, "rule", "constraint_force_at", ModelError)
     at = _Symbols.from_system(system)
     lam, h, qm, vm = at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)

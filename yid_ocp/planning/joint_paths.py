@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array, IntArray, Vector3
-from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, ModelError, require_known_names, unknown_name_error_arguments
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
@@ -314,10 +314,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
     """Return the start positions (nc,) of the moved joints. Raises `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
-    for name in posture:
-        if name not in system.prescribed:
-            said = unknown_name_error_arguments(name, system.prescribed)
-            raise ConfigError(f"'{name}' is not a joint that the plan moves", where=where, **said)
+    require_known_names(posture, system.prescribed, "moved joint", where, ConfigError)
     if missing := [name for name in system.prescribed if name not in posture]:
         what, allowed = f"the position of {', '.join(missing)} is missing", "a start position of every joint that moves"
         hint = f"add the missing positions, or set {where}: null for the default start"

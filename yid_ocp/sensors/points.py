@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, require_known_names, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
@@ -66,10 +66,7 @@ def _points(
         listed = unknown_name_error_arguments("", around.system.point_frames or mechanism.frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
-    for point in known:
-        if point not in group.names:
-            said = unknown_name_error_arguments(point, group.names)
-            raise DataError(f"point '{point}' is not in group '{group.name}'", where=where, **said)
+    require_known_names(known, group.names, "point", where, DataError)
     columns = [group.names.index(point) for point in known]
     inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, ModelError, require_known_names
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.virtual.joint_motion import JointOffsetMotion, grasping_joint_angles
@@ -73,9 +73,7 @@ class SimulationOptions:
         if inner < 1 or abs(inner * self.time_step * controller - 1.0) > 1e-9:
             what = f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz"
             raise ConfigError(what, where="time_step", allowed="1 / (k * controller_rate) with a whole number k from 1")
-        if self.effort_kind not in get_args(EffortSamplingKind):
-            said = unknown_name_error_arguments(self.effort_kind, get_args(EffortSamplingKind))
-            raise ConfigError(f"effort_kind = '{self.effort_kind}' does not exist", where="effort_kind", **said)
+        require_known_names([self.effort_kind], get_args(EffortSamplingKind), "kind", "effort_kind", ConfigError)
         if self.effort_kind == "command" and periods > 1:
             what = f"effort_kind = 'command', but the controller ({controller:g} Hz) changes commands within a sample"
             allowed = f"sample or mean; command with controller_rate = {self.sample_rate:g} Hz"

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp import files
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, OutputError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, OutputError, require_known_names
 from yid_ocp.vision import frames
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
@@ -221,9 +221,7 @@ def read_frame_folder(
     camera = frames.validated_camera_pose(head.get("pose") if pose is None else pose, where)
     scale = metres_per_named_unit(str(unit or head.get("unit", "m")), where)
     frame = head.get("frame", "camera")
-    if frame not in ("camera", "world"):
-        said = unknown_name_error_arguments(str(frame), ("camera", "world"))
-        raise DataError(f"'{frame}' is no coordinate frame of clouds", where=f"{where}: frame", **said)
+    require_known_names([str(frame)], ("camera", "world"), "coordinate frame", f"{where}: frame", DataError)
     intrinsics = _intrinsics(head.get("intrinsics"), where)
     names, times = _read_stamps(path / STAMP_FILE)
     _check_kinds(names, path, intrinsics)
@@ -268,8 +266,7 @@ def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike
 
 def metres_per_named_unit(unit: str, where: str) -> float:
     """Return the length of a cloud's unit in metres [m]. Raises `DataError` for an unknown unit."""
-    if unit not in _METRES_PER_UNIT:
-        raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_error_arguments(unit, _METRES_PER_UNIT))
+    require_known_names([unit], _METRES_PER_UNIT, "unit", where, DataError)
     return _METRES_PER_UNIT[unit]
 
 
@@ -280,8 +277,7 @@ def _read_camera(path: Path) -> dict[str, Any]:
     if not isinstance(head, dict):
         what, hint = "the file is not a JSON object", 'write {"pose": [[...], ...], "unit": "m"}'
         raise DataError(what, where=str(path), allowed=f"an object with {', '.join(_CAMERA_FILE_KEYS)}", hint=hint)
-    for key in (key for key in head if key not in _CAMERA_FILE_KEYS):
-        raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_error_arguments(key, _CAMERA_FILE_KEYS))
+    require_known_names(head, _CAMERA_FILE_KEYS, "key", str(path), DataError)
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
         what, hint = f"the format of the frames is '{head['format']}'", "update yid_ocp, or leave `format` out"
         raise DataError(what, where=f"{path}: format", allowed=_FRAMES_FORMAT, hint=hint)

@@ -14,7 +14,7 @@ from annotated_types import Ge, Le
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, Vector3
-from yid_ocp.errors import ConfigError, ModelError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, ModelError, require_known_names
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
 from yid_ocp.model.system import System
@@ -76,10 +76,8 @@ class CableTopology:
                 what = f"branch '{name}' ({', '.join(vertices)}) is too short, or does not start on the main branch"
                 allowed = f"two or more vertices, the first of them one of {', '.join(free)}"
                 raise ModelError(what, where=f"cable: child_branch_vertex_names.{name}", allowed=allowed)
-        for vertex in self.vertex_names:
-            if vertex not in self.undeformed_positions:
-                said = unknown_name_error_arguments(vertex, self.undeformed_positions)
-                raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", **said)
+        known = self.undeformed_positions
+        require_known_names(self.vertex_names, known, "undeformed position of vertex", "cable", ModelError)
         if len(set(self.vertex_names)) != len(self.vertex_names):
             what = f"vertex '{max(self.vertex_names, key=self.vertex_names.count)}' belongs to two branches"
             raise ModelError(what, where="cable", allowed="every vertex in one branch", hint="list it in one branch")
