@@ -125,10 +125,14 @@ def test_a_plan_that_fails_says_so(config, carried_out):
     assert done.result["message"] in html.unescape((done.folder / "report.html").read_text())
 
 
+WRONG = ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")
+UNKNOWN = ("no finished run in ", "nowhere", "plan.parameter_run_folder")
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.parameter_run_folder=nowhere"], ("no finished run of `solve`", "plan.parameter_run_folder")),
+        (["plan.parameter_run_folder=nowhere"], UNKNOWN),
         (["plan.goal=throw"], ("plan.goal", "place, path, box")),
         (["plan.limits.velocity_fraction=2"], ("plan.limits.velocity_fraction", "up to 1")),
         (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?", "pendulum.yaml")),
@@ -192,10 +196,6 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
     told = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[outcome.result["format"]](outcome.result))
     assert PAIR[0] in "\n".join(told)
-
-
-WRONG = ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")
-UNKNOWN = ("no finished run of `solve` or `diagnose`", "plan.parameter_run_folder")
 
 
 @pytest.mark.parametrize(

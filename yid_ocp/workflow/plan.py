@@ -16,7 +16,6 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_recording
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
 from yid_ocp.files import attributes_to_dict, write_text
 from yid_ocp.integrator.step import Step
@@ -30,7 +29,7 @@ from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, fr
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_history import ESTIMATE_FORMAT_BY_COMMAND, read_result_file
+from yid_ocp.workflow.run_history import read_estimation_result
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role
 
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated noise in the recording of a plan, for later estimation [N m], [m]
@@ -170,21 +169,9 @@ def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
 
 
 def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
-    folder, where = Path(str(run.plan.parameter_run_folder)), ("plan", "parameter_run_folder")
-    file = folder / "result.json"
-    if not file.is_file() or not (folder / "trajectories.h5").is_file():
-        what = f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}"
-        allowed = "a run folder with result.json and trajectories.h5"
-        raise run.config_error(what, *where, allowed=allowed, hint="give the run folder that the command printed")
-    result, formats = read_result_file(file), [ESTIMATE_FORMAT_BY_COMMAND[command] for command in commands]
-    if result.get("format") not in formats:
-        what = f"{folder} has a result of another command (format {result.get('format')})"
-        hint = f"give a run folder of {' or '.join(commands)}"
-        raise run.config_error(what, *where, allowed=" or ".join(formats), hint=hint)
-    if result.get("status") == "failed":
-        what, hint = f"the solve in {folder} failed: {result['message']}", "give the folder of a successful run"
-        raise DataError(what, where=run.setting_location(*where), allowed="a successful run", hint=hint)
-    return result, folder
+    folder = Path(str(run.plan.parameter_run_folder))
+    with add_setting_location_to_errors(run, "plan", "parameter_run_folder"):
+        return read_estimation_result(folder, commands), folder
 
 
 def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[InformativeMotionPlan, dict[str, Any]]:

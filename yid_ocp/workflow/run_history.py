@@ -100,14 +100,14 @@ def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[
     return replace(run, model=replace(run.model, effects=(*run.model.effects, *added)))
 
 
-def read_estimation_result(folder: str | Path) -> dict[str, Any]:
-    """Read result.json of a successful `solve` or `diagnose`. Errors are as in `read_estimates`."""
+def read_estimation_result(folder: str | Path, commands: Sequence[str] = ("solve", "diagnose")) -> dict[str, Any]:
+    """Read result.json of a successful run of one of the `commands`. Errors are as in `read_estimates`."""
     file = Path(folder) / "result.json"
-    result = read_result_file(file)
-    if result.get("format") not in ESTIMATE_FORMAT_BY_COMMAND.values():
+    result, formats = read_result_file(file), [ESTIMATE_FORMAT_BY_COMMAND[command] for command in commands]
+    if result.get("format") not in formats:
         what = f"the run folder has a result of another command (format {result.get('format')})"
-        hint = "give a run folder of `solve` or `diagnose`"
-        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_FORMAT_BY_COMMAND.values()), hint=hint)
+        hint = f"give a run folder of {' or '.join(f'`{command}`' for command in commands)}"
+        raise DataError(what, where=str(file), allowed=" or ".join(formats), hint=hint)
     if result.get("status") == "failed":
         what, hint = f"the run failed: {result.get('message')}", "give the folder of a successful run"
         raise DataError(what, where=str(file), allowed="a successful run", hint=hint)
