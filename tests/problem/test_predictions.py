@@ -244,7 +244,7 @@ def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
 
 
 def test_what_cannot_be_predicted_is_said(recording):
-    with pytest.raises(DataError, match="not recorded"):
+    with pytest.raises(DataError, match="there is no point"):
         naive_cable_predictions(recording, CABLE, ("p9",))
     seen, t = recording.points[0].position.copy(), recording.points[0].t
     short = Recording(points=(PointGroup("points", NAMES, t[:2], seen[:2]),), name="short")

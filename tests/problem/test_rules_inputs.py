@@ -230,7 +230,7 @@ def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
     hidden[2] = math.nan
     with pytest.raises(DataError, match="'d' is seen in 3 frames"):
         path_of(clamped(origin, hidden), grid)
-    with pytest.raises(DataError, match="'x' is not recorded"):
+    with pytest.raises(DataError, match="there is no point 'x'"):
         path_of(made, grid, towards="x")
 
 

@@ -14,7 +14,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError
 from yid_ocp.sensors import CHANNEL_KINDS, SensorOptions
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, NOISE_ESTIMATE_DIFFERENCE_ORDER, quantization_step
 
@@ -242,7 +242,8 @@ def typical_point_pair_distances(
     for edge in edges:
         seen = []
         for recording in recordings:
-            begin, end = (_measured_positions(recording, point)[:frames] for point in edge)
+            groups = [recording.group_of_point(point) for point in edge]
+            begin, end = (own.position[:frames, own.names.index(p)] for own, p in zip(groups, edge, strict=True))
             length = np.linalg.norm(end - begin, axis=1)
             if np.any(np.isfinite(length)):
                 seen.append(float(np.nanmean(length)))
@@ -253,14 +254,6 @@ def typical_point_pair_distances(
             raise DataError(what, where=where, allowed="at least one frame with both points", hint=hint)
         result[edge] = float(np.median(seen))
     return result
-
-
-def _measured_positions(recording: Recording, point: str) -> Array:
-    for group in recording.points:
-        if point in group.names:
-            return group.position[:, group.names.index(point)]
-    said = unknown_name_error_arguments(point, recording.point_names)
-    raise DataError(f"point '{point}' is not recorded", where=f"recording '{recording.name}'", **said)
 
 
 IssueSeverity = Literal["warning", "not_trusted", "refused"]

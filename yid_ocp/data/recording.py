@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
 from yid_ocp.sensors.base import CHANNEL_KINDS, EffortSamplingKind, channel_specs_for_group_name
 
 RecordedOrNominalClock = Literal["recorded", "nominal"]
@@ -290,6 +290,11 @@ class Recording(ReprMixin):
     def point_names(self) -> tuple[str, ...]:
         """Names of the points of all groups, without repetitions, in order of appearance."""
         return tuple(dict.fromkeys(name for group in self.points for name in group.names))
+
+    def group_of_point(self, name: str) -> PointGroup:
+        """Return the first group that has the point `name`. Raises `DataError` if it is not recorded."""
+        require_known_names([name], self.point_names, "point", f"recording '{self.name}'", DataError)
+        return next(group for group in self.points if name in group.names)
 
     @property
     def duration(self) -> float:

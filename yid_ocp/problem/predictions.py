@@ -11,7 +11,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.display import ReprMixin, ReprTexts
-from yid_ocp.errors import DataError, failed_rollout_error, unknown_name_error_arguments
+from yid_ocp.errors import DataError, failed_rollout_error, require_known_names
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -59,12 +59,10 @@ def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Arr
     for group in recording.points:
         if set(points) <= set(group.names):
             return group.position[:, [group.names.index(point) for point in points]]
-    what, where = f"no point group contains all of {', '.join(points)}", f"recording '{recording.name}'"
-    said = {"allowed": "points of one group", "hint": "put the points of one object in one group"}
-    if missing := [point for point in points if point not in recording.point_names]:
-        what = f"point '{missing[0]}' is not recorded"
-        said = unknown_name_error_arguments(missing[0], recording.point_names)
-    raise DataError(what, where=where, **said)
+    where = f"recording '{recording.name}'"
+    require_known_names(points, recording.point_names, "point", where, DataError)
+    what, hint = f"no point group contains all of {', '.join(points)}", "put the points of one object in one group"
+    raise DataError(what, where=where, allowed="points of one group", hint=hint)
 
 
 def _start_frame(recording: Recording, points: Sequence[str]) -> Array:

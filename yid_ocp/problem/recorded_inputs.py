@@ -13,7 +13,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period, noise_or_quantization_std
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError
 from yid_ocp.model.objects.base import ClampPosePointNames
 from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX, MOTOR_OFF_COMMAND, PositionServo
 from yid_ocp.model.system import System
@@ -305,13 +305,10 @@ def _clamp_course(
 
 def _smoothed_point_path(recording: Recording, point: str, grid: TimeGrid, low_pass: ZeroPhaseLowPassFilter) -> Array:
     """Smoothed position of a recorded point at every node, shape (steps + 1, 3) [m]."""
-    for group in recording.points:
-        if point in group.names:
-            seen = group.position[:, group.names.index(point)]
-            good = np.all(np.isfinite(seen), axis=1)
-            if good.sum() < 4:
-                what, hint = f"point '{point}' is seen in {good.sum()} frames", "choose a point that is seen more often"
-                raise DataError(what, where=f"recording '{recording.name}'", allowed="4 frames or more", hint=hint)
-            return _smoothed_at_nodes(group.t[good], seen[good], grid, low_pass)
-    said = unknown_name_error_arguments(point, recording.point_names)
-    raise DataError(f"point '{point}' is not recorded", where=f"recording '{recording.name}'", **said)
+    group = recording.group_of_point(point)
+    seen = group.position[:, group.names.index(point)]
+    good = np.all(np.isfinite(seen), axis=1)
+    if good.sum() < 4:
+        what, hint = f"point '{point}' is seen in {good.sum()} frames", "choose a point that is seen more often"
+        raise DataError(what, where=f"recording '{recording.name}'", allowed="4 frames or more", hint=hint)
+    return _smoothed_at_nodes(group.t[good], seen[good], grid, low_pass)
