@@ -197,7 +197,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.parameters_to_identify=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "you mean", "pendulum.yaml")),
+        (["plan.parameters_to_identify=[elbow.stif]"], ("no parameter 'elbow.stif'", "did you mean", "pendulum.yaml")),
         (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
         (["recordings.estimate=[]"], ("no recording is listed for estimation",)),
         (["plan.duration=0.1", "plan.hold_duration=0.1"], ("too short", "plan.duration")),
