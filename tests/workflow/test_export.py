@@ -179,7 +179,7 @@ def test_wrong_input_leaves_nothing(printed, found, pendulum_data, tmp_path) -> 
     (broken / "result.json").write_text("{")
     before = set(tmp_path.rglob("*"))
     for arguments, parts in (
-        ((found, "--format", "usd"), ["no format 'usd'", "allowed: mjcf", "UsdPhysics has no schema for cables"]),
+        ((found, "--format", "usd"), ["no format 'usd'", "allowed: mjcf", "UsdPhysics has no cables yet"]),
         ((found, "--format", "csv"), ["a run folder cannot be written as CSV", "export a recording"]),
         ((recording, "--format", "mjcf"), ["the format mjcf needs a run folder", "solve"]),
         ((broken,), ["result.json", "not JSON"]),
