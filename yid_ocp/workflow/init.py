@@ -18,7 +18,7 @@ from yid_ocp.config.schema import config_json_schema, option_info_from_annotatio
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.display import Progress, abbreviated_names_text
-from yid_ocp.errors import ConfigError, DataError, OutputError, nearest_name_question, require_known_names
+from yid_ocp.errors import ConfigError, DataError, OutputError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitialObjectSettings, object_factories_for_init, parse_comma_separated_numbers
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
@@ -84,8 +84,9 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
                 what, hint = f"--{name} needs --object", f"add --object KIND, or leave --{name} out"
                 raise ConfigError(what, where=f"--{name}", allowed=f"with --object {', '.join(templates)}", hint=hint)
         return None
-    require_known_names([word], templates, "object", "--object", ConfigError)
-    template = templates[word]
+    if (template := templates.get(word)) is None:
+        said = unknown_name_error_arguments(word, templates, "leave --object out for an arm that holds nothing")
+        raise ConfigError(f"there is no object '{word}'", where="--object", **said)
     links = template.default_links if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
         raise ConfigError(f"the object has {links} links", where="--links", allowed="a whole number from 1 to 64")
@@ -98,10 +99,9 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
             hint = f"write {name}=NUMBER" if name in known else nearest_name_question(name, known) or "leave it out"
             raise ConfigError(what, where="--number", allowed=allowed or "none", hint=hint)
         numbers[name] = parse_comma_separated_numbers(value, 1, "--number")[0]
-    for name, number in numbers.items():
-        if number is not None and not 0 < number < float("inf"):
-            unit = "kg" if name == "mass" else "m" if name in ("length", "radius") else "SI unit"
-            raise ConfigError(f"the {name} is {number:g}", where=f"--{name}", allowed=f"a number above 0 [{unit}]")
+    for name, number in ((n, x) for n, x in numbers.items() if x is not None and not 0 < x < math.inf):
+        unit = "kg" if name == "mass" else "m" if name in ("length", "radius") else "SI unit"
+        raise ConfigError(f"the {name} is {number:g}", where=f"--{name}", allowed=f"a number above 0 [{unit}]")
     given = {**numbers, **{name: getattr(arguments, name) for name in ("section", "branch", "branches")}}
     if given["branch"] and not template.has_branches:
         what, hint = f"a {word} has no branches", "set --object tree, or leave --branch out"
