@@ -121,7 +121,8 @@ def test_mass_matrix_bias_and_frames_are_those_of_mujoco(
 
 def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "robot.xml"
-    file.write_text(MODELS["arm with a gripper"])
+    cube = '<body name="cube"><freejoint/><geom size="0.1"/><site name="top"/></body></worldbody>'
+    file.write_text(MODELS["arm with a gripper"].replace("</worldbody>", cube))
     with caplog.at_level(logging.WARNING):
         mechanism = read_urdf(file)
         read_urdf(file)
@@ -131,7 +132,8 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     assert "finger2" not in mechanism.joint_names
     assert [joint.effort_limit for joint in mechanism.joints[:2]] == [87, 40]
     assert mechanism.joints[0].upper_limit == 2.5
-    assert "tcp" in mechanism.frames
+    assert {"tcp", "cube", "top"}.intersection(mechanism.frames) == {"tcp"}
+    assert "bodies of free objects: 1 ignored" in caplog.text
     assert read_urdf(file, joints=["joint1", "joint2"]).joint_names == ("joint1", "joint2")
     with caplog.at_level(logging.WARNING):
         file.write_text(MODELS["rail with references"])

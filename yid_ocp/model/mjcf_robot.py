@@ -29,18 +29,15 @@ def read_mjcf_robot_description(file: Path) -> SimpleNamespace:
     Each body becomes a link, and each site a frame. The inertia of a body is its `inertial` element or, without this
     element, computed by MuJoCo from the geoms. Coordinates are as in MuJoCo, including `ref`. A joint that a linear
     equality constraint couples to another joint is treated like a URDF `mimic` joint. A free body that a weld attaches
-    to another body is fixed to that body. Raises `ModelError` if `mujoco` is not installed, if it cannot compile the
-    file, or if the file has a free or ball joint.
+    to another body is fixed to that body; other free objects are omitted. Raises `ModelError` if `mujoco` is not
+    installed, if it cannot compile the file, or if the robot has a free or ball joint.
     """
     model = _compiled(file, file.stat().st_mtime_ns)
-    links = [SimpleNamespace(name=_WORLD, inertial=None)]
-    joints: list[SimpleNamespace] = []
-    follows, welds = _followed_joints(model), _welded_free_bodies(model)
-    for i in range(1, model.nbody):
-        own_links, own_joints = _body(model, i, follows, welds, str(file))
-        links += own_links
-        joints += own_joints
-    for i in range(model.nsite):
+    follows, welds, loose = _followed_joints(model), _welded_free_bodies(model), _bodies_of_free_objects(model)
+    made = [_body(model, i, follows, welds, str(file)) for i in range(1, model.nbody) if i not in loose]
+    links = [SimpleNamespace(name=_WORLD, inertial=None), *(link for own, _ in made for link in own)]
+    joints = [joint for _, own in made for joint in own]
+    for i in (i for i in range(model.nsite) if int(model.site_bodyid[i]) not in loose):
         name = model.site(i).name
         if name and name not in {link.name for link in links}:
             links.append(SimpleNamespace(name=name, inertial=None))
@@ -135,9 +132,7 @@ def _limits(model: Any, j: int) -> SimpleNamespace:
     """Limits of a joint. The effort limit is `actuatorfrcrange` or follows from the forces of its actuators."""
     lower, upper = model.jnt_range[j] if model.jnt_limited[j] else (None, None)
     efforts = [float(np.abs(model.jnt_actfrcrange[j]).max())] if model.jnt_actfrclimited[j] else []
-    for i in range(model.nu):
-        if model.actuator_trntype[i] != 0 or model.actuator_trnid[i, 0] != j:
-            continue
+    for i in (i for i in range(model.nu) if model.actuator_trntype[i] == 0 and model.actuator_trnid[i, 0] == j):
         if model.actuator_forcelimited[i]:
             efforts.append(float(np.abs(model.actuator_forcerange[i] * model.actuator_gear[i, 0]).max()))
         if _is_motor(model, i) and model.actuator_ctrllimited[i]:
@@ -163,9 +158,7 @@ def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
 def _welded_free_bodies(model: Any) -> dict[int, tuple[int, Array]]:
     """Indices of free bodies that an active weld holds, with the index of the other body and the pose (4, 4) in it."""
     found: dict[int, tuple[int, Array]] = {}
-    for i in range(model.neq):
-        if int(model.eq_type[i]) != _WELD_EQUALITY or not model.eq_active0[i]:
-            continue
+    for i in (i for i in range(model.neq) if int(model.eq_type[i]) == _WELD_EQUALITY and model.eq_active0[i]):
         first, second, data = int(model.eq_obj1id[i]), int(model.eq_obj2id[i]), model.eq_data[i]
         if int(model.eq_objtype[i]) == _SITE_OBJECT:
             sites = (_pose(model.site_pos[site], model.site_quat[site]) for site in (first, second))
@@ -181,6 +174,13 @@ def _welded_free_bodies(model: Any) -> dict[int, tuple[int, Array]]:
     return found
 
 
+def _bodies_of_free_objects(model: Any) -> set[int]:
+    """Indices of the bodies of objects beside the robot: their only joint is a free one, and no weld holds them."""
+    roots, welds = model.body_rootid[model.jnt_bodyid].tolist(), _welded_free_bodies(model)
+    free = [i for i in model.jnt_bodyid[model.jnt_type == _FREE_JOINT] if roots.count(i) == 1 and i not in welds]
+    return {i for i in range(1, model.nbody) if model.body_rootid[i] in free}
+
+
 def _left_out(model: Any) -> Iterator[str]:
     """Sentences on elements of the file that the mechanism omits."""
     taken = len(_followed_joints(model)) + len(_welded_free_bodies(model))
@@ -192,11 +192,11 @@ def _left_out(model: Any) -> Iterator[str]:
         "equalities": (model.neq - taken, "for welds and connects that close loops, set model.grasp"),
         "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "set model.joint_springs"),
         "tendons": (model.ntendon, ""),
+        "bodies of free objects": (len(_bodies_of_free_objects(model)), ""),
         "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), ""),
     }
-    for noun, (count, remedy) in others.items():
-        if count:
-            yield f"{noun}: {count} ignored" + (f" ({remedy})" if remedy else "")
+    for noun, (count, remedy) in ((noun, own) for noun, own in others.items() if own[0]):
+        yield f"{noun}: {count} ignored" + (f" ({remedy})" if remedy else "")
 
 
 def _body_name(model: Any, i: int) -> str:
