@@ -204,9 +204,11 @@ def _none_good(
     )
     cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFIT_REASONS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
-    hint = (
-        "track.point_cloud_unit: mm, or unit: mm in camera.json" if "metres" in listed else _hint(sizes, things, hint)
-    )
+    of_cause = {
+        "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
+        "crosses or touches itself": "record the object without crossings, or look whether the filters join its parts",
+    }
+    hint = next((own for words, own in of_cause.items() if words in listed), _hint(sizes, things, hint))
     what, allowed = f"{cause}no frame could be used: {listed}", "one usable frame or more"
     return DataError(what, where=source, allowed=allowed, hint=hint)
 
