@@ -212,9 +212,7 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden, e=estimate(2.0, 0.1))
     other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0))
     found = compared({"c": 11.25}, one=best, two=other)
-    said = (
-        f"from one (in brackets) in a.b 12.35 (10), e 3 (2): {why}"  # the reason once, and no ± of sensor noise alone
-    )
+    said = f"from one (in brackets) in a.b 12.35 (10), e 3 (2): {why}"  # the reason once, no ± of sensor noise alone
     assert found.disagreements == {"one": [], "two": [said]}
     weak, lost = found.explanations
     assert all(fact in weak for fact in ("c (truth 11.25)", "weakly", "one 5, two 99")), weak
