@@ -204,16 +204,8 @@ ELBOW_LIMIT = ("effort_limits", "elbow", 1.345, "of elbow is 1.75 times its effo
 SWUNG = {
     "as needed": (lambda e: e, 0.0, []),
     "one a tenth": (lambda e: e * [0.1, 1.0], 0.0, [("effort_gain", "shoulder", 3.124, "0.1 times what gravity")]),
-    "one ten times": (
-        lambda e: e * [10.0, 1.0],
-        0.0,
-        [LIMIT, ("effort_gain", "shoulder", 31.80, "10 times what gravity")],
-    ),
-    "other ten times": (
-        lambda e: e * [1, 10.0],
-        0.0,
-        [ELBOW_LIMIT, ("effort_gain", "elbow", 32.30, "10 times what gravity")],
-    ),
+    "one ten times": (lambda e: e * [10, 1], 0.0, [LIMIT, ("effort_gain", "shoulder", 31.80, "10 times what gravity")]),
+    "other ten": (lambda e: e * [1, 10], 0.0, [ELBOW_LIMIT, ("effort_gain", "elbow", 32.30, "10 times what gravity")]),
     "other a tenth": (lambda e: e * [1.0, 0.1], 0.0, [("effort_gain", "elbow", 3.175, "0.1 times what gravity")]),
     "ten times": (lambda e: 10 * e, 0.0, [LIMIT, ("effort_gain", "", 10 / 3, "about 10 times")]),
     "a tenth": (lambda e: 0.1 * e, 0.0, [("effort_gain", "", 10 / 3, "about 0.1 times")]),

@@ -107,9 +107,8 @@ def test_an_interrupted_or_killed_run_does_not_look_finished(pendulum, tmp_path,
 def test_a_full_disk_is_the_users_business(printed, pendulum, left_nothing, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(estimation, "solve", Mock(side_effect=FileNotFoundError(2, "No such file", "a")))
-        assert re.search(
-            "reports: No such file\n.*: a\n.*\n  try: check the path\n", printed("solve", pendulum, code=2)
-        )
+        said = printed("solve", pendulum, code=2)
+        assert re.search("reports: No such file\n.*: a\n.*\n  try: check the path\n", said)
     monkeypatch.setattr("yid_ocp.workflow.run_folder.os.replace", Mock(side_effect=OSError(28, "No space left on")))
     assert "No space left on device" in printed("solve", pendulum, code=2)
     left_nothing()

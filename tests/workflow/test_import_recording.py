@@ -122,9 +122,8 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     t = np.arange(0, 2, 0.01)
     rows = "".join(f"{x:.3f},{math.sin(3 * x):.6f},{3 * math.cos(3 * x):.6f},{k % 3}\n" for k, x in enumerate(t))
     (odd / "joints.csv").write_text("timestamp,pos_a,vel_a,tau_a [Nm]\n" + rows)
-    rows = "".join(
-        f"{x:.3f},{500 * math.cos(math.sin(3 * x)):.3f},{500 * math.sin(math.sin(3 * x)):.3f},0\n" for x in t
-    )
+    turned = np.column_stack([t, 500 * np.cos(np.sin(3 * t)), 500 * np.sin(np.sin(3 * t))])
+    rows = "".join(f"{x:.3f},{y:.3f},{z:.3f},0\n" for x, y, z in turned)
     (odd / "mocap.csv").write_text("time,tip X,tip Y,tip Z\n" + rows)
     *_, said = printed("import", *BOTH, "--preview").strip().splitlines()
     told = printed(*shlex.split(said)[1:])
