@@ -43,7 +43,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     verdict = result["verdict"].replace("_", " ")
     gap, *others = result["summary"].split("\n")
-    parts = f"Verdict: {verdict}. {gap}", unused_efforts_sentence(result), *others
+    parts = f"Verdict: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), *others[-1:]
     yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps = result["gap"]["before"], result.get("steps", ())
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
