@@ -182,9 +182,10 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             and options(group.name).clock_offset_std is None
             and group.clock_offset_std is None
         ):
-            lag = late_notes[0].partition(LATE_POINTS_WORDS)[2]
+            lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
             setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0].lstrip('+-')}"
-            advice = f"unless the object swings behind, import again with this option, or set {setting} for a fit of it"
+            again = f"import again with --clock-offset {option.rstrip(')')}, or set {setting}"
+            advice = f"unless the object swings behind, {again}, and a fit estimates the shift"
             what = LATE_POINTS_WORDS + lag
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
 

@@ -27,6 +27,7 @@ TableRows = list[Sequence[str]]
 _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings that a table of torque offsets shows side by side
 _MAX_NUMBERS_BEYOND_MODEL = 6  # parameters that a sentence on a poor fit lists; the table has all
+_MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and largest length of a note that stays on one line."""
@@ -181,9 +182,12 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     for key, words in tries:
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
-        changes = ", ".join(f"{n} by {own[key]:+.2g} (± {own['std']:.2g})" for n, own in moved.items())
+        worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
+        changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
+        changes[_MAX_SHIFTS:] = [f"{len(changes) - _MAX_SHIFTS} more"] * (len(changes) > _MAX_SHIFTS)
         if moved:
-            said.append(f"with {words} these estimates change by more than their ± from the data: {changes}")
+            text = f"with {words} these estimates change by more than their ± from the data: "
+            said.append(text + ", ".join(changes))
         elif tried:
             said.append(f"with {words} no estimate changes by more than its ± from the data")
     return said
