@@ -80,7 +80,7 @@ def gaps():
         yield f"no gap, p = {p} and chi2 {size}", finding("no_gap", **tests, **seen, **NO_EFFECT)
     quiet = {"nominal_test": outcome(0.2, chi2=1.02), "nominal_held_out_test": outcome(0.6, chi2=0.989)}
     yield "along a candidate alone", finding(**quiet)
-    yield "no gap", finding("no_gap", next_experiment="None is needed.", **NO_EFFECT)
+    yield "no gap", finding("no_gap", next_experiment="None is needed for what these motions can show.", **NO_EFFECT)
 
 
 def places():

@@ -78,7 +78,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
         finding = diagnose(
             bench.problem(recordings[:1]), FRICTION, recordings[1:], thresholds=limits, progress=progress
         )
-        said = f"The search stopped after {finding.search_seconds:.3g} s; it would go on with {finding.untried[0]}"
+        said = f"it stopped after {finding.search_seconds:.3g} s, and would go on with {finding.untried[0]}"
         assert finding.summary.count(said) == 1
         assert finding.search_seconds == pytest.approx(sum(list(finding.stage_seconds.values())[:-4]))
         return json.loads(json.dumps(finding.to_dict(), allow_nan=False))

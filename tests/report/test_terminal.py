@@ -113,7 +113,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     first += "`yid-ocp diagnose`"
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    sure = "if no effect is missing (`yid-ocp diagnose`), these are known to within 10 %, misfit counted: a = 2 ± 0.1"
+    sure = "only if no effect is missing are these known to within 10 %, with the misfit in the ±: a = 2 ± 0.1"
     assert lines[:2] == [first, f"{sure} N m/rad"]
     unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
     assert "no value is known to within 10 %" in told("yid-solve/1", unsure)[1]
@@ -191,7 +191,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
     assert lines[0].startswith("values by single_shooting, late are not trusted, as they ignore the noise that drives")
     assert "a is 9 ± 0.1 N m/rad, not 7 (single_shooting)" in lines
-    assert "stopped before its first iteration, so without values: late" in lines
+    assert "late: no values, because the time was up before the first iteration" in lines
     assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "verdict"]
     assert "a          7                stopped  9 ± 0.1  found" in lines
     assert not any("does not explain" in line or "all methods agree" in line for line in lines)

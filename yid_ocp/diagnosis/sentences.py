@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from yid_ocp.inference.smoother import select_largest_gap_locations
 from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
+_MAX_CHANGES = 5  # number of named parameters, the largest changes first
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 _GAP_ORIGIN_PHRASES = {
@@ -48,7 +50,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     texts = {
         "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
         "unknown": mostly or "Record other motions, faster and larger.",
-        "no_gap": "None is needed.",
+        "no_gap": "None is needed for what these motions can show.",
         "confusable": "Record other motions, in which effects and changed parameters act differently.",
         "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
     }
@@ -57,13 +59,13 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
-    text = [_gap(result)]
+    stopped = f"The search is not finished: it stopped after {result.search_seconds:.3g} s, and would go on with "
+    text = [_gap(result), _listed(stopped, result.untried)]
     if result.verdict not in ("insufficient_data", "no_gap"):
         text += [_places(result), *_causes(result), *_remains(result)]
     if result.law is not None:
         text.append(result.law.sentence)
-    stopped = f"The search stopped after {result.search_seconds:.3g} s; it would go on with "
-    text += [_listed(stopped, result.untried), *map(held_out_truncation_message, result.truncated_recordings)]
+    text += [*map(held_out_truncation_message, result.truncated_recordings)]
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     step = f"Steps of {stated} s are too long here, so this result is for {used} s"
@@ -237,12 +239,18 @@ def _remains(result: DiagnosisResult) -> list[str]:
     said = "is within noise and the uncertainty of the parameters"
     if result.remaining_test.p_value < result.thresholds.significance_level:
         said = f"exceeds noise: {', '.join([*worst.values(), *mostly])}"
+    changes = sorted(result.nominal_parameters_before_and_after.items(), key=lambda own: -_relative_change(own[1]))
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
-        for name, own in result.nominal_parameters_before_and_after.items()
-        if abs(own["after"] - own["before"]) > _MIN_RELATIVE_CHANGE * max(abs(own["before"]), 1e-9)
+        for name, own in changes
+        if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
+    moved[_MAX_CHANGES:] = [f"{len(moved) - _MAX_CHANGES} more"] * (len(moved) > _MAX_CHANGES)
     return [f"{what} {said}.", _listed("With the effects in the model, these estimates change: ", moved)]
+
+
+def _relative_change(own: Mapping[str, Any]) -> float:
+    return float(abs(own["after"] - own["before"]) / max(abs(own["before"]), 1e-9))
 
 
 def _earlier_runs(result: DiagnosisResult) -> list[str]:

@@ -147,7 +147,7 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     if first.partition(":")[0] in {kind.__name__ for kind in YidError.__subclasses__()}:
         told = dict(line.strip().partition(": ")[::2] for line in rest.splitlines())  # as `YidError.__str__` writes it
         where = f"task '{failed[0].name}': {told.get('where', 'its arguments')}"
-        hint = f"{told.get('try', 'correct this cause')}; then run the same command, which repeats failed tasks"
+        hint = f"{told.get('try', 'correct this cause')}. The command, run again, repeats only the failed tasks"
         raise ParallelWorkError(what, where=where, allowed=told.get("allowed", "tasks without errors"), hint=hint)
     raise RuntimeError(f"{what}; the same command tries them again")
 

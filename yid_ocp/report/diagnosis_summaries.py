@@ -318,7 +318,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
                 said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
                 yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
     if stopped:
-        yield f"stopped before its first iteration, so without values: {', '.join(stopped)}"
+        yield f"{', '.join(stopped)}: no values, because the time was up before the first iteration"
     if not fit["explains"]:
         yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
     elif not fit["data_trusted"]:

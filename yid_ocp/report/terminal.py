@@ -163,9 +163,7 @@ def misfit_summary_blocks(
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
             none = "if this misfit is counted in the ±, no value is known to within 10 %"
-            said = (
-                f"if no effect is missing (`yid-ocp diagnose`), these are known to within 10 %, misfit counted: {shown}"
-            )
+            said = f"only if no effect is missing are these known to within 10 %, with the misfit in the ±: {shown}"
             yield SummaryStatement(said if known else none, "conclusion")
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:

@@ -280,7 +280,8 @@ def load_robot_meshes_by_joint(
     try:
         robot = yourdfpy.URDF.load(str(check_input_file(path)), **bare)
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
-        what, hint = f"the URDF cannot be read: {error}", "check it with check_urdf, or export it again"
+        reason = f"an element has no {error}" if isinstance(error, KeyError) else error
+        what, hint = f"the URDF cannot be read: {reason}", "check it with check_urdf, or export it again"
         raise ModelError(what, where=str(path), allowed="a URDF file with links and joints", hint=hint) from error
     parts: dict[int, list[TriangleMesh]] = {}
     for link in robot.robot.links:

@@ -47,9 +47,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         rubbing = friction_joint_names(next(iter(by_law.values())), problems[0].system)
         compared = [own.sensor for episode in problems[0].episodes for own in episode.measurements]
         if {*rubbing} <= {*problems[0].system.prescribed} and not any(sensor.effort_joints for sensor in compared):
-            what = "the torques of joints that move as measured are not compared"
+            what = "friction shows only in joint torques, and the configuration does not use them"
             where, hint = run.setting_location("sensors"), "set sensors.joints.effort.use: true"
-            allowed = "recorded torques that are used: friction shows only there"
+            allowed = "recorded torques that the fit compares with the model"
             raise DataError(what, where=where, allowed=allowed, hint=hint)
         problems = friction_law_comparison.problems_with_common_samples(problems)
         progress.begin_stage("fitting the friction laws, each also with one kind of motion left out in turn")
