@@ -223,7 +223,7 @@ def test_what_all_tasks_found_or_why_one_did_not():
     assert require_task_values([good, good]) == [1, 1]
     with pytest.raises(RuntimeError, match=r"1 of 2 tasks failed; .* b, ZeroDivisionError: no b; the same command"):
         require_task_values([good, TaskResult("b", error="ZeroDivisionError: no b")])
-    with pytest.raises(ParallelWorkError, match=r"of c, DataError: no such file\n.* 'c': here\n(.|\n)*try: there\. The c"):
+    with pytest.raises(ParallelWorkError, match=r"of c, DataError: no such file\n.* 'c': here\n(.|\n)*try: there\. Th"):
         require_task_values([good, TaskResult("c", error="DataError: no such file\n  where: here\n  try: there")])
 
 
