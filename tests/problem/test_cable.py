@@ -235,7 +235,7 @@ def test_vertices_are_read_from_a_table(tmp_path):
     path.write_text("point,x,y,z\np0,1,2,3\n")
     np.testing.assert_array_equal(read_vertex_positions_by_name(path)["p0"], [1.0, 2.0, 3.0])
     path.write_text("point,x,y\np0,1,2\n")
-    with pytest.raises(DataError, match="lacks a column"):
+    with pytest.raises(DataError, match="has no column 'z'"):
         read_vertex_positions_by_name(path)
     with pytest.raises(DataError, match="no such file"):
         read_vertex_positions_by_name(tmp_path / "none.csv")

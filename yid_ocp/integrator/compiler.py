@@ -65,7 +65,8 @@ def _compiler_path(wanted: str | None) -> str | None:
         what, where = f"there is no compiler '{wanted}'", "the environment variable CC"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
-        _LOG.warning("no C compiler was found, or CC is none: computations run uncompiled, about ten times slower")
+        why = "CC is none" if wanted == "none" else "no C compiler was found"
+        _LOG.warning("%s: computations run uncompiled, about ten times slower", why)
     return path
 
 

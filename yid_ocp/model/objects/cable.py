@@ -100,8 +100,9 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         return {row["point"]: np.array([float(row[axis]) for axis in "xyz"]) for row in rows}
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         allowed = "columns point, x, y, z with numbers in metres"
-        what, hint = "the table of vertices lacks a column, or a coordinate is not a number", "correct the table"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
+        is_lost = isinstance(error, KeyError)
+        what = f"the table of vertices has no column {error}" if is_lost else f"a coordinate is not a number: {error}"
+        raise DataError(what, where=str(path), allowed=allowed, hint="correct the table") from error
 
 
 def length_parameters_from_edges(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
