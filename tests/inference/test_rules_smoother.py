@@ -137,6 +137,13 @@ def smoothed(monkeypatch, models, **limits):
 NOTHING = dict.fromkeys(SOURCES, 0.0)
 
 
+def test_parameters_that_rounding_cannot_tell_apart_share_the_step():
+    products = 1e24 * np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0 - 1e-15]])
+    evidence, shift, _ = smoother._judged(products, 0.0)
+    assert np.isfinite(evidence)
+    assert np.sum(shift) == pytest.approx(1.0)
+
+
 def test_variances_stay_within_their_range(monkeypatch):
     assert set(smoothed(monkeypatch, [made(3, size=np.full(3, 1e9))]).group_variance.values()) == {1e7}
     assert smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6})[0][FORCE] >= 1e-6

@@ -220,11 +220,7 @@ class _State:
 
 def _run(models: _Models, variance: _Variances) -> _State:
     """Filter all recordings at given variances."""
-
-    def run(model: ResidualStateSpaceModel) -> _Filtered:
-        return _forwards(model, model.prior_variances_of_unknowns(variance))
-
-    filtered = tuple(map_in_threads(run, models))
+    filtered = tuple(map_in_threads(lambda m: _forwards(m, m.prior_variances_of_unknowns(variance)), models))
     products = np.sum([done.products for done in filtered], axis=0)
     evidence, shift, information = _judged(products, sum(done.log_determinant for done in filtered))
     return _State(filtered, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
@@ -232,13 +228,15 @@ def _run(models: _Models, variance: _Variances) -> _State:
 
 def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
     """Log evidence, the parameters' step, and the Cholesky factor of its information, from sums over recordings."""
-    # a parameter may move by several times its size: the prior only fixes unobserved ones
-    precision = np.full(len(products) - 1, 1.0 / 9.0)
-    factor = scipy.linalg.cho_factor(products[1:, 1:] + np.diag(precision), lower=True)
-    shift = scipy.linalg.cho_solve(factor, products[1:, 0])
+    # a parameter may move by several times its size: the prior only fixes unobserved ones, beyond rounding errors
+    precision = np.maximum(1.0 / 9.0, 1e-13 * np.diag(products)[1:])
+    factor, failed = scipy.linalg.lapack.dpotrf(products[1:, 1:] + np.diag(precision), lower=1)
+    if failed:  # rounding
+        return -math.inf, np.zeros(len(precision)), (np.eye(len(precision)), True)
+    shift = scipy.linalg.cho_solve((factor, True), products[1:, 0])
     quadratic = float(products[0, 0] - products[0, 1:] @ shift)
-    determinant = 2 * float(np.sum(np.log(np.diag(factor[0])))) - float(np.sum(np.log(precision)))
-    return -0.5 * (quadratic + log_determinant + determinant), shift, factor
+    determinant = 2 * float(np.sum(np.log(np.diag(factor)))) + len(shift) * math.log(9.0)
+    return -0.5 * (quadratic + log_determinant + determinant), shift, (factor, True)
 
 
 def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
