@@ -58,9 +58,11 @@ def blocks(text: str, language: str) -> list[str]:
 
 
 def printed_commands(text: str) -> list[list[str]]:
-    """Words of every command that a page prints, continued lines joined."""
-    found, lines = [], iter(text.splitlines())
+    """Words of every command that a page prints, continued lines joined, and loops over `run` unrolled."""
+    found, lines, runs = [], iter(text.splitlines()), [""]
     for line in lines:
+        if loop := re.match(r"\s*for run in (.*); do", line):
+            runs = loop[1].split()
         begin = re.match(r"\s*(?:\$ |python -m pip install [^&]*&& )?(yid-ocp .*)", line)
         if begin is None:
             continue
@@ -75,7 +77,8 @@ def printed_commands(text: str) -> list[list[str]]:
             except ValueError:  # a quote that a later line closes
                 command += next(lines).strip()
         for part in " ".join(map(shlex.quote, words)).replace("'&&'", "|").replace("'|'", "|").split(" | "):
-            found += [shlex.split(part)] if part.startswith("yid-ocp ") else []
+            for run in runs if "$run" in part else [""]:
+                found += [shlex.split(part.replace("$run", run))] if part.startswith("yid-ocp ") else []
     return found
 
 
@@ -144,10 +147,8 @@ def test_entries_and_names_are_those_of_the_equations(page, symbols):
     text = page("inspection")
     [commands] = blocks(text, "sh")
     for entry in re.findall(r"--entry '(.*?)'", commands):
-        assert (
-            symbols.equation_or_derivative_by_name(entry).title.split(" / ")[0].removeprefix("d ")
-            == entry.split(",")[0]
-        )
+        title = symbols.equation_or_derivative_by_name(entry).title
+        assert title.split(" / ")[0].removeprefix("d ") == entry.split(",")[0]
     lines = symbols.equation_or_derivative_by_name("del[T2_3_z], T2.twist").text_lines
     assert "\n".join(f"    {line}" for line in lines) in text
     listed = re.findall(r"`((?:del|constraint|p1|q0|p0|u|q1|lam)\[[\w.]+\])`", text)
