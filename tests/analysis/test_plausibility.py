@@ -143,11 +143,7 @@ EFFORTS = {
     "late": (2, late(30), [("effort_lag", "", 3.0, "0.3 s earlier")]),
     "wrist off": (1, offset(5.0, 6), [("effort_offset", "left_w2", 2.223, "error of +5 N m")]),
     "wrist far off": (1, offset(12.0, 6), [("effort_offset", "left_w2", 5.334, "error of +12 N m")]),
-    "a wrist that rubs off": (
-        1,
-        offset(-5.0, 6, rubs=True),
-        [("effort_offset", "left_w2", 2.207, "error of -4.97 N m")],
-    ),
+    "a wrist rubs off": (1, offset(-5.0, 6, rubs=True), [("effort_offset", "left_w2", 2.207, "error of -4.97 N m")]),
     "wrist ten times": (1, times(10.0, 6), [("effort_gain", "left_w2", 1.545, "10 times what gravity")]),
     "what may hang on the gripper": (1, offset(20.0, 2), []),
 }
@@ -212,11 +208,7 @@ SWUNG = {
     "flipped": (lambda e: -e, 0.0, [("effort_sign", "", 7.172, "all efforts")]),
     "one flipped": (lambda e: e * [-1.0, 1.0], 0.0, [("effort_sign", "shoulder", 7.061, "of shoulder has")]),
     "one off": (lambda e: e + np.array([0.0, 1.0]), 0.0, [("effort_offset", "elbow", 1.051, "error of +0.946 N m")]),
-    "other off": (
-        lambda e: e + np.array([3.0, 0.0]),
-        0.0,
-        [("effort_offset", "shoulder", 2.390, "error of +2.15 N m")],
-    ),
+    "other off": (lambda e: e - [-3.0, 0.0], 0.0, [("effort_offset", "shoulder", 2.390, "error of +2.15 N m")]),
     "a little off": (lambda e: e + np.array([0.0, 0.9]), 0.0, []),
     "balanced": (lambda e: e - [3.0, 0.0], 0.0, []),
     "late": (lambda e: e, 0.1, [("effort_lag", "", 1.0, "0.1 s earlier")]),
@@ -489,10 +481,8 @@ def errors_of_guess(names, value, run=None, cable=None):
     grid = SimpleNamespace(start_time=0.5, node_times=np.array([0.5, 1.0]))
     episode = SimpleNamespace(recording=run, name="run", measurements=[seen], grid=grid)
     options = ProblemOptions(initial_state="equilibrium", cable_topology=cable)
-    problem, fit = (
-        SimpleNamespace(options=options, step=SimpleNamespace(time_step=0.1)),
-        SimpleNamespace(evaluation=None),
-    )
+    problem = SimpleNamespace(options=options, step=SimpleNamespace(time_step=0.1))
+    fit = SimpleNamespace(evaluation=None)
     [told], *_ = prediction_errors_units_and_fit_rmse(problem, fit, [(episode, "not predicted")])
     return told["baselines"]["stays"]
 

@@ -92,10 +92,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("model:\n  object: {links: 4}\n", ["line 2: model.object"]),
         ("model:\n  object: {kind: cube}\n", ["there is no kind 'cube'"]),
         ("model:\n  object: 3\n", ["model.object = 3 is not a section"]),
-        (
-            "model:\n  object:\n    kind: segments\n    named_segments: {a: {length: 1, radius: 0.1}}\n",
-            ["'mass' is missing"],
-        ),
+        ("model: {object: {kind: segments, named_segments: {a: {length: 1, radius: 0.1}}}}", ["'mass' is missing"]),
         ("model:\n  grasp: {left: {holder_frame: x}}\n", ["'held_frame' is missing"]),
         ("model:\n  grasp: [left]\n", ["model.grasp"]),
         ("model:\n  gravity: [0, 0]\n", ["a list of 3"]),

@@ -140,12 +140,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "time of day": ("t,q_a\n10:20:30,1\n", {}, "'t' has the cell '10:20:30'", ""),
     "no such day": ("t,q_a\n2025-13-04T10:20:30,1\n", {}, "'t' has the cell '2025-13", ""),
     "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' has the cell 'fast'", ""),
-    "joint missing in a channel": (
-        "t,q_a,q_b,effort_a\n0,1,1,1\n",
-        {},
-        "no column for effort of 'b'",
-        "add the column",
-    ),
+    "joint missing": ("t,q_a,q_b,effort_a\n0,1,1,1\n", {}, "no column for effort of 'b'", "add the column"),
     "misspelt": ("t,q_elbwo,q_b,effort_elbow,effort_b\n0,1,1,1,1\n", {}, "for position of 'elbow'", "mean 'elbwo'?"),
     "no position": ("t,effort_a\n0,1\n", {}, "no column for position of 'a'", ""),
     "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),

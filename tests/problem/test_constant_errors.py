@@ -139,10 +139,8 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
 )
 def test_a_clock_is_uncertain_where_dampers_are_free(urdf_folder, free, effects, clock_offset_std, group, expected):
     step = pendulum_step(urdf_folder, effects, prescribed=tuple(BIAS))
-    sensors = {
-        "joints.position": SensorOptions(std=1e-4),
-        "points_mocap": SensorOptions(clock_offset_std=clock_offset_std),
-    }
+    clock = SensorOptions(clock_offset_std=clock_offset_std)
+    sensors = {"joints.position": SensorOptions(std=1e-4), "points_mocap": clock}
     told = ProblemOptions(sensors=sensors, has_uncertain_point_clocks=True)
     made = taken(step, 3, efforts=False, camera=False)
     made = replace(made, points=(replace(made.points[0], name=group),))

@@ -315,17 +315,6 @@ def test_a_deviation_that_is_mostly_the_models_error(carried_out, pendulum):
     assert found[1] == pytest.approx(found[0], rel=0.01)
 
 
-@pytest.mark.slow
-def test_the_embedded_example_finds_what_was_withheld(carried_out):
-    done = carried_out("diagnose")
-    result = done.result
-    assert result["verdict"] == "effect"
-    assert result["effects"] == [{"kind": "kelvin_voigt", "location": "T1"}]
-    assert result["which"][0]["parameters"]["tau"]["value"] == pytest.approx(0.05, rel=0.1)
-    assert result["gap"]["closure_ci"][0] > 0.9
-    assert (done.folder / "report.html").exists()
-
-
 def merged(one: dict, other: dict) -> dict:
     return one | {k: merged(one[k], v) if isinstance(v, dict) and k in one else v for k, v in other.items()}
 

@@ -15,7 +15,6 @@ from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_confi
 from yid_ocp.config.settings import config_yaml_with_defaults
 from yid_ocp.virtual.mujoco_simulation import replay_mismatch_by_channel
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install '.[blind]'")
@@ -89,10 +88,15 @@ def test_the_embedded_diagnosis_in_mujoco(printed, found, tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_diagnosis_found_in_mujoco(tmp_path, exported) -> None:
-    run = load_config(None, default=SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
-    run_diagnose(replace(run, output=replace(run.output, write_report=False)), tmp_path / "run")
-    gate_holds(exported(tmp_path / "run", tmp_path / "y.xml")["gate"])
+def test_the_embedded_example_finds_what_was_withheld_and_plays_it_in_mujoco(carried_out, tmp_path, exported) -> None:
+    done = carried_out("diagnose")
+    result = done.result
+    assert result["verdict"] == "effect"
+    assert result["effects"] == [{"kind": "kelvin_voigt", "location": "T1"}]
+    assert result["which"][0]["parameters"]["tau"]["value"] == pytest.approx(0.05, rel=0.1)
+    assert result["gap"]["closure_ci"][0] > 0.9
+    assert (done.folder / "report.html").exists()
+    gate_holds(exported(done.folder, tmp_path / "y.xml")["gate"])
 
 
 def test_urdf_loads_in_three_readers(found, tmp_path, exported) -> None:
