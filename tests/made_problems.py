@@ -130,6 +130,5 @@ class Steps:
         for entry in history:
             if callback is not None:
                 callback(entry)
-        return SolverResult(
-            self._status, f"run {len(self.runs)}", np.array(path[-1], float), history, len(path), "warm"
-        )
+        end = np.array(path[-1], float)
+        return SolverResult(self._status, f"run {len(self.runs)}", end, history, len(path), "warm")

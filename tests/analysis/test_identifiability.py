@@ -177,10 +177,8 @@ def test_where_the_grasp_sits_is_a_nuisance(held_tube):
             assert found.parameters[name].std == pytest.approx(entry.std, rel=1e-4)
     assert loose.parameters["T1.bend"].std > 1.5 * base.parameters["T1.bend"].std
     one_free = EstimationProblem(step, recordings, (*held_tube.free, "grasp_offset@hand.dy"), held_tube.options)
-    added = ("grasp_offset@hand.dx", "grasp_offset@hand.dz")
-    assert module.with_free_starts_and_grasps(one_free, "assumed", 2e-3).options.prior_stds == dict.fromkeys(
-        added, 2e-3
-    )
+    added = dict.fromkeys(("grasp_offset@hand.dx", "grasp_offset@hand.dz"), 2e-3)
+    assert module.with_free_starts_and_grasps(one_free, "assumed", 2e-3).options.prior_stds == added
     assert module.with_free_starts_and_grasps(one_free, "assumed", None) is one_free
 
 

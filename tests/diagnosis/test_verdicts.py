@@ -75,9 +75,8 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
 
     def stopped(progress):
         limits = Thresholds(max_effects=2, budget=1e4, min_excess_chi2_per_dof=-0.5)
-        finding = diagnose(
-            bench.problem(recordings[:1]), FRICTION, recordings[1:], thresholds=limits, progress=progress
-        )
+        problem = bench.problem(recordings[:1])
+        finding = diagnose(problem, FRICTION, recordings[1:], thresholds=limits, progress=progress)
         said = f"it stopped after {finding.search_seconds:.3g} s, and would go on with {finding.untried[0]}"
         assert finding.summary.count(said) == 1
         assert finding.search_seconds == pytest.approx(sum(list(finding.stage_seconds.values())[:-4]))

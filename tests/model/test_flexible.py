@@ -72,9 +72,8 @@ def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
             assert springs[f"{name}_{i}_y"] == springs[f"{name}_{i}_x"]
             damping = 0.3 if name == "B" else 0.1
             assert springs[f"{name}_{i}_z"] == pytest.approx((1.5 * factor, damping * factor))
-    plain = stiffness(
-        flexible_object([FlexibleSegment("A", 0.6, 0.6, 0.01, links=3, bend=2.0, twist=1.5, damping=0.1)])
-    )
+    segment = FlexibleSegment("A", 0.6, 0.6, 0.01, links=3, bend=2.0, twist=1.5, damping=0.1)
+    plain = stiffness(flexible_object([segment]))
     assert set(plain.values()) == {(2.0, 0.1), (1.5, 0.1)}
 
 
@@ -88,10 +87,8 @@ def test_branches_at_inner_links():
 
 
 def test_a_flat_beam_that_bends_one_way():
-    clamped = {"values_given_as_rigidities": True, "clamped_at_base": True}
-    beam = FlexibleSegment(
-        "B", 0.6, 0.3, links=3, cross_section_size=(0.001, 0.08), joint_axes="y", bend=1.2, **clamped
-    )
+    more = {"values_given_as_rigidities": True, "clamped_at_base": True, "joint_axes": "y"}
+    beam = FlexibleSegment("B", 0.6, 0.3, links=3, cross_section_size=(0.001, 0.08), bend=1.2, **more)
     item = flexible_object([beam])
     assert item.mechanism.joint_names == ("B_0_y", "B_1_y", "B_2_y")
     assert {spring.axis for spring in item.elastic_joints} == {"y"}

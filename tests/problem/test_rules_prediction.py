@@ -208,9 +208,8 @@ def test_readings_along_a_trajectory_are_those_of_its_rollout(urdf_folder):
         np.testing.assert_allclose(along, evaluation.episode_predictions[0].predicted_outputs[k], atol=1e-12)
         np.testing.assert_array_equal(slopes, np.zeros((*along.shape, len(x))))
     by_state[:, 0, 1] = 1.0
-    _, slopes = problem.predictor.readings_and_sensitivities(
-        problem.episodes[0].measurements[0], state, by_state, theta
-    )
+    samples = problem.episodes[0].measurements[0]
+    _, slopes = problem.predictor.readings_and_sensitivities(samples, state, by_state, theta)
     # turned about the shoulder as a whole, the tip moves across its lever
     lever = evaluation.episode_predictions[0].predicted_outputs[0] - [0.0, 0.0, 1.2]
     np.testing.assert_allclose(slopes[:, 1, 1], -lever[:, 2], atol=1e-9)

@@ -100,9 +100,8 @@ def test_points_on_a_swath_are_wider_than_the_tube_and_tubes_are_slender():
     assert np.sqrt(blurred.excess_variance) == pytest.approx(RADIUS * np.sqrt((1.8**2 - 1) / 3), rel=0.15)
     points = np.concatenate([tube(), wall((-0.3, 0.3), (0.3, 0.6), 2.0)])
     nodes = np.array([[-0.1, 0.0, 1.985], [0.1, 0.0, 1.985], [0.0, 0.45, 2.0]])
-    thin, mine = tube_like_node_and_point_masks(
-        ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA), RADIUS
-    )
+    cloud = ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA)
+    thin, mine = tube_like_node_and_point_masks(cloud, RADIUS)
     assert thin.tolist() == [True, True, False]
     assert mine.sum() == len(tube())
 
