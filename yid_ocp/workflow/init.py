@@ -137,7 +137,7 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
         elif options:
             what = f"{file.name} is a recording already, so options of the import do not apply"
             where, allowed = ", ".join(map(import_recording._flag, options)), "options with files of other formats"
-            raise ConfigError(what, where=where, allowed=allowed, hint="leave these options out")
+            raise ConfigError(what, where=where, allowed=allowed, hint="import the original file again with them")
         else:
             made[file] = None
     if len(made) < len(arguments.files):
