@@ -251,7 +251,7 @@ def test_check_refines_links_and_time_step(carried_out, written):
     coarsest, finest = (row["hertz"][0] for row in convergence["links"])
     assert abs(finest - exact) < 0.05 * exact
     assert abs(finest - exact) < abs(coarsest - exact)
-    assert "warning: frequency" in done.out
+    assert "warning: natural frequency" in done.out
 
 
 def test_inspect(carried_out, pendulum, tmp_path):

@@ -72,9 +72,8 @@ def test_the_result_holds_what_was_found():
     assert result["where"] == [first]
     other = first | {"location": "T2", "share": 0.3, "observable": False, "windows": []}
     assert result["remaining"] == {"p_value": 0.4, "where": [other]}
-    assert result["confusable"] == [
-        [{"kind": "friction", "location": "elbow"}, {"kind": "offset", "location": "wrist"}]
-    ]
+    alike = [("friction", "elbow"), ("offset", "wrist")]
+    assert result["confusable"] == [[{"kind": kind, "location": place} for kind, place in alike]]
     assert [step["added"] for step in result["steps"]] == ["friction@elbow", "offset@wrist"]
     assert result["steps"][0]["rmse"] == {"points.tip": 0.01}
     assert result["unseen"] == ["offset@wrist"]

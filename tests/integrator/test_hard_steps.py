@@ -81,7 +81,7 @@ def redundant(folder):
 CLAMP_TURNED = np.array([-0.2, 0.1, -0.2, 0.2, 0.2, 0.2])
 PULLED_BACK = np.array([0.0, 0.0, -1e-4, 0.0, 0.0, 0.0])
 HANGING = np.array([0.3, -0.2])
-
+CODE = NewtonStatusCode
 CASES: dict[str, Callable[..., Hard]] = {
     "fast_pendulum": lambda p, f: Hard(pendulum(f), HANGING, 0.2, p=np.array([30.0, 20.0]), torque=5.0, damped=True),
     "closed_loop_moved_far": lambda p, f: Hard(*p.closed_loop(f), 0.05, torque=60.0, moved=1.0, steps=2, damped=True),
@@ -101,19 +101,13 @@ CASES: dict[str, Callable[..., Hard]] = {
     ),
     "almost_at_full_stretch": lambda p, f: Hard(*gripped_cable(p, 1e-4 * NEARLY_STRAIGHT), 1e-3, conditioning=1e5),
     "short_steps_to_the_last_digit": lambda p, f: Hard(p.cable(), BENT, 5e-6, p=0.1 * BENT, steps=300, tolerance=1e-17),
-    "at_full_stretch": lambda p, f: Hard(
-        *gripped_cable(p, 0 * BENT), 1e-3, moved=PULLED_BACK, code=NewtonStatusCode.SINGULAR
-    ),
-    "redundant_grasps": lambda p, f: Hard(
-        redundant(f), np.array([0.1, 0.2, 0.3]), 0.01, code=NewtonStatusCode.SINGULAR
-    ),
-    "out_of_reach": lambda p, f: Hard(
-        out_of_reach(f), np.array([0.1, 0.3, 0.4]), 0.01, code=NewtonStatusCode.NOT_CONVERGED
-    ),
+    "at_full_stretch": lambda p, f: Hard(*gripped_cable(p, 0 * BENT), 1e-3, moved=PULLED_BACK, code=CODE.SINGULAR),
+    "redundant_grasps": lambda p, f: Hard(redundant(f), np.array([0.1, 0.2, 0.3]), 0.01, code=CODE.SINGULAR),
+    "out_of_reach": lambda p, f: Hard(out_of_reach(f), np.array([0.1, 0.3, 0.4]), 0.01, code=CODE.NOT_CONVERGED),
     "much_too_fast": lambda p, f: Hard(
-        pendulum(f), HANGING, 1.0, p=np.array([10.0, -4.0]), torque=5.0, code=NewtonStatusCode.NOT_CONVERGED
+        pendulum(f), HANGING, 1.0, p=np.array([10.0, -4.0]), torque=5.0, code=CODE.NOT_CONVERGED
     ),
-    "not_a_number": lambda p, f: Hard(pendulum(f), HANGING, 0.01, torque=np.nan, code=NewtonStatusCode.NOT_FINITE),
+    "not_a_number": lambda p, f: Hard(pendulum(f), HANGING, 0.01, torque=np.nan, code=CODE.NOT_FINITE),
 }
 
 

@@ -218,9 +218,7 @@ def drawn(monkeypatch):
     from matplotlib.figure import Figure  # half a second
 
     saved, save = [], Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda self, *given, **more: (saved.append(self), save(self, *given, **more))
-    )
+    monkeypatch.setattr(Figure, "savefig", lambda *given, **more: (saved.append(given[0]), save(*given, **more)))
     return saved
 
 

@@ -225,9 +225,8 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
         samples.append(replace(s, value=y + size * 1e-4 * rng.standard_normal(y.shape), weight=weight))
     white = rng.standard_normal(len(np.unique(errors.sample_of_step)))
     wrong = errors.torque_std * white[errors.sample_of_step][:, None]
-    episode = replace(
-        episode, measurements=tuple(samples), torque=episode.torque + wrong + 1.5 * errors.torque_bias_std
-    )
+    torque = episode.torque + wrong + 1.5 * errors.torque_bias_std
+    episode = replace(episode, measurements=tuple(samples), torque=torque)
     problem = first.with_episodes([episode], ())
     expected = problem_with_whitening_at(problem, x).evaluate(x).cost
     assert problem_with_sensor_noise_only(problem).evaluate(x).cost > 3 * expected

@@ -39,7 +39,9 @@ It is exact for an error proportional to their size: m + m/2 + m/4 + ...
 """
 _N_NOISE_DRAWS = 6  # of encoder noise
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
-_MAX_FINER_FIT_ITERATIONS, _MAX_LINEAR_CHANGE = 3, 10.0  # of r'r, below which a linear step decides
+_MAX_FINER_FIT_ITERATIONS = 3
+# changes by a finer model in units of r'r, up to which a linear step suffices, and up to which it rules out a decrease
+_MAX_LINEAR_CHANGE, _MAX_REFUTING_CHANGE = 1.0, 10.0
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 _MIN_NOTED_SHARE, _MIN_NOTED_FALL = 0.25, 0.05  # of the misfit beyond noise that is removed; of chi2 per sample
 _REFINED_SETTINGS = {"links": "double `links` of the segments in model.object", "time_step": "halve problem.time_step"}
@@ -189,12 +191,14 @@ def problem_data_corrected_for_few_links(
             after = fitted.with_episodes(episodes, ()).evaluate(x, False, guesses).residual
             if len(after) != len(before):
                 return None  # events have removed samples
-            if np.sum((after - before) ** 2) <= _MAX_LINEAR_CHANGE * (before @ before):
+            assert at_x.jacobian is not None
+            left = after - at_x.jacobian @ np.linalg.lstsq(at_x.jacobian, after, rcond=1e-10)[0]
+            change = np.sum((after - before) ** 2) / (before @ before)
+            is_lower = before @ before - left @ left > min_chi2_decrease
+            if not is_lower and (is_refitted or change <= _MAX_REFUTING_CHANGE):
+                return None
+            if change <= _MAX_LINEAR_CHANGE:
                 break
-        assert at_x.jacobian is not None
-        left = after - at_x.jacobian @ np.linalg.lstsq(at_x.jacobian, after, rcond=1e-10)[0]
-        if not before @ before - left @ left > min_chi2_decrease:
-            return None
         finer = _refined_problem(problem, "links", [e.recording for e in problem.held_out], finer.step).problem
         held_out = (one.predict_held_out(at) for one, at in ((problem, own), (finer, point)))
         others = [_with_data_shifted(e, one, other) for (e, one), (_, other) in zip(*held_out, strict=True)]
