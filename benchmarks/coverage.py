@@ -39,7 +39,7 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, aligned_table_lines, summary_terminal_lines
 from yid_ocp.sensors.base import EffortSamplingKind
-from yid_ocp.version import sha256_of_source_files
+from yid_ocp.version import sha256_of_folder_sources
 from yid_ocp.virtual.experiment import (
     ArmSensorNoise,
     VirtualExperimentSettings,
@@ -397,7 +397,7 @@ def record(
     """Record twins of some cells by their numbers; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    code = sha256_of_source_files(PACKAGE / "virtual")
+    code = sha256_of_folder_sources(PACKAGE / "virtual")
     tasks = [
         Task(
             f"recording {k} of {name}",

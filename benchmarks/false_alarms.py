@@ -42,7 +42,7 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.files import json_sha256, to_json_types, write_strict_json
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.version import sha256_of_source_files
+from yid_ocp.version import sha256_of_folder_sources
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, baxter_foam_y_system
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
@@ -226,7 +226,7 @@ def record(names: Sequence[str], number: int, workers: WorkerConfig, out: Path) 
     """Record so many twins of some kinds; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    code = sha256_of_source_files(PACKAGE / "virtual")
+    code = sha256_of_folder_sources(PACKAGE / "virtual")
     tasks = [
         Task(
             f"recordings {k} of {name}",

@@ -36,7 +36,7 @@ from yid_ocp.files import json_sha256, write_strict_json
 from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, VERDICT_SENTENCE_TEXTS, interval_text
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.version import sha256_of_source_files
+from yid_ocp.version import sha256_of_folder_sources
 from yid_ocp.virtual.experiment import (
     PointCamera,
     VirtualExperimentSettings,
@@ -95,7 +95,7 @@ def run(
     """What steepest descent finds: experiment, errors of the torques, parameter to the members' values."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    maker = sha256_of_source_files(PACKAGE / "virtual")
+    maker = sha256_of_folder_sources(PACKAGE / "virtual")
     keys = [(experiment, errors, k) for experiment in experiments for errors in kinds for k in range(members)]
     tasks = [
         Task(

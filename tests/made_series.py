@@ -9,16 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.inference.null_test import ChannelResidualIndices
+from yid_ocp.inference.null_test import OutputResidualIndices
 
 WHITE = (1.0,)
 
 
-def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ChannelResidualIndices:
+def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> OutputResidualIndices:
     """One output of one recording; times at even intervals unless given."""
     rows = np.asarray(rows)
     t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
-    return ChannelResidualIndices(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+    return OutputResidualIndices(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
 
 
 def without(recording: Recording, begin: float, end: float) -> Recording:

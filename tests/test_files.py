@@ -27,7 +27,7 @@ from yid_ocp.files import (
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.version import (
     package_source_hash,
-    sha256_of_source_files,
+    sha256_of_folder_sources,
     software_fingerprint,
     software_fingerprint_differences,
 )
@@ -100,14 +100,14 @@ def test_the_hash_of_sources_follows_their_names_and_content(tmp_path):
     kernel = tmp_path / "inner" / "kernel.c"
     (tmp_path / "a.py").write_text("a = 1\n")
     kernel.write_text("int a;\n")
-    first = sha256_of_source_files(tmp_path)
+    first = sha256_of_folder_sources(tmp_path)
     (tmp_path / "a.pyc").write_text("compiled")
-    assert sha256_of_source_files(tmp_path) == first
+    assert sha256_of_folder_sources(tmp_path) == first
     kernel.write_text("int b;\n")
-    assert sha256_of_source_files(tmp_path) != first
+    assert sha256_of_folder_sources(tmp_path) != first
     kernel.write_text("int a;\n")
     (tmp_path / "a.py").rename(tmp_path / "b.py")
-    assert sha256_of_source_files(tmp_path) != first
+    assert sha256_of_folder_sources(tmp_path) != first
 
 
 def test_where_two_processes_differ_is_said():
@@ -129,7 +129,7 @@ GUARDS = {"check_input_file", "check_readable_in_child_process", "read_input_tex
 OPENED_ELSEWHERE = {
     "files.limit_process_memory": "/proc",
     "files.atomic_write": "what was written",
-    "version.sha256_of_source_files": "the package's own sources",
+    "version.sha256_of_folder_sources": "the package's own sources",
     "cli._discard_what_follows": "/dev/null",
     "cli._reliable_streams": "/dev/null",
     "config.reader._loaded": "a text that was read",

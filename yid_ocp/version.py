@@ -24,7 +24,7 @@ def installed_versions() -> dict[str, str]:
     return result | {name: _version(name, "not installed") for name in ("yid-ocp", *_NUMERICAL_PACKAGES)}
 
 
-def sha256_of_source_files(folder: Path) -> str:
+def sha256_of_folder_sources(folder: Path) -> str:
     """Compute the SHA-256 of all source files in a folder and its subfolders, 64 hexadecimal digits."""
     digest = hashlib.sha256()
     for file in sorted(path for path in folder.rglob("*") if path.suffix in _SOURCE_SUFFIXES):
@@ -36,7 +36,7 @@ def sha256_of_source_files(folder: Path) -> str:
 @functools.cache
 def package_source_hash() -> str:
     """Return the SHA-256 of this package's source files at the first call in this process, 64 hexadecimal digits."""
-    return sha256_of_source_files(Path(__file__).parent)
+    return sha256_of_folder_sources(Path(__file__).parent)
 
 
 def software_fingerprint() -> dict[str, str]:

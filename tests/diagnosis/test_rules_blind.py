@@ -124,7 +124,7 @@ def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
     monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
     monkeypatch.setattr(module, "linearize_candidates", linearized)
-    [told] = BlindCaseGenerator(ensemble.problem, 3, None).candidate_sensitivities_to_list()
+    [told] = BlindCaseGenerator(ensemble.problem, 3, None).candidate_sensitivity_dicts()
     assert np.abs(told["columns"]) == 2.0
 
 
@@ -205,10 +205,10 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
 
 
 def test_what_is_detectable_survives_as_plain_data(drawn):
-    told = json.loads(json.dumps(drawn().candidate_sensitivities_to_list()))
+    told = json.loads(json.dumps(drawn().candidate_sensitivity_dicts()))
     other = drawn(seed=5)
     other.set_candidate_sensitivities_from_list(told)
-    assert other.candidate_sensitivities_to_list() == told
+    assert other.candidate_sensitivity_dicts() == told
     assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
     assert of_category(other, "single", 3.0)[1] == of_category(drawn(seed=5), "single", 3.0)[1]
 

@@ -15,7 +15,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
-from yid_ocp.inference.null_test import episodes_with_added_encoder_noise
+from yid_ocp.inference.null_test import episodes_with_noisier_motion
 from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation, ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
@@ -326,7 +326,7 @@ def _shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array, at_x: Ev
     rng, moves, system = np.random.default_rng(0), list[dict[str, float]](), problem.system
     has_encoders = system.prescribed and any(episode.recording.joints for episode in problem.episodes)
     for _ in range(_N_NOISE_DRAWS if has_encoders and system.unprescribed_coordinate_indices else 0):
-        noisy = _FinerDiscretisationProblem(problem.with_episodes(episodes_with_added_encoder_noise(problem, rng), ()))
+        noisy = _FinerDiscretisationProblem(problem.with_episodes(episodes_with_noisier_motion(problem, rng), ()))
         made = _gauss_newton_step_in_finer_model(noisy, problem, x, at_x)
         moves += [] if isinstance(made, str) else [made[0]]
     shifts = {name: np.array([own[name] for own in moves]) for name in problem.shared_parameters if moves}

@@ -312,7 +312,7 @@ class BlindCaseGenerator:
             for s in self._linearize_clean_recordings().signatures
         )
 
-    def candidate_sensitivities_to_list(self) -> list[dict[str, Any]]:
+    def candidate_sensitivity_dicts(self) -> list[dict[str, Any]]:
         """Return the sensitivities of all candidates, from which detectable sizes follow, in JSON-compatible form."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
@@ -320,7 +320,7 @@ class BlindCaseGenerator:
         ]
 
     def set_candidate_sensitivities_from_list(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Set sensitivities that `candidate_sensitivities_to_list` of another generator of this experiment returned."""
+        """Set sensitivities that `candidate_sensitivity_dicts` of another generator of this experiment returned."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))

@@ -30,7 +30,7 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
-from yid_ocp.inference.null_test import ChannelResidualIndices, channels_with_residual_indices
+from yid_ocp.inference.null_test import OutputResidualIndices, channels_with_residual_indices
 
 DETECTABLE_AMPLITUDE_Z = 2.576 + 1.282  # found with 90 % power at the 1 % level [standard deviations]
 _SHAPE_GRID_SIZE = 4  # values tried per shape parameter
@@ -108,7 +108,7 @@ def linearize_candidates(
     is_in_scatter = np.any(scatter, axis=1)
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
-    redrawn = [null_test.episodes_with_added_encoder_noise(placed, rng) for _ in draws]
+    redrawn = [null_test.episodes_with_noisier_motion(placed, rng) for _ in draws]
     # changes by encoder noise hardly depend on the effects in the model
     known = problem.changes_by_encoder_noise
     residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
@@ -185,7 +185,7 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def _covariance_of_scores(columns: Array, series: Sequence[ChannelResidualIndices]) -> Array:
+def _covariance_of_scores(columns: Array, series: Sequence[OutputResidualIndices]) -> Array:
     """X' Omega X under the noise's known autocorrelation."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
@@ -195,7 +195,7 @@ def _covariance_of_scores(columns: Array, series: Sequence[ChannelResidualIndice
     return (total + total.T) / 2
 
 
-def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ChannelResidualIndices]) -> Array:
+def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[OutputResidualIndices]) -> Array:
     """Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
@@ -209,7 +209,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Cha
 
 def _score_candidates(
     point: ProjectedCandidatesLinearization,
-    series: Sequence[ChannelResidualIndices],
+    series: Sequence[OutputResidualIndices],
     visible: Sequence[CandidateDetectability],
 ) -> tuple[ScoreTestResult, ...]:
     """Score every detectable candidate, largest predicted decrease of r'r first."""
@@ -239,7 +239,7 @@ def _promised(information: Array, slope: Array, room: Array) -> tuple[Array, flo
     return step, float((2 * slope - information @ step) @ step)
 
 
-def _score(signature: _EffectSignature, residual: Array, series: Sequence[ChannelResidualIndices]) -> ScoreTestResult:
+def _score(signature: _EffectSignature, residual: Array, series: Sequence[OutputResidualIndices]) -> ScoreTestResult:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = signature.score_bias - x.T @ residual
     room = _room(effect)

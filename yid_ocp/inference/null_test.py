@@ -31,7 +31,7 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
 @dataclass(frozen=True)
-class ChannelResidualIndices:
+class OutputResidualIndices:
     """The sample times of one scalar sensor output, and the indices of its samples in the residual vector."""
 
     recording: str
@@ -106,7 +106,7 @@ def chi2_p_value(chi2: float, degrees: float) -> float:
 
 
 def residual_chi2_null_test(
-    series: Sequence[ChannelResidualIndices],
+    series: Sequence[OutputResidualIndices],
     residual: Array,
     parameters: float,
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
@@ -162,14 +162,14 @@ def encoder_noise_residual_covariance_factor(
         return nothing
     rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
     for _ in range(_N_PATH_NOISE_DRAWS):
-        after = residual_of(problem.with_episodes(episodes_with_added_encoder_noise(problem, rng), ()))
+        after = residual_of(problem.with_episodes(episodes_with_noisier_motion(problem, rng), ()))
         if after is not None:
             found.append(np.zeros(len(before)))
             found[-1][at] = (after - before)[at]
     return np.stack(found, axis=1) / np.sqrt(len(found)) if found else nothing
 
 
-def episodes_with_added_encoder_noise(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
+def episodes_with_noisier_motion(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
     """Return the recordings with one more random draw of encoder noise in the prescribed motion, not in sensor data."""
     return [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
 
@@ -204,11 +204,11 @@ def bonferroni_corrected_min_test_p_value(tests: Sequence[NullTestResult]) -> fl
 
 
 def _windows(
-    series: Sequence[ChannelResidualIndices], residual: Array, level: float, length: float
+    series: Sequence[OutputResidualIndices], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
     raw: list[tuple[str, str, float, float]] = []
     p_values: list[float] = []
-    merged: dict[tuple[str, str], list[ChannelResidualIndices]] = {}
+    merged: dict[tuple[str, str], list[OutputResidualIndices]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
     for (recording, channel), own in merged.items():
@@ -244,9 +244,9 @@ def times_since_recording_start(episode: Episode, samples: SensorMeasurements) -
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelResidualIndices, ...]:
+def channels_with_residual_indices(problem: EstimationProblem) -> tuple[OutputResidualIndices, ...]:
     """Return the sample times and residual indices of every scalar sensor output of every recording."""
-    series: list[ChannelResidualIndices] = []
+    series: list[OutputResidualIndices] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):
             t = times_since_recording_start(episode, samples)
@@ -257,7 +257,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[ChannelR
                 seen = samples.positive_weight_mask[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
-                    series.append(ChannelResidualIndices(*text, t[seen], place[seen, column], autocorrelation))
+                    series.append(OutputResidualIndices(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
 
 

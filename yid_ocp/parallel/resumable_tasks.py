@@ -111,7 +111,7 @@ def run_tasks(
         Local processes stop at once if the run is interrupted. If a process crashes, only its own task is lost. Workers
         of a scheduler finish their current task.
     code : str, optional
-        Hash of the sources that results depend on; default: the whole package. See `version.sha256_of_source_files`.
+        Hash of the sources that results depend on; default: the whole package. See `version.sha256_of_folder_sources`.
     """
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
     # paths are absolute, because a worker may run in another folder

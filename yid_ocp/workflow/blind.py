@@ -248,7 +248,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     first = Path(folder) / f"{name}.h5"
     _BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = ensemble.candidate_sensitivities_to_list()
+    detectable = ensemble.candidate_sensitivity_dicts()
     write_strict_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
