@@ -439,7 +439,7 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "other number": (("--object", "tapered_rod", "--number", "tip_radus=1"), "is not an additional", "'tip_radius'?"),
     "number alone": (("--object", "tapered_rod", "--number", "tip_radius"), "not an additional", "tip_radius=NUMBER\n"),
     "grasp of no point": ((*CABLE, "--grasp", "hub"), "is not FRAME=POINT", "FRAME=POINT"),
-    "import flags of a recording": ((*CABLE, "--units", "deg"), "is a recording already", "leave"),
+    "import flags of a recording": ((*CABLE, "--units", "deg"), "is a recording already", "import the original"),
 }  # fmt: skip
 
 
