@@ -93,9 +93,9 @@ def overspeed_truncation_messages(events: EventSet) -> list[str]:
     return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
 
 
-def _listed(beginning: str, names: Iterable[str], end: str = ".") -> str:
+def _listed(beginning: str, names: Iterable[str], end: str = ".", **limit: int) -> str:
     """Sentence on names, similar ones merged. Empty if there are none."""
-    text = abbreviated_names_text([*names])
+    text = abbreviated_names_text([*names], **limit)
     return f"{beginning}{text}{end}" if text else ""
 
 
@@ -245,8 +245,8 @@ def _remains(result: DiagnosisResult) -> list[str]:
         for name, own in changes
         if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
-    moved[_MAX_CHANGES:] = [f"{len(moved) - _MAX_CHANGES} more"] * (len(moved) > _MAX_CHANGES)
-    return [f"{what} {said}.", _listed("With the effects in the model, these estimates change: ", moved)]
+    change = _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)
+    return [f"{what} {said}.", change]
 
 
 def _relative_change(own: Mapping[str, Any]) -> float:

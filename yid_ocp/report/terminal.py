@@ -182,10 +182,9 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
         changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
-        changes[_MAX_SHIFTS:] = [f"{len(changes) - _MAX_SHIFTS} more"] * (len(changes) > _MAX_SHIFTS)
         if moved:
             text = f"with {words} these estimates change by more than their ± from the data: "
-            said.append(text + ", ".join(changes))
+            said.append(text + abbreviated_names_text(changes, _MAX_SHIFTS))
         elif tried:
             said.append(f"with {words} no estimate changes by more than its ± from the data")
     return said
