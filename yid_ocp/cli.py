@@ -195,7 +195,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--skip-bad-lines", action="store_const", const=True, help=text)
     group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: character between cells")
     group.add_argument("--episode", type=int, metavar="NUMBER", help="episode of a LeRobot dataset; 0 when absent")
-    group.add_argument("--recorded-or-nominal-times", choices=("recorded", "nominal"), help="of a table: kind of times")
+    group.add_argument("--timestamp-kind", choices=("recorded", "nominal"), help="of a table: kind of its times")
     group.add_argument("--point-sensor-name", metavar="TEXT", help="name of the sensor of the points")
     group.add_argument("--point-frame", metavar="TEXT", help="reference frame of points, of a table or C3D file")
 
@@ -480,8 +480,9 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     # freed arrays stay, in pages of the usual size: new pages take a tenth of the time, huge ones more
     os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
     with contextlib.suppress(OSError, AttributeError, TypeError):
-        for option in (-1, -3):  # glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD
-            ctypes.CDLL(None).mallopt(option, 2**30)
+        # glibc's M_TRIM_THRESHOLD, M_MMAP_THRESHOLD and M_ARENA_MAX: threads reuse what other threads freed
+        for option, value in ((-1, 2**30), (-3, 2**30), (-8, 1)):
+            ctypes.CDLL(None).mallopt(option, value)
     try:
         run, arguments.begin_time = arguments.run, time.monotonic()
         if isinstance(run, str):

@@ -31,6 +31,7 @@ from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.null_test import OutputResidualIndices, channels_with_residual_indices
+from yid_ocp.problem import EstimationProblem
 
 DETECTABLE_AMPLITUDE_Z = 2.576 + 1.282  # found with 90 % power at the 1 % level [standard deviations]
 _SHAPE_GRID_SIZE = 4  # values tried per shape parameter
@@ -122,18 +123,15 @@ def linearize_candidates(
             raise failed_rollout_error(evaluation.message, "model with the candidate effects")
         warm = evaluation.equilibrium_guesses
         data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
+        del evaluation  # its Jacobian is large
         places = [trial.unknown_names.index(name) for name in amplitudes]
         basis, follow = _basis_and_coefficients(np.delete(jacobian, places, axis=1), jacobian[:, places])
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
         if point not in known:
-            known[point] = []
-            for again in (trial.with_episodes(episodes, ()) for episodes in redrawn):
-                outcome = again.evaluate(again.pack_unknowns(values))
-                if outcome.ok:
-                    other, slopes = residual_and_jacobian_with_stated_priors(again, outcome)
-                    by_name = dict(zip(trial.unknown_names, (slopes - jacobian)[rows.data].T, strict=True))
-                    known[point].append(((other - data)[rows.data] * ~is_in_scatter, by_name))
+            names = amplitudes if point else trial.unknown_names  # other shapes change nothing else
+            changed = (_changes(trial.with_episodes(own, ()), values, data, jacobian, names) for own in redrawn)
+            known[point] = [(change * ~is_in_scatter, by_name) for change, by_name in filter(None, changed)]
         errors, shifts = [], []
         for (_, first), (error, own) in zip(known[0], known[point], strict=False):
             changes, unmoved = first | own, np.zeros_like(error)
@@ -155,6 +153,18 @@ def linearize_candidates(
                 bias += own[rows.data].T @ error / len(errors)
             signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors, bias))
     return ProjectedCandidatesLinearization(residual, tuple(signatures))
+
+
+def _changes(
+    again: EstimationProblem, values: Mapping[str, float], data: Array, jacobian: Array, names: Sequence[str]
+) -> tuple[Array, dict[str, Array]] | None:
+    """Changes by redrawn noise of the data's residual `data` and, for each of `names`, of a column of its Jacobian."""
+    outcome, rows = again.evaluate(again.pack_unknowns(values)), again.residual_rows.data
+    if not outcome.ok:
+        return None
+    other, slopes = residual_and_jacobian_with_stated_priors(again, outcome)
+    at = [again.unknown_names.index(name) for name in names]
+    return (other - data)[rows], dict(zip(names, (slopes[rows][:, at] - jacobian[rows][:, at]).T, strict=True))
 
 
 def _basis_and_coefficients(matrix: Array, columns: Array) -> tuple[Array, Array]:

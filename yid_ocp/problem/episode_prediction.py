@@ -34,7 +34,7 @@ from yid_ocp.problem.recorded_inputs import step_mean_input_delay_derivative, st
 from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
-_MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
+_MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**26
 _MAX_RESTING_TIME = 1.0  # latest time at which a point's first sample still shows the shape of the equilibrium [s]
 # root mean square error of first points above which another equilibrium is sought [stds], and the part that may remain
 _POOR_EQUILIBRIUM_RMSE, _MAX_REMAINING_ERROR_FRACTION = 5.0, 0.5
@@ -268,11 +268,14 @@ class EpisodePredictor:
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
             by_torque = inputs.torque_sensitivity_with_feedback_reference(feedback, driven, width)
-            by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
+            if by_path is not None and width > len(wanted):
+                by_path = np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
         feedback = inputs.tracking_feedback_with_corrected_reference(feedback, driven, episode.measured_driven_angles)
         given = (start.state, episode.grid.steps, inputs.torque, inputs.prescribed_path)
         member = checked_rollout_inputs(self.integrator_step, theta, *given, feedback, directions)
+        # samples need no other derivatives, and they are large
+        inputs = replace(inputs, prescribed_path_sensitivity=None, driven_angles_sensitivity=None)
         return _Prepared(episode, start, inputs, member, wanted, derivatives)
 
     def _told(self, prepared: _Prepared | str, rollout: Rollout | None) -> EpisodePrediction | str:

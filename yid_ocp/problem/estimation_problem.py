@@ -219,7 +219,8 @@ class EstimationProblem(ReprMixin):
         results = self.predictor.predict_episodes(asked, derivatives)
         if failures := [result for result in results if isinstance(result, str)]:
             return Evaluation(np.inf, np.zeros(0), None, False, failures[0], ())
-        done = tuple(result for result in results if isinstance(result, EpisodePrediction))
+        done = [result for result in results if isinstance(result, EpisodePrediction)]
+        del results  # derivatives are the largest arrays
         cost, residuals, jacobians = 0.0, [], []
         threshold = self.options.huber_threshold
         for i, result in enumerate(done):
@@ -228,16 +229,16 @@ class EstimationProblem(ReprMixin):
             residuals.append(part.residual)
             if part.jacobian is not None:
                 jacobians.append(self.unknowns.scatter_to_unknown_columns(part.jacobian, i))
-        done = tuple(replace(result, output_sensitivities=None, torque_correction_sensitivity=None) for result in done)
+            done[i] = replace(result, output_sensitivities=None, torque_correction_sensitivity=None)
         prior, prior_jacobian = self.priors.residual_and_jacobian(x)
         residual = np.concatenate([*residuals, prior])
         cost += 0.5 * float(prior @ prior)
         jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
         if not np.isfinite(cost):
-            return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
+            return Evaluation(np.inf, residual, None, False, "the cost is not finite", tuple(done))
         if jacobian is not None and not np.all(np.isfinite(jacobian)):
-            return Evaluation(np.inf, residual, None, False, "the derivatives are not finite", done)
-        return Evaluation(cost, residual, jacobian, True, "", done)
+            return Evaluation(np.inf, residual, None, False, "the derivatives are not finite", tuple(done))
+        return Evaluation(cost, residual, jacobian, True, "", tuple(done))
 
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
