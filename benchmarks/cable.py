@@ -29,7 +29,7 @@ import yid_ocp as yid
 from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import (
     CableBranchRigidityDampingAndDensity,
     CableOptions,
@@ -57,16 +57,16 @@ BRANCH = CableBranchRigidityDampingAndDensity(
 OPTIONS = CableOptions(default_branch=BRANCH, shape_memory_fraction=0.5, has_rest_angle_parameters=True)
 
 
-def branched_cable(folder: Path = FOLDER) -> CableTopology:
+def branched_cable(folder: Path = FOLDER) -> CableVertices:
     """The cable of the recordings: thirteen vertices of the parent, children leaving at the fifth and the ninth."""
-    return CableTopology(
+    return CableVertices(
         tuple(f"p{i}" for i in range(13)),
         {"a": ("p4", "a1", "a2", "a3", "a4"), "b": ("p8", "b1", "b2", "b3")},
         read_vertex_positions_by_name(folder / "bdlo1_undeformed.csv"),
     )
 
 
-def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptions) -> tuple[str, ...]:
+def identifiable_cable_parameter_names(cable: CableVertices, options: CableOptions) -> tuple[str, ...]:
     """Names of the parameters that a cable's motion alone can identify: stiffness, damping and rest shape, no mass."""
     names: list[str] = []
     for name in cable.vertex_names_by_branch:
@@ -84,7 +84,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
     return tuple(names)
 
 
-def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
+def cable_options(cable: CableVertices, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
     known = {
         r.name: length_parameters_from_edges(cable, typical_point_pair_distances(cable.edge_vertex_names, [r], 2))
@@ -129,7 +129,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
     return errors
 
 
-def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
+def baselines(recording: Recording, cable: CableVertices) -> dict[str, float]:
     """Prediction errors without a model [m]."""
     free, measured = cable.unclamped_vertex_names, recorded_point_positions(recording, cable.unclamped_vertex_names)
     predictions = naive_cable_predictions(recording, cable, free, cable.clamped_vertex_names)
@@ -203,7 +203,7 @@ def medians(files: list[dict[str, Any]]) -> dict[str, float]:
     return result
 
 
-def parameters(cable: CableTopology, x: Any, covariance: Any, names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+def parameters(cable: CableVertices, x: Any, covariance: Any, names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """Values, standard deviations, and values per unit weight (density times gravity) of rigidities and dampings."""
     units = {"bend": "m^3", "twist": "m^3", "damping": "m^3 s", "twist_damping": "m^3 s"}
     result: dict[str, dict[str, Any]] = {}

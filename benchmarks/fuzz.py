@@ -387,7 +387,7 @@ def probe_command(folder: Path, rng: Random) -> None:
     value = float(rng.choice([0, -1, 1e-9, 1e-3, 3, 1e3, 1e12, 1e300])) * float(rng.choice([1, rng.random()]))
     (folder / "config.yaml").write_text(f"{text[: one.start()]}{value!r}{text[one.end() :]}", encoding="utf-8")
     name = str(rng.choice(["solve", "simulate", "identifiability", "check", "inspect"]))
-    quick = ["--set", "problem.duration=0.2", "--set", "output.discretisation_check=none"]
+    quick = ["--set", "problem.duration=0.2", "--set", "output.checked_discretisation=none"]
     more = ["--intervals", "none"] if name == "identifiability" else []
     run_in_process(name, str(folder / "config.yaml"), "--out", str(folder / "run"), *quick, *more)
 

@@ -209,7 +209,7 @@ def movement(planned: TargetMotionPlan) -> PlannedMovement:
 def settings(**recordings: Sequence[Path]) -> RunSettings:
     """The configuration with recordings by purpose."""
     files = [f"recordings.{purpose}=[{', '.join(map(str, paths))}]" for purpose, paths in recordings.items()]
-    return load_config(CONFIG, [*files, "output.write_report=false", "output.discretisation_check=none"])
+    return load_config(CONFIG, [*files, "output.write_report=false", "output.checked_discretisation=none"])
 
 
 def record(folder: Path, noise: int = NOISE, effects: Sequence[InjectedEffect] = ()) -> list[Path]:

@@ -239,10 +239,10 @@ track:
   options:
     calibration: {fix_pose: true, translation_prior_std: 0.01}    # a hand-eye calibration, known to 1 cm [m]
 """,
-    "track.options.clock_offset": """\
+    "track.options.clock_offset_search": """\
 track:
   options:
-    clock_offset: {initial_stamp_minus_joint_time: 0.08, search_half_width: 0.05}      # [s]
+    clock_offset_search: {initial_stamp_minus_joint_time: 0.08, search_half_width: 0.05}      # [s]
 """,
     "plan": """\
 plan:

@@ -80,7 +80,7 @@ def test_python_and_shell_say_the_same(coarse):
 
 @pytest.mark.parametrize(("setting", "tried"), [("none", set()), ("time_step", {"time_step"})])
 def test_settings_say_what_is_refined(folder, tmp_path, setting, tried):
-    overrides = [f"output.discretisation_check={setting}", "solver.max_iterations=1"]
+    overrides = [f"output.checked_discretisation={setting}", "solver.max_iterations=1"]
     result = run_solve(load_config(configuration(folder, 4, ["north"]), overrides), tmp_path / "run").result
     moved = result["discretisation"].get("north.bend", {})
     assert {key for key in ("links", "time_step") if moved.get(key) is not None} == tried

@@ -56,7 +56,7 @@ def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
         (made.camera_points_times_and_median_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_points_times_and_median_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.arm_point_group_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -372,7 +372,7 @@ def drawn_motion(monkeypatch):
             row[:, feedback.state_indices] -= s.state_by_torque @ gain
         return [(np.stack(rows), None)]
 
-    monkeypatch.setattr(propagation, "rollout_step_derivatives", maps)
+    monkeypatch.setattr(propagation, "linearized_rollout_steps", maps)
     monkeypatch.setattr(
         propagation, "applied_torque_derivative_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
     )

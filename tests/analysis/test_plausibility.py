@@ -35,7 +35,7 @@ from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -542,7 +542,7 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
 
 
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}
-CABLE = CableTopology(tuple(f"p{i}" for i in range(9)), {"a": ("p4", "a1", "a2", "a3")}, REST)
+CABLE = CableVertices(tuple(f"p{i}" for i in range(9)), {"a": ("p4", "a1", "a2", "a3")}, REST)
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 

@@ -19,7 +19,7 @@ COARSE = (
     "parameters={T*.bend: {initial: 2.8}, T1.bend: {free: true, initial: 5.5}, T*.twist: {initial: 2.5}}",
 )
 # one of the paper's experiments is run with half the time step as well
-UNREFINED = ("output.discretisation_check=none",)
+UNREFINED = ("output.checked_discretisation=none",)
 FEW = ("solver.max_iterations=2", "problem.use_compiler=false")
 DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {

@@ -28,7 +28,7 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
         "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
     )
     said = {"point_sensor_name": "camera", "point_frame": "base", "description": "two joints"}
-    recording = read_any(path, recorded_or_nominal_times="nominal", **said)
+    recording = read_any(path, timestamp_kind="nominal", **said)
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert joints.clock == "nominal"

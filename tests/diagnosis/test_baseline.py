@@ -36,7 +36,7 @@ parameters:
 problem: {time_step: 0.01, initial_state: estimated, initial_configuration_prior_std: 0.2,
           initial_velocity_prior_std: 3.0}
 diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
-output: {write_report: false, discretisation_check: none}
+output: {write_report: false, checked_discretisation: none}
 """
 NOISE, LOAD, SOFTER = 1e-4, 0.05, 0.016
 TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}

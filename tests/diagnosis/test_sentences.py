@@ -38,7 +38,7 @@ from hypothesis import strategies as st
 from sound_findings import assert_nothing_impossible_is_said
 
 from yid_ocp.diagnosis.baseline import (
-    ErrorsWithEffectsRemovedOrAdded,
+    CounterfactualPredictionErrors,
     ParameterShiftsSinceBaseline,
     _ParameterShift,
     _PredictionErrors,
@@ -180,7 +180,7 @@ def compared():
     better = _PredictionErrors(("bare (without)",), *errors)
     for name, other in {"worse": _PredictionErrors(("a", "b", "c"), *reversed(errors)),
                         "failed": _PredictionErrors(("a",), {}, {}, "it diverges")}.items():  # fmt: skip
-        yield f"{name} with effects", finding(counterfactual=ErrorsWithEffectsRemovedOrAdded(better, other))
+        yield f"{name} with effects", finding(counterfactual=CounterfactualPredictionErrors(better, other))
 
 
 def separating(rivals: Mapping[str, str]) -> str:

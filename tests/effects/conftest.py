@@ -18,7 +18,7 @@ from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import CableOptions, clamped_cable_system
 from yid_ocp.sensors import PointSensor, PrescribedJointEffortSensor, Sensor, sensor_function_with_jacobians
 
@@ -136,11 +136,11 @@ class Bench:
 PARENT = tuple(f"p{i}" for i in range(7))
 
 
-def made_cable() -> tuple[CableTopology, Recording]:
+def made_cable() -> tuple[CableVertices, Recording]:
     """A cable of six edges with a branch of two, and a recording in which its clamps sway."""
     where = {name: [0.1 * i, 0.0, 1.0] for i, name in enumerate(PARENT)}
     where |= {"c1": [0.3, 0.1, 1.0], "c2": [0.3, 0.2, 1.0]}
-    layout = CableTopology(PARENT, {"a": ("p3", "c1", "c2")}, where)
+    layout = CableVertices(PARENT, {"a": ("p3", "c1", "c2")}, where)
     t = H * np.arange(9)
     points = np.tile(np.array([where[name] for name in layout.vertex_names]), (len(t), 1, 1))
     points[:, :, 2] -= 0.02 * np.sin(np.pi * points[0, :, 0] / 0.6)
@@ -168,7 +168,7 @@ def prescribed(benches) -> Bench:
 
 
 @pytest.fixture(scope="session")
-def cable() -> tuple[CableTopology, Recording, System]:
+def cable() -> tuple[CableVertices, Recording, System]:
     layout, recording = made_cable()
     lengths = typical_point_pair_distances(layout.edge_vertex_names, [recording])
     return layout, recording, clamped_cable_system(lengths, layout, CableOptions())

@@ -53,7 +53,7 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     assert poor.grants_needed(lambda: kernel.step_residuals_and_jacobians(*trajectory)) == 1
     loads = np.zeros((sum(step.sizes[key] for key in ("n", "nz", "m")), 0)), np.zeros((step.sizes["n"], 0))
     mapped = case.theta, plain, case.feedback, np.zeros((*plain.torque.shape, 1)), loads
-    assert poor.grants_needed(lambda: kernel.rollout_step_derivatives(*mapped)) == 1
+    assert poor.grants_needed(lambda: kernel.linearized_rollout_steps(*mapped)) == 1
     poor.grants.value = 100
     again = kernel.rollout(differentiated)
     np.testing.assert_array_equal(again.state, plain.state)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import rollout_step_derivatives
+from yid_ocp.integrator.step import linearized_rollout_steps
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 
@@ -146,7 +146,7 @@ def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
     inputs = rng.normal(size=(len(rollout.torque), sizes["nu"], 3))
     for feedback in (None, case.feedback):
         maps = (
-            rollout_step_derivatives(s, case.theta, rollout, inputs, feedback, (rows, momentum))
+            linearized_rollout_steps(s, case.theta, rollout, inputs, feedback, (rows, momentum))
             for s in (case.step, slow)
         )
         both = ([np.concatenate(parts) for parts in zip(*some, strict=True)] for some in maps)
@@ -157,7 +157,7 @@ def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
             scale = np.maximum(np.max(np.abs(other), axis=(0, 1), initial=0.0), least)
             assert np.max(np.abs(one - other) / scale, initial=0.0) < 1e-9
     each = np.tile(np.eye(sizes["nu"]), (len(rollout.torque), 1, 1))
-    by_all, effort = next(rollout_step_derivatives(case.step, case.theta, rollout, each))
+    by_all, effort = next(linearized_rollout_steps(case.step, case.theta, rollout, each))
     n, q0 = sizes["n"], rollout.state[0]
     prescribed = (case.path[0], case.path[1]) if sizes["nc"] else None
     A, B_u, _ = case.step.jacobians(q0[:n], q0[n : 2 * n], case.torque[0], case.theta, prescribed, q0[2 * n :], ())

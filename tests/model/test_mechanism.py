@@ -27,7 +27,7 @@ from yid_ocp.model.mechanism import (
     symbolic_rotation_from_rpy,
     transform_from_xyz_rpy,
 )
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import clamped_cable_system
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf
@@ -88,7 +88,7 @@ def test_points_stay_when_the_tree_is_put_together():
 def test_a_cable_is_counted_from_clamp_to_clamp():
     parent = ("a", "b", "c", "d", "e")
     shape = {name: [0.1 * i, 0.0, 0.0] for i, name in enumerate(parent)} | {"f": [0.2, 0.0, 0.1]}
-    cable = CableTopology(parent, {"child": ("c", "f")}, shape)
+    cable = CableVertices(parent, {"child": ("c", "f")}, shape)
     tree = clamped_cable_system(dict.fromkeys(cable.edge_vertex_names, 0.1), cable).mechanism
     along = places(tree, ["parent:0%", "parent:12.5%", "parent:25%", "parent:50%", "parent:100%", "child:50%"])
     a, b, c, e, f = places(tree, ["a", "b", "c", "e", "f"])

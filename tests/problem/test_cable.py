@@ -11,7 +11,7 @@ from yid_ocp.errors import DataError, ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import (
     CableBranchRigidityDampingAndDensity,
     CableOptions,
@@ -61,7 +61,7 @@ def twin_options(real, cable):
 
 @pytest.fixture(scope="module")
 def cable():
-    return CableTopology(PARENT, {"c": CHILD}, UNDEFORMED)
+    return CableVertices(PARENT, {"c": CHILD}, UNDEFORMED)
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +227,7 @@ def test_edges_are_as_long_as_measured(cable):
 )
 def test_a_cable_that_does_not_fit_together_is_refused(arguments, text):
     with pytest.raises(ModelError, match=text):
-        CableTopology(*arguments, UNDEFORMED)
+        CableVertices(*arguments, UNDEFORMED)
 
 
 def test_vertices_are_read_from_a_table(tmp_path):

@@ -10,7 +10,7 @@ from small_problems import PENDULUM, H, pendulum_step, taken
 import yid_ocp as yid
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     _noisy,
@@ -203,7 +203,7 @@ def recording():
     return Recording(points=(PointGroup("points", NAMES, 0.01 * np.arange(frames), at),), name="made")
 
 
-CABLE = CableTopology(PARENT, CHILDREN, dict.fromkeys(NAMES, (0.0, 0.0, 0.0)))
+CABLE = CableVertices(PARENT, CHILDREN, dict.fromkeys(NAMES, (0.0, 0.0, 0.0)))
 
 
 def test_stay_repeats_the_last_given_frame(recording):

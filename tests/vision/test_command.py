@@ -27,7 +27,7 @@ recordings:
 track:
   frames_path: {data}/frames
   n_drawn_frames: 1
-  options: {{calibration: {{fix_pose: true}}, clock_offset: {{search_half_width: 0}}}}
+  options: {{calibration: {{fix_pose: true}}, clock_offset_search: {{search_half_width: 0}}}}
 """
 PLAIN, UNDRAWN = "output.write_report=false", "track.n_drawn_frames=0"
 
@@ -177,7 +177,7 @@ def test_the_settings_exist(repository):
     text = (repository / "docs" / "explain" / "tracking.md").read_text(encoding="utf-8")
     options = TrackOptions()
     known = {field.name for field in dataclasses.fields(options)}
-    for part in ("filters", "skeleton", "shape_fit", "clock_offset", "calibration"):
+    for part in ("filters", "skeleton", "shape_fit", "clock_offset_search", "calibration"):
         known |= {field.name for field in dataclasses.fields(getattr(options, part))}
     _, _, table = text.partition("| stage | settings")
     rows = [line for line in table.partition("\n\n")[0].splitlines()[2:] if line.startswith("| ")]

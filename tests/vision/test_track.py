@@ -201,8 +201,8 @@ def test_the_time_of_another_clock(system, small):
     later = replace(small.sequence, stamps=small.sequence.stamps + 1.7e9)
     with pytest.raises(DataError, match="the clocks differ") as caught:
         track_object(SceneDescription(system), small.recording, later)
-    assert "set track.options.clock_offset.initial_stamp_minus_joint_time" in caught.value.hint
-    options = TrackOptions(clock_offset=vision.CameraClockOptions(initial_stamp_minus_joint_time=1.7e9))
+    assert "set track.options.clock_offset_search.initial_stamp_minus_joint_time" in caught.value.hint
+    options = TrackOptions(clock_offset_search=vision.CameraClockOptions(initial_stamp_minus_joint_time=1.7e9))
     assert len(track_object(SceneDescription(system), small.recording, later, options).t) == 3
 
 

@@ -24,7 +24,7 @@ from yid_ocp.workflow.blind import EXPERIMENT_VARIATIONS, _blind_experiments_and
 
 HERE = InlineExecutor()
 SHORT = "problem.duration=0.6"
-QUICK = ("output.write_report=false", "output.discretisation_check=none", "recordings.held_out=[]", SHORT)
+QUICK = ("output.write_report=false", "output.checked_discretisation=none", "recordings.held_out=[]", SHORT)
 
 
 @pytest.fixture

@@ -36,7 +36,7 @@ parameters:
   beam.bend: {free: true, initial: 0.02}
   beam.damping: {free: true, initial: 5.0e-5}
 problem: {time_step: 0.01, use_compiler: false, initial_state: estimated, duration: 0.4}
-output: {write_report: false, discretisation_check: none}
+output: {write_report: false, checked_discretisation: none}
 """
 STRAIGHT = np.array([0.2, 0.2, 0.32])  # the tip's face is at 0.2, 0.2, 0.3
 

@@ -188,7 +188,7 @@ def test_a_live_fit_shows_cost_and_the_courses_of_parameters_those_that_move_fir
 
 
 def test_a_live_solve_is_shown_on_a_terminal_and_nowhere_else(pendulum, monkeypatch, capsys, tmp_path):
-    settings = ["--set", "output={write_report: false}", "--set", "output.discretisation_check=none"]
+    settings = ["--set", "output={write_report: false}", "--set", "output.checked_discretisation=none"]
     assert main(["solve", str(pendulum), "--live", *settings, "--out", str(tmp_path / "lines")]) == 0
     assert "last step" not in capsys.readouterr().err
     show_all_on_a_terminal(monkeypatch)

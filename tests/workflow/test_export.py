@@ -157,7 +157,7 @@ def test_what_cannot_be_said_is_left_out_and_listed(tmp_path, exported) -> None:
 
 
 def test_a_configuration_that_starts_at_the_estimates(printed, carried_out, pendulum) -> None:
-    settings = ["output={write_report: false, discretisation_check: none}"]
+    settings = ["output={write_report: false, checked_discretisation: none}"]
     first = carried_out("solve", pendulum, settings=settings, out="first").result
     assert printed("export", "first", "--format", "yaml", "--out", "again.yaml", "--quiet") == "again.yaml\n"
     second = carried_out("solve", "again.yaml", out="second").result

@@ -23,7 +23,7 @@ from yid_ocp.inference.uncertainty import (
     mark_free_estimates_not_trusted,
     typical_parameter_magnitudes,
 )
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
@@ -398,7 +398,7 @@ def _errors(samples: SensorMeasurements, predicted: Array, fixed: float) -> dict
     return result
 
 
-def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableTopology | None) -> dict[str, Array]:
+def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableVertices | None) -> dict[str, Array]:
     sensor = samples.sensor
     if sensor.naive_prediction == "zero":
         return {"zero": np.zeros_like(samples.value)}

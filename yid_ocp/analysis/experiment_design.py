@@ -74,7 +74,7 @@ class UnchangedExperiment:
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: camera_pose_of_point_group(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_points_times_and_median_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_point_group_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Return the points that arms measure, with times [s] and median noise [m]. Without any: None and defaults."""
         t = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor_name == "arm", t, _DEFAULT_ARM_POINT_STD)
@@ -300,7 +300,7 @@ class ExperimentVariantSensitivityBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Return the smallest noise standard deviation [m] of the points of each group in a recording."""
         finest = {}
-        samplings = self.setting.camera_points_times_and_median_std, self.setting.arm_points_times_and_median_std
+        samplings = self.setting.camera_points_times_and_median_std, self.setting.arm_point_group_times_and_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
@@ -421,7 +421,7 @@ class ExperimentVariantSensitivityBuilder:
         for view in setting.existing_point_observation_schedules(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
         camera = setting.camera_points_times_and_median_std(episode)[0]
-        arm = setting.arm_points_times_and_median_std(episode)[0]
+        arm = setting.arm_point_group_times_and_std(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})

@@ -17,7 +17,7 @@ from yid_ocp.analysis.joint_checks import RecordedJointsModel, known_effect_conf
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import Issue, median_sample_period
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.sensors import SensorOptions
@@ -298,7 +298,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
         yield _Change("point_mirrored", words, words, _rms(moved(pose @ flip @ back) - place))
 
 
-def cable_point_geometry_issues(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
+def cable_point_geometry_issues(cable: CableVertices, recording: Recording, gravity: Array) -> Iterator[Issue]:
     """Yield issues about cable points that lie too high above the clamps, are exchanged, or have wrong distances."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertex_names if name in group.names}
@@ -344,7 +344,7 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
 
 
 def _upside_down(
-    cable: CableTopology, at: Mapping[str, Array], rest: Mapping[str, Array], gravity: Array
+    cable: CableVertices, at: Mapping[str, Array], rest: Mapping[str, Array], gravity: Array
 ) -> Issue | None:
     """Return the issue for a cable that rises between its clamps by more than its undeformed shape, or None."""
     pull = float(np.linalg.norm(gravity))

@@ -17,7 +17,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
-from yid_ocp.integrator.step import rollout_step_derivatives
+from yid_ocp.integrator.step import linearized_rollout_steps
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
@@ -144,7 +144,7 @@ class _Motion:
             known = applied_torque_derivative_by_torque_error(feedback.gain, momentum)
             pulled = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         inputs = np.concatenate([known, pulled], axis=2)
-        for state, _ in rollout_step_derivatives(step, course.theta, course.rollout, inputs, feedback):
+        for state, _ in linearized_rollout_steps(step, course.theta, course.rollout, inputs, feedback):
             self.by_state += [*state[:, :, : -2 * nu]]
             self.by_torque += [*state[:, :, -2 * nu : -nu]]
             self.by_angles += [*state[:, :, -nu:]]

@@ -193,7 +193,7 @@ class _Outcomes:
         """All single changes that apply to the experiment."""
         setting, episode = self.setting, self.setting.problem.episodes[0]
         camera = setting.camera_points_times_and_median_std(episode)[0]
-        arm = setting.arm_points_times_and_median_std(episode)[0]
+        arm = setting.arm_point_group_times_and_std(episode)[0]
         views = setting.existing_point_observation_schedules(episode)
         groups = ("" if group is None else group.name for group in (camera, arm))
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
@@ -244,7 +244,7 @@ class _Outcomes:
     ) -> list[SinglePointObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_points_times_and_median_std(episode)
-        arm, arm_times, arm_std = setting.arm_points_times_and_median_std(episode)
+        arm, arm_times, arm_std = setting.arm_point_group_times_and_std(episode)
         looking, feeling = CAMERA_GROUP if camera is None else camera.name, ARM_GROUP if arm is None else arm.name
         rate = next((change.camera_rate for change in changes if change.camera_rate is not None), None)
         if rate is not None:

@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
 from yid_ocp.arrays import Vector3
-from yid_ocp.data.recording import RecordedOrNominalClock
+from yid_ocp.data.recording import TimestampKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.effects.law import TorqueLawQuantitiesName
@@ -249,7 +249,7 @@ class ImportSettings:
     )
     file_clock_offsets: Annotated[_Numbers, OptionInfo("several files: added to each one's times, by stem", "s")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("LeRobot dataset: episode; default: the first")] = None
-    recorded_or_nominal_times: Annotated[RecordedOrNominalClock | None, OptionInfo("table: kind of its times")] = None
+    timestamp_kind: Annotated[TimestampKind | None, OptionInfo("table: are its times measured or nominal?")] = None
     point_sensor_name: Annotated[str | None, OptionInfo("name of the sensor that measured the points")] = None
     point_frame: Annotated[str | None, OptionInfo("table or C3D file: frame of the points")] = None
 
@@ -401,7 +401,7 @@ class OutputSettings:
 
     runs_folder: Annotated[_FilePath | None, OptionInfo("folder of run folders; default: `runs`")] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
-    discretisation_check: Annotated[
+    checked_discretisation: Annotated[
         Literal["none", "time_step", "both"] | None,
         OptionInfo(
             "what `solve` refines to test the estimates: nothing, the time step, or time step and links; "
@@ -428,7 +428,9 @@ class RunSettings:
     parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("parameters by name or pattern")] = field(
         default_factory=dict
     )
-    problem: Annotated[_ProblemSettings, OptionInfo("the estimation problem")] = _ProblemSettings()
+    problem: Annotated[_ProblemSettings, OptionInfo("options: initial state, weights, filters, steps")] = (
+        _ProblemSettings()
+    )
     solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("method that minimises the cost")] = (
         field(default_factory=GaussNewton)
     )

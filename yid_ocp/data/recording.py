@@ -17,7 +17,7 @@ from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
 from yid_ocp.sensors.base import CHANNEL_KINDS, EffortSamplingKind, channel_specs_for_group_name
 
-RecordedOrNominalClock = Literal["recorded", "nominal"]
+TimestampKind = Literal["recorded", "nominal"]
 
 JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position": "rad",
@@ -90,7 +90,7 @@ class JointGroup(ReprMixin):
     position_resolution: float | Array | None = None
     proportional_gain: float | Array | None = None
     effort_kind: EffortSamplingKind | None = None
-    clock: RecordedOrNominalClock = "recorded"
+    clock: TimestampKind = "recorded"
 
     def __post_init__(self) -> None:
         _freeze_arrays(self, ("t", *JOINT_CHANNEL_UNITS))
@@ -150,7 +150,7 @@ class PointGroup(ReprMixin):
     sensor_name: str = "unknown"
     frame: str = "world"
     camera_pose: Array | None = None
-    clock: RecordedOrNominalClock = "recorded"
+    clock: TimestampKind = "recorded"
     clock_offset_std: float | None = None
 
     def __post_init__(self) -> None:
@@ -195,7 +195,7 @@ class SensorChannelGroup(ReprMixin):
     t: Array
     values_by_quantity: Mapping[str, Array]
     noise_and_bias_stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
-    clock: RecordedOrNominalClock = "recorded"
+    clock: TimestampKind = "recorded"
 
     def __post_init__(self) -> None:
         _freeze_arrays(self, ("t",))
@@ -532,7 +532,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         raise_data_error_unless(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
         raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
-    clocks, place = get_args(RecordedOrNominalClock), f"{where}, attribute clock"
+    clocks, place = get_args(TimestampKind), f"{where}, attribute clock"
     raise_data_error_unless(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))

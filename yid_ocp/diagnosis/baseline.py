@@ -147,7 +147,7 @@ class EarlierRunsBaseline:
 
     def predict_counterfactual_errors(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> ErrorsWithEffectsRemovedOrAdded | None:
+    ) -> CounterfactualPredictionErrors | None:
         """Predict recordings made without the effects of `last`, and those with them, with and without these effects.
 
         Reference recordings are predicted by `last` without its effects, and the diagnosed recordings by the parameters
@@ -168,8 +168,8 @@ class EarlierRunsBaseline:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return ErrorsWithEffectsRemovedOrAdded(removed, _nothing(present, error.what))
-        return ErrorsWithEffectsRemovedOrAdded(removed, _predicted(last, present, then, {**then, **effects}))
+            return CounterfactualPredictionErrors(removed, _nothing(present, error.what))
+        return CounterfactualPredictionErrors(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def problem_with_priors_and_baseline(
@@ -232,7 +232,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class ErrorsWithEffectsRemovedOrAdded:
+class CounterfactualPredictionErrors:
     """The prediction errors on reference recordings without the effects, and on diagnosed recordings with them."""
 
     # recordings without the effects: the diagnosed model minus its effects, against the fitted nominal model

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from yid_ocp.diagnosis.baseline import ErrorsWithEffectsRemovedOrAdded, ParameterShiftsSinceBaseline
+from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors, ParameterShiftsSinceBaseline
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.gap_law import NonparametricLaw
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
@@ -44,7 +44,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
     baseline_comparison: ParameterShiftsSinceBaseline | None = None
-    counterfactual: ErrorsWithEffectsRemovedOrAdded | None = None
+    counterfactual: CounterfactualPredictionErrors | None = None
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[HeldOutTruncation, ...] = ()

@@ -336,7 +336,7 @@ def elastic_joints_of_segment(system: System, segment: str) -> tuple[ElasticJoin
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
-def nominal_segment_bend_stiffness_by_joint(system: System, segment: str) -> dict[str, float]:
+def nominal_bend_stiffness_by_joint_of_segment(system: System, segment: str) -> dict[str, float]:
     """Return the nominal stiffness [N m/rad] of the joints that bend a segment, or of all its joints if none bends."""
     springs = elastic_joints_of_segment(system, segment)
     chosen = [spring for spring in springs if spring.deformation == "bend"] or springs

@@ -313,21 +313,13 @@ class _AerodynamicDrag(EffectBase):
         return EffectStepTerms(force_with_derivatives=_on_bodies(kinematics, velocity, wrenches, slopes))
 
 
-def _object(system: System) -> tuple[str, ...]:
-    return ("object",) if system.segment_layouts else ()
-
-
-def _world(system: System) -> tuple[str, ...]:
-    return ("world",)
-
-
 @EFFECTS.register("gravity_scale")
 class _GravityScale(EffectBase):
     """Additional weight of the object as a fraction of its full weight. Its inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
     required_excitation = "its orientation to gravity"
-    possible_locations = _object
+    possible_locations = lambda system: ("object",) if system.segment_layouts else ()
     declared_parameters = (ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "added over full weight"),)
 
     def apply_to_system(self, system: System) -> System:
@@ -346,7 +338,7 @@ class _GravityTilt(EffectBase):
 
     equation = "g = Ry(ry) Rx(rx) g_0"
     required_excitation = "its orientation to gravity"
-    possible_locations = _world
+    possible_locations = lambda system: ("world",)
     declared_parameters = tuple(
         ParameterDefinition(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.05, 0.05), f"turn about {axis}") for axis in "xy"
     )

@@ -124,7 +124,7 @@ def _coordinate_indices_and_factors(system: System, location: str) -> dict[int, 
     index = system.mechanism.joint_index
     if location not in base.flexible_segment_names(system):
         return {index(location): 1.0}
-    stiffness = base.nominal_segment_bend_stiffness_by_joint(system, location)
+    stiffness = base.nominal_bend_stiffness_by_joint_of_segment(system, location)
     typical = float(np.median([*stiffness.values()])) if stiffness else 0.0
     return {index(joint): own / typical if typical > 0 else 1.0 for joint, own in stiffness.items()}
 

@@ -20,7 +20,7 @@ _MIN_LARGEST_ANGLE = 0.02  # minimum of that angle [rad]
 
 def _bending_stiffness(system: System, segment: str) -> float:
     """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
-    stiffness = [*base.nominal_segment_bend_stiffness_by_joint(system, segment).values()]
+    stiffness = [*base.nominal_bend_stiffness_by_joint_of_segment(system, segment).values()]
     return max(float(np.mean(stiffness)), 1e-6) if stiffness else 1.0
 
 

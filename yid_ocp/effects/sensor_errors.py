@@ -19,14 +19,6 @@ def _camera(system: System) -> tuple[str, ...]:
     return ("camera",) if system.point_frames else ()
 
 
-def _camera_of_tubes(system: System) -> tuple[str, ...]:
-    return _camera(system) if system.segment_layouts else ()
-
-
-def _clock(system: System) -> tuple[str, ...]:
-    return ("clock",)
-
-
 class _CameraEffect(EffectBase):
     """The base class of errors of points that cameras see. Readings of other sensors are unchanged."""
 
@@ -84,7 +76,7 @@ class _SurfaceOffset(_CameraEffect):
     """The camera sees the near surface: the seen point is a fraction of the tube's radius nearer than the axis."""
 
     equation = "seen point = true + fraction r (c - true)/|c - true|"
-    possible_locations = _camera_of_tubes
+    possible_locations = lambda system: _camera(system) if system.segment_layouts else ()
     declared_parameters = (
         ParameterDefinition("fraction", "1", 0.0, 0.0, 1.5, (0.0, 1.0), "distance from the axis over the radius"),
     )
@@ -127,7 +119,7 @@ class _ClockScale(EffectBase):
     equation = "recorded time = true x scale"
     required_excitation = "when it is read"
     required_sensors = frozenset({"nominal_clock"})
-    possible_locations = _clock
+    possible_locations = lambda system: ("clock",)
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.7, 1.4, (0.9, 1.1), "recorded over true time"),)
 
     def apply_to_system(self, system: System) -> System:

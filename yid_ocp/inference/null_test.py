@@ -22,7 +22,7 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
-from yid_ocp.sensors.base import LowPassFilter
+from yid_ocp.sensors.base import ZeroPhaseFilterInterface
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
@@ -261,7 +261,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[OutputRe
     return tuple(series)
 
 
-def _noise_autocorrelation(low_pass: LowPassFilter | None, step: float) -> Array:
+def _noise_autocorrelation(low_pass: ZeroPhaseFilterInterface | None, step: float) -> Array:
     """Autocorrelation, at lags 0, 1, ... samples, of white noise that was filtered every `step` [s] and thinned."""
     if low_pass is None or not np.isfinite(low_pass.cutoff):
         return np.ones(1)

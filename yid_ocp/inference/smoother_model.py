@@ -32,8 +32,8 @@ from yid_ocp.inference.linearized_residual import (
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import (
     actuated_joint_torques_of_rollout,
+    linearized_rollout_steps,
     reachable_and_observable_state_mask,
-    rollout_step_derivatives,
 )
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -291,7 +291,7 @@ def _steps(
         # the momentum of the measured motion contains half the impulse of an unknown force (of the previous step, taken
         # as that of this step)
         inputs = feedback.gain @ np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
-    for pair in rollout_step_derivatives(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
+    for pair in linearized_rollout_steps(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
         push, done = pushes[done : done + len(pair[0])], done + len(pair[0])
         by_state = (one[:, :, moving] for one in pair)
         by_load = [one[:, :, nx : nx + width] + one[:, :, nx + width :] for one in pair]

@@ -43,7 +43,7 @@ from yid_ocp.inference.linearized_residual import (
     ResidualDerivativesByStateAndEffort,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import reachable_and_observable_state_mask, rollout_step_derivatives
+from yid_ocp.integrator.step import linearized_rollout_steps, reachable_and_observable_state_mask
 from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -203,7 +203,7 @@ def _filter_steps(
     observe, by_torque = np.zeros((ends[-1], na)), np.zeros((ends[-1], nu))
     along = course.model_functions.step, course.theta, course.rollout
     places = kept[:, None] * (nx + inputs.shape[2]) + columns
-    for state, effort in rollout_step_derivatives(*along, inputs, feedback):
+    for state, effort in linearized_rollout_steps(*along, inputs, feedback):
         move = moves[begun : begun + len(state)]
         move[:] = state if ns == nx else state.reshape(len(state), -1).take(places, axis=1)  # faster than an index
         spans = pairwise(ends[begun : begun + len(state) + 1].tolist())

@@ -227,10 +227,10 @@ class CompiledKernel:
         self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
 
-    def rollout_step_derivatives(
+    def linearized_rollout_steps(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute the derivatives of a rollout's steps in C, as `step.rollout_step_derivatives` describes them."""
+        """Compute the derivatives of a rollout's steps in C, as `step.linearized_rollout_steps` describes them."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)

@@ -220,10 +220,10 @@ class InterpretedKernel:
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
 
-    def rollout_step_derivatives(
+    def linearized_rollout_steps(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute the derivatives of a rollout's steps, as `step.rollout_step_derivatives` describes them."""
+        """Compute the derivatives of a rollout's steps, as `step.linearized_rollout_steps` describes them."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))

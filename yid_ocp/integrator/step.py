@@ -341,13 +341,13 @@ def reachable_and_observable_state_mask(
 
     Prescribed coordinates and internal states of a neutral effect are excluded. Other coordinates and momenta count as
     measured. Only the first and the last step are examined. `loads` are further inputs as in
-    `rollout_step_derivatives`. `seen` (nx,) marks states on which sensors depend directly. `disturbed` (nx,) marks
+    `linearized_rollout_steps`. `seen` (nx,) marks states on which sensors depend directly. `disturbed` (nx,) marks
     states with an initial error; if given, states that neither initial errors nor torque errors reach are excluded.
     """
     count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
     given = (step, theta, rollout, np.repeat(inputs, count, 0), None, loads)
     first, last = slice(0, 1), slice(count - 1, count)
-    ends = [next(rollout_step_derivatives(*given, chosen)) for chosen in (first, last)]
+    ends = [next(linearized_rollout_steps(*given, chosen)) for chosen in (first, last)]
     by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
     by_state, moved = by_all[:, :nx], np.any(by_all > 0, axis=1)
     moved[list(step.system.prescribed_coordinate_indices)] = False
@@ -365,7 +365,7 @@ def reachable_and_observable_state_mask(
     return moved & felt
 
 
-def rollout_step_derivatives(
+def linearized_rollout_steps(
     step: Step,
     theta: Array,
     rollout: Rollout,
@@ -390,4 +390,4 @@ def rollout_step_derivatives(
         span = slice(first, min(first + _STEPS_PER_CHUNK, end))
         nodes, own = rollout.state[first : span.stop + 1], feedback and replace(feedback, gain=feedback.gain[span])
         along = replace(rollout, state=nodes, multipliers=rollout.multipliers[span], torque=rollout.torque[span])
-        yield step.kernel.rollout_step_derivatives(theta, along, own, inputs[span], loads)
+        yield step.kernel.linearized_rollout_steps(theta, along, own, inputs[span], loads)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.integrator.step import Step
-from yid_ocp.model.objects.base import CableTopology, ClampPosePointNames
+from yid_ocp.model.objects.base import CableVertices, ClampPosePointNames
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeightingName
 from yid_ocp.sensors import SensorOptions as SensorOptions
@@ -90,7 +90,7 @@ class ProblemOptions:
         Discretisation errors that the standard deviations include: `links`, `time_step`.
     divided_links_model : DividedLinksModel, optional
         Model with divided links, required to check `links`.
-    cable_topology : CableTopology, optional
+    cable_topology : CableVertices, optional
         Topology of a cable held by clamps, for its baselines.
     """
 
@@ -162,7 +162,7 @@ class ProblemOptions:
     excess_residual_criteria: ExcessResidualCriteria = ExcessResidualCriteria()
     checked_discretisations: tuple[RefinementKind, ...] = ("links", "time_step")
     divided_links_model: DividedLinksModel | None = field(default=None, compare=False, repr=False)
-    cable_topology: CableTopology | None = field(default=None, compare=False, repr=False)
+    cable_topology: CableVertices | None = field(default=None, compare=False, repr=False)
 
     @property
     def has_no_data_issue_above_warning(self) -> bool:

@@ -12,7 +12,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.errors import DataError, failed_rollout_error, require_known_names
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -25,7 +25,7 @@ _GIVEN_FRAMES = 2  # number of measured frames that predictions without a model 
 
 
 def naive_cable_predictions(
-    recording: Recording, cable: CableTopology, points: Sequence[str], knots: Sequence[str] | None = None
+    recording: Recording, cable: CableVertices, points: Sequence[str], knots: Sequence[str] | None = None
 ) -> dict[str, Array]:
     """Predict positions (M, len(points), 3) [m] of cable points without a model, from two frames and the clamps' paths.
 

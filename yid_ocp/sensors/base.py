@@ -154,7 +154,7 @@ class RecordedJointsInterface(_RecordedGroup, Protocol):
     def position_resolution(self) -> float | Array | None: ...
 
 
-class RecordedExtraSensorInterface(_RecordedGroup, Protocol):
+class RecordedExtraChannelsInterface(_RecordedGroup, Protocol):
     """The interface of an additional sensor's recorded channels. `data.recording.SensorChannelGroup` implements it."""
 
     @property
@@ -173,7 +173,7 @@ class _RecordingData(Protocol):
     @property
     def points(self) -> Sequence[RecordedPointsInterface]: ...
     @property
-    def channel_groups(self) -> Sequence[RecordedExtraSensorInterface]: ...
+    def channel_groups(self) -> Sequence[RecordedExtraChannelsInterface]: ...
 
 
 def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> DataError:
@@ -308,7 +308,7 @@ def sensor_function_with_jacobians(system: System, sensor: Sensor, names: tuple[
     return ca.Function("sensor", inputs, ca.cse(outputs), names_in, ["y", *(f"by_{name}" for name in names_in)])
 
 
-class LowPassFilter(Protocol):
+class ZeroPhaseFilterInterface(Protocol):
     """A zero-phase low-pass filter, as in `problem.signal_filters.ZeroPhaseLowPassFilter`."""
 
     @property
@@ -336,8 +336,8 @@ class SensorDataInputs:
     sensor_usage: Callable[[str], SensorOptions]  # sensor's options by settings key
     node_times: Array  # times of the rollout's nodes, shape (N + 1,) [s]
     time_step: float  # distance of the nodes [s]
-    effort_filter: LowPassFilter  # filter of prescribed joints' efforts
-    path_filter: LowPassFilter  # filter of prescribed joints' motion
+    effort_filter: ZeroPhaseFilterInterface  # filter of prescribed joints' efforts
+    path_filter: ZeroPhaseFilterInterface  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
     has_uncertain_clocks: bool = False  # of point groups, if the settings do not specify it
     # by joint: speed [rad/s or m/s] below which a friction that is estimated can hold it with any torque up to its size
@@ -356,7 +356,7 @@ class SensorData:
     bias_std: Array | None = None  # std of every output's constant error in the recording, shape (k,)
     noise_correlation: Array | None = None  # correlation of the outputs' noise in a sample, (M, k, k)
     change_by_clock: Array | None = None  # change of the outputs by one std of the recording's clock offset, (M, k)
-    smoothing_filter: LowPassFilter | None = None  # of the values, if their noise is autocorrelated by it
+    smoothing_filter: ZeroPhaseFilterInterface | None = None  # of the values, if their noise is autocorrelated by it
 
 
 SENSOR_READERS: Registry[Callable[[SensorDataInputs], list[SensorData]]] = Registry("kind of sensor")

@@ -46,7 +46,7 @@ def _read_motor_currents(around: base.SensorDataInputs) -> list[base.SensorData]
     return [found for group in groups if (found := _currents(around, group)) is not None]
 
 
-def _currents(around: base.SensorDataInputs, group: base.RecordedExtraSensorInterface) -> base.SensorData | None:
+def _currents(around: base.SensorDataInputs, group: base.RecordedExtraChannelsInterface) -> base.SensorData | None:
     key, where = f"{group.name}.{_CURRENT.quantity}", f"recording '{around.recording.name}': {group.name}"
     choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
     if choice.use is False or not names or around.recording.joints is None:

@@ -66,7 +66,7 @@ def _read_sensors(around: base.SensorDataInputs, kind: type[MountedSensor]) -> l
 
 
 def _measured(
-    around: base.SensorDataInputs, kind: type[MountedSensor], group: base.RecordedExtraSensorInterface, key: str
+    around: base.SensorDataInputs, kind: type[MountedSensor], group: base.RecordedExtraChannelsInterface, key: str
 ) -> base.SensorData:
     choice, tree = around.sensor_usage(key), around.system.mechanism
     where, channel, names = f"{around.recording.name}: {group.name}", kind.channel, group.names

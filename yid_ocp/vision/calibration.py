@@ -252,7 +252,7 @@ def calibrate_camera(
         reason, advice = error.args
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_without_estimation(pose, clock, reason)
-        known = "track.options.calibration.fix_pose: true and track.options.clock_offset.search_half_width: 0"
+        known = "track.options.calibration.fix_pose: true and track.options.clock_offset_search.search_half_width: 0"
         hint = f"{advice}; if pose and clock are known, set {known}"
         what, allowed = f"the camera cannot be calibrated by the arm: {reason}", "frames that show the moving arm"
         raise DataError(what, where=source, allowed=allowed, hint=hint) from None
@@ -309,7 +309,7 @@ class _Calibrator:
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < _MAX_CLOCK_OFFSET_STD:
             told = f"the arm moves too little to determine the clock offset, whose std is {1e3 * std:.0f} ms"
-            known = "set track.options.clock_offset.initial_stamp_minus_joint_time, and search_half_width: 0"
+            known = "set track.options.clock_offset_search.initial_stamp_minus_joint_time, and search_half_width: 0"
             raise _UntoldError(told, f"record a faster motion, or {known}")
         used_state = state
         if self.options.fix_pose:

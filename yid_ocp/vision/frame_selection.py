@@ -38,7 +38,7 @@ class TrackOptions:
     )
     skeleton: Annotated[SkeletonOptions, OptionInfo("skeleton of a cloud")] = field(default_factory=SkeletonOptions)
     shape_fit: Annotated[ShapeFitOptions, OptionInfo("fit of a shape")] = field(default_factory=ShapeFitOptions)
-    clock_offset: Annotated[
+    clock_offset_search: Annotated[
         CameraClockOptions, OptionInfo("estimation of the camera clock's offset from the joints' clock")
     ] = field(default_factory=CameraClockOptions)
     calibration: Annotated[

@@ -199,7 +199,7 @@ class SingleFrameTracker:
     def _calibration(self) -> CameraCalibration:
         options, pose = self.options, self.sequence.camera_pose
         if self.arm_surface is None:
-            return calibration_without_estimation(pose, options.clock_offset, "no robot to compare")
+            return calibration_without_estimation(pose, options.clock_offset_search, "no robot to compare")
         glimpses = []
         for i in self.calibration_frames:
             try:
@@ -209,19 +209,20 @@ class SingleFrameTracker:
             thinned = point_cloud.voxel_averages(points, options.filters.voxel_size).points
             glimpses.append(StampedCloud(float(self.sequence.stamps[i]), thinned))
         rng = np.random.default_rng(options.seed)
-        source, clock = self.sequence.source, options.clock_offset
+        source, clock = self.sequence.source, options.clock_offset_search
         return calibrate_camera(self.arm_surface, glimpses, pose, rng, options.calibration, clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.joint_time_span is None or not usable:
             return
-        stamps, offset = self.sequence.stamps[list(usable)], self.options.clock_offset.initial_stamp_minus_joint_time
+        stamps, search = self.sequence.stamps[list(usable)], self.options.clock_offset_search
+        offset, reach = search.initial_stamp_minus_joint_time, search.search_half_width
         first, last = float(stamps.min()) - offset, float(stamps.max()) - offset
-        (begin, end), reach = self.joint_time_span, self.options.clock_offset.search_half_width
+        begin, end = self.joint_time_span
         if first > end + reach or last < begin - reach:
             spans = f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {begin:.3f} s to {end:.3f} s"
-            hint = f"set track.options.clock_offset.initial_stamp_minus_joint_time ({first + offset - begin:.3f} s if "
-            hint += "they started together)"
+            hint = "set track.options.clock_offset_search.initial_stamp_minus_joint_time "
+            hint += f"({first + offset - begin:.3f} s if they started together)"
             what, where = f"the clocks differ: {spans}", self.sequence.source
             raise DataError(what, where=where, allowed="frames and joints whose times overlap", hint=hint)
 

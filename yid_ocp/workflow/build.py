@@ -30,7 +30,7 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System
 from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
-from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
@@ -130,7 +130,7 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
     return build_system(load_config(path, overrides))
 
 
-def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
+def cable_topology_between_clamps(run: RunSettings) -> CableVertices | None:
     """Return the measured vertices and clamps of a run's cable. None for an object that is not held by clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
         return None if run.model.object is None else run.model.object.clamped_cable_topology()
@@ -174,7 +174,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     return damping | {name: own.damping for name, own in springs.items() if own.damping is not None}, of_object
 
 
-def _clamped_system(run: RunSettings, cable: CableTopology) -> System:
+def _clamped_system(run: RunSettings, cable: CableVertices) -> System:
     assert run.model.object is not None
     kind = run.model.object.kind
     for key in ("robot", "grasp", "joint_springs", "frames"):

@@ -27,7 +27,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model import System
-from yid_ocp.model.objects.base import CableTopology, ClampPosePointNames
+from yid_ocp.model.objects.base import CableVertices, ClampPosePointNames
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import DividedLinksModel, RefinementKind
@@ -78,7 +78,7 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
     clamps: tuple[ClampPosePointNames, ...] = ()
-    item, checked = run.model.object, run.output.discretisation_check
+    item, checked = run.model.object, run.output.checked_discretisation
     if checked is None:
         checked = "both" if item is not None and item.default_link_refinement else "time_step"
     divided: DividedLinksModel | None = None
@@ -299,7 +299,7 @@ def _duplicate(others: Sequence[Recording], recording: Recording) -> tuple[Issue
 
 
 def _beside_the_model(
-    run: RunSettings, system: System, arm: RecordedJointsModel | None, cable: CableTopology | None, recording: Recording
+    run: RunSettings, system: System, arm: RecordedJointsModel | None, cable: CableVertices | None, recording: Recording
 ) -> list[Issue]:
     gravity = np.array(run.model.gravity, float)
     recording = recording.with_effort_sampling_kind(_choice(run)(JOINT_EFFORT_SENSOR_KEY).effort_sampling_kind)

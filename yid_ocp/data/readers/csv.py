@@ -24,9 +24,9 @@ from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
     JointGroup,
     PointGroup,
-    RecordedOrNominalClock,
     Recording,
     SensorChannelGroup,
+    TimestampKind,
 )
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, os_error_reason
@@ -55,7 +55,7 @@ class _CsvOptions(base.JointPointAndUnitOptions):
     has_header: bool = True  # whether the first row has names; if not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # omit lines that are not rows of numbers, and count them in `notes`
     delimiter: str = ""  # one character between cells; empty: found in the first line
-    recorded_or_nominal_times: RecordedOrNominalClock = "recorded"  # whether the times were measured
+    timestamp_kind: TimestampKind = "recorded"  # whether the times were measured
     point_sensor_name: str = "unknown"  # sensor of the points
     point_frame: str = "world"  # reference frame of the points
     description: str = ""  # what was recorded
@@ -136,15 +136,15 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     if joint_names:
         rows = measured(list(channels.values()))
         own: dict[str, Any] = {name: values[rows] for name, values in channels.items()}
-        joints = JointGroup(joint_names, t[rows], clock=options.recorded_or_nominal_times, **own)
+        joints = JointGroup(joint_names, t[rows], clock=options.timestamp_kind, **own)
     if point_names:
         rows = measured([position])
-        said = options.point_sensor_name, options.point_frame, None, options.recorded_or_nominal_times
+        said = options.point_sensor_name, options.point_frame, None, options.timestamp_kind
         points.append(PointGroup("points", point_names, t[rows], position[rows], None, *said))
     for name, (names, parts) in mounted.items():
         rows = measured(list(parts.values()))
         kept = {quantity: values[rows] for quantity, values in parts.items()}
-        sensors.append(SensorChannelGroup(name, names, t[rows], kept, clock=options.recorded_or_nominal_times))
+        sensors.append(SensorChannelGroup(name, names, t[rows], kept, clock=options.timestamp_kind))
     return Recording(joints, tuple(points), channel_groups=tuple(sensors))
 
 

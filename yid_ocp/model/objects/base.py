@@ -56,7 +56,7 @@ class ClampPosePointNames:
 
 
 @dataclass(frozen=True)
-class CableTopology:
+class CableVertices:
     """The vertices of a branched cable, in order along each branch, and their undeformed positions."""
 
     # parent, from clamp to clamp; clamps hold the first and last two vertices
@@ -228,7 +228,7 @@ class ObjectBuilder:
         per_joint = {segment.name for segment in self.segment_definitions() if not segment.values_given_as_rigidities}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
-    def clamped_cable_topology(self) -> CableTopology | None:
+    def clamped_cable_topology(self) -> CableVertices | None:
         """Return the object's vertices and the clamps that hold it at measured points. None for other objects.
 
         Raises `DataError` or `ModelError` if they are inconsistent.

@@ -31,7 +31,7 @@ from yid_ocp.errors import DataError, ModelError, require_known_names
 from yid_ocp.files import read_input_text
 from yid_ocp.model import flexible
 from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement, symbolic_rotation_from_axis_angle
-from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectBuilder
+from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableVertices, ObjectBuilder
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, System, SystemBuildArguments, six_joint_floating_mechanism
 from yid_ocp.options import OptionInfo
@@ -105,7 +105,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         raise DataError(what, where=str(path), allowed=allowed, hint="correct the table") from error
 
 
-def length_parameters_from_edges(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+def length_parameters_from_edges(cable: CableVertices, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Compute the values of a cable's length parameters from its edge lengths [m]."""
     values = {f"{START_CLAMP}.length": lengths[cable.main_branch_vertex_names[0], cable.main_branch_vertex_names[1]]}
     for name, chain in cable.vertex_names_by_branch.items():
@@ -115,7 +115,7 @@ def length_parameters_from_edges(cable: CableTopology, lengths: Mapping[tuple[st
 
 
 def clamped_cable_system(
-    lengths: Mapping[tuple[str, str], float], cable: CableTopology, options: CableOptions | None = None
+    lengths: Mapping[tuple[str, str], float], cable: CableVertices, options: CableOptions | None = None
 ) -> System:
     """Build the model of a cable that two clamps hold. `lengths` gives the length [m] of each edge (vertex, vertex).
 
@@ -182,7 +182,7 @@ def _with_memory(item: flexible.FlexibleObject, memory: float) -> flexible.Flexi
 
 
 def _with_vertices(
-    item: flexible.FlexibleObject, cable: CableTopology, lengths: Mapping[tuple[str, str], float]
+    item: flexible.FlexibleObject, cable: CableVertices, lengths: Mapping[tuple[str, str], float]
 ) -> flexible.FlexibleObject:
     """The object with its vertices as frames. Arc lengths along the parent branch are measured from clamp to clamp."""
     tree = item.mechanism
@@ -201,7 +201,7 @@ def _with_vertices(
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
 
 
-def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
+def _start_clamp(length: float, cable: CableVertices) -> Mechanism:
     clamp = six_joint_floating_mechanism(START_CLAMP)
     roll = Parameter(f"{START_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
     edge = Parameter(f"{START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
@@ -214,7 +214,7 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
 
 
 def _segments(
-    cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions
+    cable: CableVertices, lengths: Mapping[tuple[str, str], float], options: CableOptions
 ) -> list[flexible.FlexibleSegment]:
     parent = cable.main_branch_vertex_names
     turns = flexible.edge_to_edge_rotations_from_vertices(cable.undeformed_polyline(parent))
@@ -290,9 +290,9 @@ model:
         OptionInfo("CSV table with the columns point, x, y, z [m]"),
     ]
 
-    def clamped_cable_topology(self) -> CableTopology:
+    def clamped_cable_topology(self) -> CableVertices:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
-        found = CableTopology(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
+        found = CableVertices(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
         for name in self.branch_properties_by_name:
             where = f"model.object.branch_properties_by_name.{name}"
             require_known_names([name], found.vertex_names_by_branch, "branch", where, ModelError)
