@@ -71,8 +71,8 @@ class SolverError(YidError):
 
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
     """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
-    hint = "set other initial values (parameters.NAME.initial), or a smaller problem.time_step"
-    what, allowed = f"the model cannot be simulated: {reason}", "values with which the simulation reaches the end"
+    hint = "in this order: a smaller problem.time_step, more damping, other initial values (parameters.NAME.initial)"
+    what, allowed = f"the model cannot be simulated: {reason}", "a simulation that reaches the end of the motion"
     return SolverError(what, where=where, allowed=allowed, hint=hint)
 
 

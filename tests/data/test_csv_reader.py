@@ -144,7 +144,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "misspelt": ("t,q_elbwo,q_b,effort_elbow,effort_b\n0,1,1,1,1\n", {}, "for position of 'elbow'", "mean 'elbwo'?"),
     "no position": ("t,effort_a\n0,1\n", {}, "no column for position of 'a'", ""),
     "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),
-    "empty cell of a joint": ("t,q_a\n0,1\n1,\n", {}, "'position' of joint 'a' is not finite at t = 1 s", ""),
+    "empty cell of a joint": ("t,q_a\n0,1\n1,\n", {}, "infinite value, the first of joint 'a' at t = 1 s", ""),
     "clock": ("t,q_a\n1,1\n0,1\n", {}, "from index 0 to 1", ""),
     "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg and in rad", ""),
     "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "meaning of column 'q_a .mrad.'", ""),

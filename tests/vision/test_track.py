@@ -139,7 +139,7 @@ def test_the_spline_passes_through_the_good_frames(clean, system):
 
 
 def unreadable():
-    raise DataError("the cloud is empty or cannot be read")
+    raise DataError("the point cloud cannot be used")
 
 
 DUST = np.random.default_rng(0)
@@ -150,7 +150,7 @@ BAD = {
     "no point lies in the region that the object can reach": lambda points: points + np.array([30.0, 0.0, 0.0]),
     "too few points of the object": lambda points: points[:60],
     "an end is not where its gripper is": lambda points: points * [1.0, 1.0, 1.05],
-    "the cloud is empty or cannot be read": lambda points: unreadable(),
+    "the point cloud cannot be used": lambda points: unreadable(),
     "": lambda points: points + DUST.uniform(-0.3, 0.3, points.shape),  # random points are no object
 }
 
@@ -192,7 +192,7 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, messa
     with pytest.raises(DataError, match="no frame could be used") as caught:
         track_object(SceneDescription(system), small.recording, sequence, options)
     assert message in caught.value.what
-    assert caught.value.what.endswith(f"({len(small.clouds)} of {len(small.clouds)})")  # all for one reason
+    assert f": {len(small.clouds)} of {len(small.clouds)} because " in caught.value.what  # all for one reason
     assert "dimensions contradict the model" not in caught.value.what
     assert caught.value.hint
 

@@ -410,9 +410,9 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         bad = np.isinf(value) if is_effort and allow_nan_effort else ~np.isfinite(value)
         if bad.any():
             row, column = (int(index[0]) for index in np.nonzero(bad))
-            what = f"channel '{channel}' of joint '{joints.names[column]}' is not finite at t = {joints.t[row]:g} s "
-            what += f"({count_with_noun(int(bad.sum()), 'such value')} in the channel)"
-            hint = "cut the recording where the values are missing, or leave the channel out"
+            what = f"channel '{channel}' has {count_with_noun(int(bad.sum()), 'missing or infinite value')}, "
+            what += f"the first of joint '{joints.names[column]}' at t = {joints.t[row]:g} s"
+            hint = "cut the recording before or after them, or remove the channel's columns from the file"
             hint += ", or use read_recording(..., allow_nan_effort=True)" if is_effort else ""
             raise DataError(what, where=place, allowed="finite numbers", hint=hint)
         unit, size = JOINT_CHANNEL_UNITS[channel], np.nan_to_num(np.abs(value))

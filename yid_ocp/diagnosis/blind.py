@@ -353,8 +353,8 @@ class BlindCaseGenerator:
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
-        what, allowed = f"MuJoCo could simulate none of {MAX_DRAWS_PER_CASE} random motions", "one simulated motion"
-        where, hint = f"{name} of {planned.experiment}", "use another --seed: one seed always draws the same motions"
+        what, allowed = f"MuJoCo could simulate none of {MAX_DRAWS_PER_CASE} motions", "motions that do not diverge"
+        where, hint = f"{name} of {planned.experiment}", "use another --seed, which draws other motions"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:

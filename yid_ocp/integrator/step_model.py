@@ -78,7 +78,7 @@ class NewtonStatusCode(IntEnum):
 
 _STATUS_MESSAGES = {
     NewtonStatusCode.OK: "converged",
-    NewtonStatusCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping or another start",
+    NewtonStatusCode.NOT_CONVERGED: "Newton's method found no solution of its equations",
     NewtonStatusCode.SINGULAR: "the equations of the step are singular; "
     "look for redundant grasps or a joint without inertia",
     NewtonStatusCode.NOT_FINITE: "the state is no longer finite, because the simulated motion is unstable; "
@@ -276,9 +276,9 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], make: Callable[...
 def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     """Create the error for a lack of memory, because `what` needs `size` bytes."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
-    said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]} for {what}, which needs {amount}"
+    said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]}: {what} needs {amount}"
     hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
-    allowed = "a computation that fits into the free memory"
+    allowed = "less memory than is free"
     return InsufficientMemoryError(said, where="this machine", allowed=allowed, hint=hint)
 
 

@@ -139,8 +139,8 @@ def read_urdf(
         hint = "give a path, or package:NAME for example-robot-data"
         with contextlib.suppress(ModelError):
             _example_robot_urdf(str(path))
-            hint = f"write package:{path} for that robot of example-robot-data"
-        allowed = "the path of a URDF file, package:NAME, or default:NAME.urdf"
+            hint = f"did you mean package:{path}?"
+        allowed = "the path of a file; package:NAME (of example-robot-data); default:NAME.urdf (of yid_ocp)"
         raise ModelError(f"there is no URDF file '{file}'", where=str(path), allowed=allowed, hint=hint)
     robot, where, named = _parsed(file), str(file), (*(joints or ()), *locked)
     root = _check_tree(robot, where, named)

@@ -211,9 +211,9 @@ def smoothed_efforts_at_nodes(
     """Low-pass filter joint efforts and sample them at each node, (steps + 1, len(names)) [N m]. Raises `DataError`."""
     joints = recording.joints
     if joints is None or joints.effort is None:
-        what = "the elastic gears of the model need joint efforts, but the recording has none"
-        where, allowed = f"recording '{recording.name}': joints/effort", "the effort of every joint"
-        raise DataError(what, where=where, allowed=allowed, hint="remove the effects series_elasticity and backlash")
+        what = "the effects series_elasticity and backlash need joint efforts, but the recording has none"
+        where, hint = f"recording '{recording.name}': joints/effort", "record them, or remove both from model.effects"
+        raise DataError(what, where=where, allowed="the effort of every joint", hint=hint)
     effort = low_pass(joints.t, joints.effort[:, recorded_joint_column_indices(joints, names, recording.name)])
     # the mean of an interval belongs to its centre
     late = 0.0 if joints.effort_sampling_kind_or_default == "sample" else median_sample_period(joints.t) / 2

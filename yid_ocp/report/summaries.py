@@ -520,7 +520,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if gate is None:
         return
     if gate["status"] != "done":
-        yield f"not replayed: {gate['reason']}"
+        yield f"the file is written, but its motion was not compared with a recording in MuJoCo: {gate['reason']}"
         return
     rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():

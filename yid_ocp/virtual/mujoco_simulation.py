@@ -533,8 +533,8 @@ def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
 ) -> dict[str, ReplayErrorAgainstRecording]:
     if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
-        where, allowed = f"recording '{recording.name}'", "finite positions and efforts"
-        raise ModelError("the replay in MuJoCo diverged", where=where, allowed=allowed, hint="set a shorter time step")
+        what, hint = "the simulation in MuJoCo diverged", "set a smaller `timestep` in the file"
+        raise ModelError(what, where=f"recording '{recording.name}'", allowed="finite positions and efforts", hint=hint)
     found: dict[str, ReplayErrorAgainstRecording] = {}
     t = joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9

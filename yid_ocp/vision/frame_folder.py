@@ -85,13 +85,13 @@ def _read_pcd(path: Path) -> _Cloud:
     with path.open("rb") as file:
         declared = _PCD_POINT_COUNT.search(file.read(_PCD_HEADER_BYTES))
     if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
-        raise _damaged(path, f"it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes")
+        raise _damaged(path, f"it is cut off: {path.stat().st_size} bytes for {int(declared[1])} points")
     # Open3D prints errors to standard output and returns an empty cloud
     try:
         with files.limit_process_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
     except (MemoryError, RuntimeError) as error:
-        raise _damaged(path, "it declares more points than fit into memory") from error
+        raise _damaged(path, "its header announces more points than fit into memory") from error
     colours = np.rint(255 * np.asarray(cloud.colors)).astype(np.uint8) if cloud.has_colors() else None
     return np.asarray(cloud.points, dtype=np.float64), colours
 
@@ -143,7 +143,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
 
 def _damaged(path: Path, why: str) -> DataError:
     allowed, hint = f"a complete {path.suffix} file with x, y, z of points", "copy the file again, or export it again"
-    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), allowed=allowed, hint=hint)
+    return DataError(f"the point cloud cannot be used: {why}", where=str(path), allowed=allowed, hint=hint)
 
 
 def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
@@ -163,7 +163,7 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
             case ["property", kind, name] if found and kind in _NUMPY_TYPES:
                 found[-1][2].append((name, _NUMPY_TYPES[kind]))
             case _:
-                raise _damaged(path, f"its header has the line {line[:60]!r}")
+                raise _damaged(path, f"this line of its header is wrong: {line[:60]!r}")
     if order is None:
         raise _damaged(path, "its header has no format")
     return order, found
@@ -177,7 +177,7 @@ def _vertices(
         raise _damaged(path, "its vertices lack x, y or z, contain lists, or name a property twice")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if count * size > len(body) + (not order):  # the last line of a text may end without a newline
-        raise _damaged(path, f"it declares {count:.3g} points in {len(body)} bytes")
+        raise _damaged(path, f"it is cut off: {len(body)} bytes for {count} points")
     if not count:
         raise _damaged(path, "it has no vertices")
     wanted = [*_AXIS_PROPERTIES, *(_COLOUR_PROPERTIES if coloured and set(_COLOUR_PROPERTIES) <= set(names) else ())]

@@ -199,12 +199,13 @@ def _none_good(
         kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
     often = sorted(kinds.values(), key=len, reverse=True)[:3]
     listed = "; ".join(
-        f"{'for example ' if len(set(reasons)) > 1 else ''}{reasons[0]} ({len(reasons)} of {len(frames)})"
+        f"{len(reasons)} of {len(frames)} because {reasons[0]}{' (one of them)' * (len(set(reasons)) > 1)}"
         for reasons in often
     )
     cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFIT_REASONS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
     of_cause = {
+        "stamp is late": "set track.options.clock_offset_search.initial_stamp_minus_joint_time, or drop late frames",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
         "crosses or touches itself": "record the object without crossings, or look whether the filters join its parts",
     }

@@ -276,7 +276,7 @@ class SingleFrameTracker:
         if filters.object_colours and self.sequence.load_colours is not None:
             colours = self.sequence.load_colours(index)
             if colours is None:
-                raise DataError("the cloud has no colours")
+                raise DataError("the cloud has no colours, which track.options.filters.object_colours needs")
             inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], filters.object_colours)
             if not inside.any():
                 raise DataError("no point has a colour of the object: check track.options.filters.object_colours")
@@ -383,7 +383,7 @@ class SingleFrameTracker:
         cloud, raw = self._read(index, calibration)
         work.say(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
-            raise DataError("no joint angles were recorded at its time")
+            raise DataError("no joint angles were recorded at the time of the frame")
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
@@ -391,7 +391,7 @@ class SingleFrameTracker:
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
                 if own.is_significant:
-                    raise DataError(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
+                    raise DataError(f"the frame's time stamp is late: by {1e3 * own.delay:.0f} ms")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:

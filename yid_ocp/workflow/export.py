@@ -218,9 +218,9 @@ def _refuse_losses(
     lost += [name for name in absent if name.rpartition(".")[0] not in effects]
     lost += [f"grasp {name}" for name in grasps]
     if lost and not is_lossy:
-        what = f"{form.upper()} cannot represent {', '.join(lost)}"
-        hint = "accept a file without them by --lossy; its manifest has the reasons"
-        raise ConfigError(what, where=f"--format {form}", allowed="a format that represents all, or --lossy", hint=hint)
+        what, where = f"{form.upper()} cannot represent these parts of the model: {', '.join(lost)}", f"--format {form}"
+        hint = "add --lossy to write the file without them; the manifest beside it (.json) has the reason for each"
+        raise ConfigError(what, where=where, allowed="--lossy, or a model without them", hint=hint)
 
 
 def _expressible(

@@ -70,9 +70,9 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
         effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
-        what = "the result has no parameters with covariance that can be read"
-        allowed = "keys parameters and covariance, as this version writes them"
-        raise DataError(what, where=str(file), allowed=allowed, hint="run the command again") from error
+        what = "parameters or covariance are missing or not readable: the run failed, or another version wrote it"
+        hint = "repeat the `solve` or `diagnose` that made this folder"
+        raise DataError(what, where=str(file), allowed="keys as this version writes them", hint=hint) from error
     if not names:
         what, hint = "the run determined no parameter", "give a run that estimated one with a standard deviation"
         raise DataError(what, where=str(file), allowed="one parameter or more in `covariance`", hint=hint)

@@ -149,8 +149,8 @@ def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None
     what = f"the unit of the joint positions is unknown: the largest absolute value is {widest:.3g}{of}"
     allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "--units deg"
     if widest <= _MAX_NORMALISED:
-        hint = "--units deg if the robot was recorded with use_degrees=true. Otherwise the values are normalised to "
-        hint += "the calibrated range (-100 to 100) and cannot be converted: record again with use_degrees=true"
+        hint = "--units deg only if the robot was recorded with use_degrees=true. If not, the values are normalised "
+        hint += "(-100 to 100) and cannot be converted: record again with use_degrees=true"
     raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
