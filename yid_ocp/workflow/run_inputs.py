@@ -119,7 +119,8 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
     try:
         yield
     except YidError as error:
-        where = run.setting_location(*path)
+        own = tuple(error.where.split("."))
+        where = run.setting_location(*(own if own[: len(path)] == path else path))
         if error.where and error.where not in where:
             where = f"{where} ({error.where})"
         raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error
