@@ -68,7 +68,7 @@ def test_a_torque_without_a_name_is_found_at_its_joint_as_a_function_of_its_quan
     law = found.law
     assert (law.location, law.depends_on) == ("elbow", quantity)
     assert law.closure.fraction > 0.9
-    assert f"elbow carries a torque that depends on its {quantity} (from " in found.summary
+    assert f"A torque at elbow that depends on its {quantity} (from " in found.summary
     told = found.to_dict()["law"]
     assert (told["location"], told["depends_on"]) == ("elbow", quantity)
     assert [row["torque"] for row in told["table"]] == law.tables[0].torque.tolist()

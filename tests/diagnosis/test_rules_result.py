@@ -48,8 +48,8 @@ def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
         noise_floor=tuple(AssumedChannelNoiseLevel(*own) for own in levels),
     )
     size = math.sqrt(0.02**2 - 3 * 0.001**2)
-    sizes = f"0 N m (rms without noise) at joints.effort.elbow, {size:.2g} m (rms without noise) at points.end."
-    assert f"exceeds noise: {sizes}" in diagnosis_summary_text(made)  # noise alone gives the torque's
+    sizes = f"0 N m at joints.effort.elbow, {size:.2g} m at points.end (rms, noise subtracted)."
+    assert f"error of the nominal model is {sizes}" in diagnosis_summary_text(made)  # noise alone gives the torque's
 
 
 def test_the_result_holds_what_was_found():
@@ -121,7 +121,7 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
     told = f.finding("unknown", unknown_reason="stand_in", transfer_checks=(f.carried(),)).to_dict()
     [rejected] = told["rejected_candidates"]
     assert (rejected["kind"], rejected["location"], rejected["closure"]) == ("friction", "elbow", 0.9)
-    said = "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ±"
+    said = "friction@elbow.a is 0.5 ± 0.01 N m on the fitted recordings and 0.9 ±"
     assert rejected["reason"].startswith(said)
     assert (told["reason"], told["effects"]) == ("stand_in", [])
     assert f.finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []

@@ -80,7 +80,7 @@ def gaps():
         yield f"no gap, p = {p} and chi2 {size}", finding("no_gap", **tests, **seen, **NO_EFFECT)
     quiet = {"nominal_test": outcome(0.2, chi2=1.02), "nominal_held_out_test": outcome(0.6, chi2=0.989)}
     yield "along a candidate alone", finding(**quiet)
-    yield "no gap", finding("no_gap", next_experiment="None is needed for what these motions can show.", **NO_EFFECT)
+    yield "no gap", finding("no_gap", next_experiment="None is needed for these motions.", **NO_EFFECT)
 
 
 def places():
@@ -249,7 +249,7 @@ def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_su
     alike = finding("effect", selected_effects=(added(FRICTION, rivals=[OFFSET]),))
     assert recommended_experiment_text(alike).startswith("Move so that elbow and wrist work one at a time")
     sole = recommended_experiment_text(finding("effect", selected_effects=(added(FRICTION),)))
-    assert sole.startswith("Repeat with other motions")
+    assert sole.startswith("Record and diagnose other motions")
     few = recommended_experiment_text(replace(alike, verdict="insufficient_data"))
     assert few.startswith("Record longer and larger motions")
 

@@ -77,7 +77,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
         limits = Thresholds(max_effects=2, budget=1e4, min_excess_chi2_per_dof=-0.5)
         problem = bench.problem(recordings[:1])
         finding = diagnose(problem, FRICTION, recordings[1:], thresholds=limits, progress=progress)
-        said = f"it stopped after {finding.search_seconds:.3g} s, and would go on with {finding.untried[0]}"
+        said = f"ended the search after {finding.search_seconds:.3g} s. Not done: {finding.untried[0]}"
         assert finding.summary.count(said) == 1
         assert finding.search_seconds == pytest.approx(sum(list(finding.stage_seconds.values())[:-4]))
         return json.loads(json.dumps(finding.to_dict(), allow_nan=False))
@@ -117,7 +117,7 @@ def test_a_model_that_fails_with_all_candidates_is_diagnosed_at_a_shorter_step(b
     monkeypatch.setattr(diagnose_module, "screen_candidates", screen)
     stated, finding = bench.step.time_step, found(bench, {}, FRICTION)[0]
     assert (finding.verdict, finding.stated_and_used_time_step) == ("no_gap", (stated, stated / 4))
-    assert f"Steps of {stated:.4g} s are too long here" in finding.summary
+    assert f"Time steps of {stated:.4g} s are too long" in finding.summary
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_the_error_of_a_long_step_is_no_gap_alone_or_beside_an_effect(bench, joi
     assert {effect.label for effect in finding.accepted_effects} == set(own)
     told = finding.to_dict()
     is_finer = steps[0] != steps[1]
-    assert ("Steps of 0.04 s are too long here" in told["summary"], finding.discretisation_chi2 > 0) == (is_finer,) * 2
+    assert ("Time steps of 0.04 s are too long" in told["summary"], finding.discretisation_chi2 > 0) == (is_finer,) * 2
     assert ("the nominal model at 0.02 s" in names) is (steps[0] != steps[1])
 
 
@@ -189,7 +189,7 @@ def test_a_moment_of_data_is_insufficient(bench):
     _, result = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION, duration=0.03)
     assert result["verdict"] == "insufficient_data"
     assert result["effects"] == []
-    assert "effective samples" in result["summary"]
+    assert "independent samples" in result["summary"]
 
 
 @pytest.fixture

@@ -241,7 +241,7 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     parameters = {"tau": {"value": 0.05, "std": None, "unit": "s"}}
     entry = {"kind": "kelvin_voigt", "location": "T1", "score": 2190.0, "closure": None, "parameters": parameters}
     which = [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}]
-    known = {"summary": "The gap is real.", "verdict": "unknown", "next_plan": None, "seconds": {"fit": 1.0}}
+    known = {"summary": "There is a gap.", "verdict": "unknown", "next_plan": None, "seconds": {"fit": 1.0}}
     result = known | {"gap": {"before": {"rmse": {}, "unit": {}}}, "which": which}
     lines = told("yid-diagnosis/2", result)
     assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")

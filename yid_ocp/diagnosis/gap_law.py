@@ -63,10 +63,10 @@ class NonparametricLaw:
     def sentence(self) -> str:
         """A sentence about the law that states its location, quantity and size, and the closed fraction of the gap."""
         if self.depends_on == "time":
-            head = f"{self.location} carries a torque that no quantity of the model predicts better than time does"
+            head = f"A torque at {self.location} that depends on time, as no quantity of the model predicts it better"
         else:
             words = " and its ".join("the time" if t.quantity == "time" else t.quantity for t in self.tables)
-            head = f"{self.location} carries a torque that depends on its {words}"
+            head = f"A torque at {self.location} that depends on its {words}"
         sizes = []
         for table in self.tables:
             low, high = self.visited_range[table.quantity]
@@ -75,9 +75,9 @@ class NonparametricLaw:
             if len(torque):
                 ends = f"from {torque.min():.2g} to {torque.max():.2g} N m"
                 sizes.append(f"{ends} between {low:.2g} and {high:.2g} {unit}")
-        gap = "of the held-out gap that the effects leave" if self.has_accepted_effects else "of the held-out gap"
-        closed = f"it closes {100 * self.closure.fraction:.3g} % {gap}"
-        return f"{head} ({', '.join(sizes)}); {closed}. No accepted effect describes it."
+        gap = f"error beyond noise{' that the effects leave' * self.has_accepted_effects} on held-out motions"
+        closed = f"would remove {100 * self.closure.fraction:.3g} % of the {gap}"
+        return f"{head} ({', '.join(sizes)}) {closed}. No accepted effect describes this torque."
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the law to a dictionary with location, depends_on, table, closure, visited_range and runner_up."""

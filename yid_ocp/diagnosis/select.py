@@ -296,7 +296,7 @@ def _reconsidered(search: RefitContext, nominal: RefitStatistics, chosen: _Choic
     while len(chosen.fit.effects) > 1:
         labels = frozenset(effect.label for effect in chosen.fit.effects)
         own = next((effect for effect in chosen.fit.effects if labels - {effect.label} not in tried), None)
-        if own is None or search.is_skipped_past_deadline("each effect without the others' company"):
+        if own is None or search.is_skipped_past_deadline("each effect without the other effects"):
             break
         tried.add(labels - {own.label})
         chosen = _revised(search, nominal, chosen, own)

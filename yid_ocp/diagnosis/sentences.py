@@ -36,61 +36,62 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     for rivals in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
-        vary = next((f"At {place}, vary" for place in places if place not in _IMMOVABLE_LOCATIONS), "Vary")
-        varied = f"{vary} {' and '.join(aspects)} independently and over a wide range, in one recording."
+        at = next((f" of {place}" for place in places if place not in _IMMOVABLE_LOCATIONS), "")
         advice = (
-            (aspects, varied),
+            (aspects, f"Record one motion{at} in which these vary independently and widely: {', '.join(aspects)}."),
             (places, f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."),
-            (rivals, f"{vary} {aspects[0]} over a wider range."),
+            (rivals, f"Record a motion{at} in which this varies over a wider range: {aspects[0]}."),
         )
         if told := [text for several, text in advice if len(several) > 1]:
             return told[0]
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
     mostly = _listed("Record motions in which ", place, " moves most: slow, fast, with pauses in several postures.")
     texts = {
-        "insufficient_data": "Record longer and larger motions; more of the object must be visible.",
-        "unknown": mostly or "Record other motions, faster and larger.",
-        "no_gap": "None is needed for what these motions can show.",
-        "confusable": "Record other motions, in which effects and changed parameters act differently.",
-        "effect": "Repeat with other motions and check that the effect's parameters stay the same.",
+        "insufficient_data": "Record longer and larger motions, with more points of the object in view.",
+        "unknown": mostly or "Record other motions of all joints, faster and larger than these.",
+        "no_gap": "None is needed for these motions. Other motions may show a gap.",
+        "confusable": "Record other motions, in which the effects and the changed parameters act differently.",
+        "effect": "Record and diagnose other motions. If the cause is right, its estimates stay the same.",
     }
     return texts[result.verdict]
 
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
-    stopped = f"The search is not finished: it stopped after {result.search_seconds:.3g} s, and would go on with "
+    stopped = f"The time limit diagnosis.budget ended the search after {result.search_seconds:.3g} s. Not done: "
     text = [_gap(result), _listed(stopped, result.untried)]
     if result.verdict not in ("insufficient_data", "no_gap"):
-        text += [_places(result), *_causes(result), *_remains(result)]
+        (error, change), found = _remains(result), [_places(result), *_causes(result)]
+        text += [*found, error, change] if result.accepted_effects else [error, *found, change]
     if result.law is not None:
         text.append(result.law.sentence)
     text += [*map(held_out_truncation_message, result.truncated_recordings)]
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
-    step = f"Steps of {stated} s are too long here, so this result is for {used} s"
-    links = "The error of few links looks like a gap. It was removed here; other commands need more links."
+    step = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
+    links = "Too few links cause an error like a gap. The diagnosis removed it; for other commands, add links."
     notes = (
         (stated != used, f"{step} (set problem.time_step: {used} for other commands)."),
         (result.is_corrected_for_links, links),
-        (result.is_split_in_blocks, "No recording could be held out, so every second block of time is held out."),
+        (result.is_split_in_blocks, "No whole recording could be held out, so every second block of time is held out."),
     )
     text += _applying(notes)
     events = [f"{e.channel} at {e.start_time:.2f} s of '{e.recording}'" for e in result.events.disturbances]
-    text += [_listed("Brief disturbances were left out: ", events), *overspeed_truncation_messages(result.events)]
-    return "\n".join(filter(None, [*text, f"Next experiment: {result.next_experiment}"]))
+    text += [_listed("Brief disturbances (pushes, wrong samples) were excluded: ", events)]
+    text += [*overspeed_truncation_messages(result.events), f"Next experiment: {result.next_experiment}"]
+    return "\n".join(filter(None, text))
 
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
-    used = f"Only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of '{cut.recording}' are used"
-    return f"{used}: the simulation of the nominal model fails later on."
+    used = f"Only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out '{cut.recording}' are used"
+    return f"{used}: after that, the simulation of the nominal model fails."
 
 
 def overspeed_truncation_messages(events: EventSet) -> list[str]:
     """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
-    said, why = "s are ignored in", "moves too fast for the model."
-    return [f"Data after {e.start_time:.3g} {said} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
+    ignored, why = "s are ignored in", "is faster than diagnosis.max_joint_speed."
+    return [f"Data after {e.start_time:.3g} {ignored} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
 
 
 def _listed(beginning: str, names: Iterable[str], end: str = ".", **limit: int) -> str:
@@ -112,24 +113,24 @@ def _gap(result: DiagnosisResult) -> str:
     """Sentence on whether there is a gap."""
     tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
     fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
-    sizes = f"chi2 per degree of freedom {fitted}, held out {other}; noise alone gives 1"
+    sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
     p_value = min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    p_text, detectable = _p_value_relation(p_value), f"{sum(seen)} of {len(seen)} candidates are detectable"
-    said = f"{tests[0].degrees_of_freedom:.0f} effective samples for {unknowns} unknowns; {detectable}"
+    p_text, detectable = _p_value_relation(p_value), f"{sum(seen)} of {len(seen)} effects would be detectable"
+    said = f"{tests[0].degrees_of_freedom:.0f} independent samples for {unknowns} unknowns, and {detectable}"
     texts = {
-        "insufficient_data": f"The data are insufficient: {said}.",
-        "no_gap": "\n".join([f"The recordings show no relevant gap ({sizes}; p {p_text}).", *_why_no_gap(result)]),
+        "insufficient_data": f"The recordings are insufficient for a diagnosis: {said}.",
+        "no_gap": "\n".join([f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)]),
     }
     if result.verdict in texts:
         return texts[result.verdict]
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
-        return f"The gap is real{only} ({sizes}; p {p_text})."
+        return f"The nominal model has an error beyond noise (a gap){only}: {sizes} (p {p_text})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
-    small = f"not along what {best.effect.label} would do (p {_p_value_relation(p_value)})"
-    return f"As a whole the recordings are explained to within their noise ({sizes}), but {small}."
+    small = f"But the error has the pattern of {best.effect.label} (p {_p_value_relation(p_value)})"
+    return f"In total the error of the nominal model is within noise: {sizes}. {small}."
 
 
 def _why_no_gap(result: DiagnosisResult) -> list[str]:
@@ -139,10 +140,10 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
     needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
-    small = f"The excess over noise is significant, but too small for a gap, which needs {needs}."
-    seen = f"A residual along {''.join(best)} is significant (p {_p_value_relation(along)})"
+    small = f"The error is significantly larger than noise, but not enough for a gap, which needs {needs}."
+    seen = f"The error resembles that of {''.join(best)} more than noise would (p {_p_value_relation(along)})"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
-    narrow = f"{seen}, but it counts as a gap only with an accepted effect."
+    narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
     blind = _listed("These motions would not show the following effects, even if they exist: ", unseen)
     return _applying([(is_significant, small), (along < level, narrow), (bool(unseen), blind)])
@@ -151,39 +152,39 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
 def _places(result: DiagnosisResult) -> str:
     """Sentence on the gap's locations, with inseparable locations together."""
     where = [place for place in select_largest_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
-    named = [f"{' or '.join([p.location, *p.indistinguishable_from])} ({100 * p.gap_share:.0f} %)" for p in where]
-    if not named:
-        return "These data cannot locate it."
+    parts = [(p.gap_share, " or ".join([p.location, *p.indistinguishable_from])) for p in where]
+    if not parts:
+        return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
-    rest = 1 - sum(place.gap_share for place in where)
-    named += [f"elsewhere ({100 * rest:.0f} %)"] * (rest >= 0.005)
+    parts += [(rest, "elsewhere")] if (rest := 1 - sum(place.gap_share for place in where)) >= 0.005 else []
+    named = ", ".join(f"{100 * part:.0f} % comes from {place}" for part, place in parts)
     side = _GAP_ORIGIN_PHRASES.get(result.smoother_result.plant_or_sensor_origin, "")
-    return f"It lies in {', '.join(named)}{side}."
+    return f"Of the error beyond noise that can be located, {named}{side}."
 
 
 def _causes(result: DiagnosisResult) -> list[str]:
     """Sentences on the selected effects, and on why the verdict is unknown."""
     added, total = result.selected_effects, result.closure_by_selected_effects
-    limits, text = result.thresholds, list[str]()
+    limits, text, s = result.thresholds, list[str](), "s" if len(added) == 1 else ""
+    names = " and ".join(entry.effect.label for entry in added)
     if added:
-        *first, last = (entry.effect.label for entry in added)
-        names = f"{', '.join(first)} and {last} together close" if first else f"{last} closes"
-        part = "an unknown part of the gap on held-out motions"
+        part = "an unknown part of the error beyond noise on held-out motions"
         if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
             part += ", because the nominal model's error there is within noise"
         if math.isfinite(total.ci_low):
             interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
-            part = f"{100 * total.fraction:.3g} % of the gap on held-out motions ({interval})"
-        text += [f"{names} {part}:", *(_named(entry.effect, added[-1].refitted_model, limits) for entry in added)]
-    for own, *others in (entry.equivalent_effects for entry in result.accepted_selected_effects):
-        text.append(_listed(f"These recordings cannot distinguish {own.label} from ", [o.label for o in others]))
+            part = f"{100 * total.fraction:.3g} % of the error beyond noise on held-out motions ({interval})"
+        text += [f"{names} remove{s} {part}:", *(_named(e.effect, added[-1].refitted_model, limits) for e in added)]
+    rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
+    text += [_listed(f"These recordings cannot distinguish {own} from ", others) for own, *others in rivals]
+    causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
     explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
     reasons = {
-        "": f"The probability that the true cause is named here is {100 * result.probability:.0f} %.",
-        "none": "None of the effects that were tried explains it well enough.",
-        "little": f"This explains {explained:.3g} % of the gap in the fitted motions; a cause needs {enough:.3g} %.",
-        "stand_in": f"This only imitates the cause, because it changes with the recordings: {'; '.join(apart)}.",
+        "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
+        "none": "None of the effects that were tried explains the error well enough, so no cause is named.",
+        "little": f"On fitted motions, {names} explain{s} {explained:.3g} % of the error; {enough:.3g} % is needed.",
+        "stand_in": f"No cause is named, because estimates differ between recordings: {'; '.join(apart)}.",
     }
     return [*text, reasons[result.unknown_reason], _several_places(result)]
 
@@ -210,8 +211,8 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         for name in own.amplitude_parameter_names:
             by = mask_of_priors_determining_unknown(data, priors, names.index(name))
             others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
-        beside = f"These motions determine {own.label} only in relation to "
-        text.append(_listed(beside, others, ": state one of them exactly."))
+        beside = f"To determine {own.label}, measure and fix (`free: false`) one of these parameters: "
+        text.append(_listed(beside, others))
     return text
 
 
@@ -233,20 +234,21 @@ def _remains(result: DiagnosisResult) -> list[str]:
     noise = {own.channel: own.noise_rmse for own in result.noise_floor}
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
-    worst = {unit: f"{math.sqrt(square):.2g} {unit} (rms without noise) at {name}" for square, name, unit in beyond}
-    mostly = (f"most of it in {place.location}" for place in result.remaining_gap_locations[:1])
-    what = f"{'What remains' if result.accepted_effects else 'The error of the nominal model'} on held-out motions"
-    said = "is within noise and the uncertainty of the parameters"
+    worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in beyond}
+    mostly = "".join(f". Most of this comes from {place.location}" for place in result.remaining_gap_locations[:1])
+    effects = abbreviated_names_text([effect.label for effect in result.accepted_effects])
+    who = f"On held-out motions, the error of the {f'model with {effects}' if effects else 'nominal model'} is"
+    said = "within noise and the uncertainty of the parameters"
     if result.remaining_test.p_value < result.thresholds.significance_level:
-        said = f"exceeds noise: {', '.join([*worst.values(), *mostly])}"
+        said = f"{', '.join(worst.values())} (rms, noise subtracted){mostly}"
     changes = sorted(result.nominal_parameters_before_and_after.items(), key=lambda own: -_relative_change(own[1]))
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
         for name, own in changes
         if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
-    change = _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)
-    return [f"{what} {said}.", change]
+    change = _listed("If the effects are in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)
+    return [f"{who} {said}.", change]
 
 
 def _relative_change(own: Mapping[str, Any]) -> float:
@@ -265,21 +267,21 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         rivals = abbreviated_names_text(result.confusable_parameter_changes)
         alike = [f"a change of {rivals} explains the recordings about as well as the effects"] * bool(rivals)
         moved = [*moved, *alike] or ["no parameter has changed detectably"]
-        text.append(_listed("Against the baseline, ", moved))
-        differ = f"The runs of the baseline differ among themselves (p = {since.between_runs_p_value:.2g})"
-        small = "The model did not explain the baseline's recordings, so its ± may be too small."
-        notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}; their ± includes this.")
+        text.append(_listed("Since the baseline, ", moved))
+        differ = f"The runs of the baseline differ from each other (p = {since.between_runs_p_value:.2g})"
+        small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
+        notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}; the ± of the baseline includes this.")
         text += _applying([notes, (not since.is_baseline_explained, small)])
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
     for how, part in parts.items():
-        made = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
-        made = f"Recordings made {how} the effects ({made})"
+        names = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
+        made = f"Recordings made {how} the effects ({names})"
         plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
         if part.failure_message:
             text.append(f"{made} could not be predicted ({part.failure_message}).")
             continue
-        errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by that before the diagnosis"
+        errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by the model before the diagnosis"
         text.append(f"{made} are predicted with an error of {errors}.")
         if not part.is_improved_by_counterfactual:
-            text.append("The effects do not lower this error, so they may be a substitute for another cause.")
+            text.append(f"The effects do not lower the error on {names}, so another cause may be the true one.")
     return text

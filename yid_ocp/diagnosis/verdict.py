@@ -40,7 +40,7 @@ class EffectAmplitudeTransferCheck:
     @property
     def both_estimates_text(self) -> str:
         """A text with both estimates, their standard deviations and unit."""
-        here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
+        here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the fitted recordings"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
