@@ -56,7 +56,7 @@ def test_too_few_links_are_told_and_counted(coarse):
     assert -error < moved < -0.4 * error
     said = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[coarse[1]["format"]](coarse[1])))
     assert "with twice the links these estimates change by more than their" in said
-    assert re.search(r"twice the links would remove 3\d % of the misfit beyond noise: double `links`", said)
+    assert re.search(r"twice the links would remove 3\d % of the error beyond noise: first double `links`", said)
 
 
 def test_python_and_shell_say_the_same(coarse):
@@ -140,4 +140,4 @@ def test_the_error_of_few_links_is_no_gap_alone_or_beside_an_effect(tmp_path, la
     found = yid.diagnose(yid.load_problem(file), ("density", "camera_latency"))
     assert [effect.label for effect in found.accepted_effects] == causes
     assert (found.is_corrected_for_links, found.remaining_test.chi2_per_dof < 1.5) == (True, True)
-    assert "The error of few links looks like a gap" in found.summary
+    assert "Too few links cause an error like a gap" in found.summary

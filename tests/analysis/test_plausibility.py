@@ -297,18 +297,18 @@ TURN = np.array([[0.9, -np.sqrt(0.19), 0.0], [np.sqrt(0.19), 0.9, 0.0], [0.0, 0.
 HELD = {
     "as recorded": (1, lambda p: p, None, ""),
     "as recorded by two": (2, lambda p: p, None, ""),
-    "mirrored": (1, lambda p: MIRROR * p, "point_mirrored", "(x, -y, z) for (x, y, z), a mirror image, they are"),
-    "turned about x": (1, lambda p: p * [1, -1, -1], "point_mirrored", "with (x, -y, -z) for (x, y, z) they are"),
-    "axes exchanged": (2, lambda p: p[..., [1, 0, 2]], "point_mirrored", "(y, x, z) for (x, y, z), a mirror"),
+    "mirrored": (1, lambda p: MIRROR * p, "point_mirrored", "replaced by (x, -y, z) (a mirror image), they"),
+    "turned about x": (1, lambda p: p * [1, -1, -1], "point_mirrored", "replaced by (x, -y, -z), they are"),
+    "axes exchanged": (2, lambda p: p[..., [1, 0, 2]], "point_mirrored", "replaced by (y, x, z) (a mirror"),
     "shifted": (2, lambda p: p + np.array([0.1, 0.0, 0.2]), "point_frame", "shifted by (-0.1"),
     "turned": (2, lambda p: p @ TURN.T, "point_frame", "turned by 25.8 degrees"),
-    "exchanged": (2, lambda p: p[:, ::-1], "point_swapped", "w_T2 and w_T3 exchanged"),
+    "exchanged": (2, lambda p: p[:, ::-1], "point_swapped", "w_T2 and w_T3 are exchanged"),
     "walking away": (1, lambda p: p + WALK[: len(p)], "point_unlike", "and no simple change explains it"),
 }
 # millimetres, centimetres, inches, decimetres and feet, and read as such
 for unit in (1e-3, 1e-2, 0.0254, 0.1, 0.3048):
     for scale in (unit, 1 / unit):
-        HELD[f"times {scale:.3g}"] = (2, lambda p, by=scale: by * p, "point_scale", f"; divided by {scale:g} they are")
+        HELD[f"times {scale:.3g}"] = (2, lambda p, by=scale: by * p, "point_scale", f"if divided by {scale:g}, they")
 
 
 @pytest.mark.parametrize("case", HELD)
@@ -318,7 +318,7 @@ def test_points_that_the_arm_holds(arms, runs, case):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         assert words in doubt.what
-        assert doubt.what.endswith("explains it" if case == "walking away" else f"they are 0.001{6 + count} m away")
+        assert doubt.what.endswith("explains it" if case == "walking away" else f"0.001{6 + count} m from the model")
         [group] = (group for group in runs[count].points if group.name == "points_arm")
         apart = np.linalg.norm(change(group.position) - group.position, axis=2)
         assert doubt.group == "points_arm"
@@ -333,7 +333,7 @@ def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, 
     (doubt,) = forward_kinematics_issues(arms[1], moved, usual)
     name = arms[1].joint_names[joint]
     assert (doubt.cause, doubt.group, doubt.channel) == ("encoder_offset", "joints", f"position.{name}")
-    size, found = re.search(r"([-+\d.]+) rad more.*location: (\S+, .*)}}", f"{doubt.what} {doubt.setting}").groups()
+    size, found = re.search(r"([-+\d.]+) rad are.*location: (\S+, .*)}}", f"{doubt.what} {doubt.setting}").groups()
     assert float(size) == pytest.approx(-offset, abs=2e-4)
     assert found == f"{name}, values: {{offset: {-float(size):.3g}"
 
@@ -351,7 +351,7 @@ def test_points_may_be_as_far_off_as_they_are_said_to_be(arms, runs, std, is_kno
 
 def test_clocks_that_are_far_apart(arms, runs):
     (doubt,) = forward_kinematics_issues(arms[2], stamped(runs[2], 0.2, -0.05), usual)
-    assert "with times +0.202 s off the joints' clock, and -52.4 parts per thousand fast" in doubt.what
+    assert "if their times are +0.202 s off the joints' clock and -52.4 parts per thousand fast" in doubt.what
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
     (doubt,) = forward_kinematics_issues(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert (doubt.cause, doubt.limit_violation_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
@@ -446,7 +446,7 @@ def test_half_a_turn_is_told_as_such_although_its_cosine_may_be_rounded_below_mi
     rng = np.random.default_rng(seed)
     place, axis = rng.standard_normal((20, 2, 3)), rng.standard_normal(3)
     turned = 2 * np.multiply.outer(place @ axis, axis) / (axis @ axis) - place
-    assert [change.words for change in _moved(turned, place)][1] == "turned by 180 degrees and shifted"
+    assert [change.words for change in _moved(turned, place)][1] == "if turned by 180 degrees and shifted"
 
 
 def test_a_held_object_loads_a_joint_by_its_lever(drives):
@@ -513,12 +513,12 @@ def applied(pose):
 
 ROLLED = {
     "as predicted": (lambda p: p + 0.1, True, None, ""),
-    "in the camera's frame": (applied(BACK), True, "point_frame", "with the camera's pose applied"),
-    "pose inverted": (applied(BACK @ BACK), True, "point_frame", "with the camera's pose inverted"),
-    "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis reversed"),
+    "in the camera's frame": (applied(BACK), True, "point_frame", "if the camera's pose is applied"),
+    "pose inverted": (applied(BACK @ BACK), True, "point_frame", "if the camera's pose is inverted"),
+    "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis is reversed"),
     "no pose is known": (applied(BACK), False, None, ""),
     "in millimetres": (lambda p: 1e3 * p, False, "point_scale", "divided by 1000"),
-    "exchanged": (lambda p: p[:, [1, 0, 2]], False, "point_swapped", "with a and b exchanged"),
+    "exchanged": (lambda p: p[:, [1, 0, 2]], False, "point_swapped", "if a and b are exchanged"),
     "elsewhere": (lambda p: p + 5.0 * np.sin(np.arange(3))[:, None], True, None, ""),
 }
 
@@ -637,7 +637,7 @@ def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):
     assert (doubt.cause, doubt.channel, doubt.recording) == ("weak_excitation", "position.elbow", "held")
     assert doubt.setting == "parameters.elbow.stiffness.free: false; parameters.elbow.damping.free: false"
     assert doubt.limit_violation_ratio == pytest.approx(QUALITY_LIMITS.min_joint_motion / 0.006, rel=1e-3)
-    assert "elbow turns by 0.006 rad at most, in held" in doubt.what
+    assert "elbow turns by at most 0.006 rad, in held" in doubt.what
     assert list(joint_excitation_issues([held, recording], asked, USUAL)) == []
     assert list(joint_excitation_issues([recording, held], asked, USUAL)) == []
     assert list(joint_excitation_issues([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []

@@ -418,8 +418,8 @@ def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
     [
         (None, True, "not known"),
         (math.nan, False, "not known"),
-        (1.0449, True, "explains the recordings to within their noise (chi2 per degree of freedom is 1.04)"),
-        (9.0, False, "does not explain the recordings (chi2 per degree of freedom is 9, 1 is noise alone)"),
+        (1.0449, True, "explains the recordings to within their noise (chi2 per degree of freedom is 1.04; noise alone gives 1)"),
+        (9.0, False, "does not explain the recordings (chi2 per degree of freedom is 9; noise alone gives 1)"),
     ],
 )
 def test_a_fit_is_told_with_its_misfit(chi2, explains, words):

@@ -83,8 +83,8 @@ def test_a_verdict_reads_alike_in_every_command(said):
 def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", solved())
     assert "cannot be found from these recordings: p_not_identifiable" in lines
-    assert "only weakly determined: p_weak" in lines
-    good = "the model explains the recordings to within their noise (chi2 per degree of freedom is 1.03)"
+    assert "only weakly determined, so use the 95 % interval: p_weak" in lines
+    good = "the model explains the recordings to within their noise (chi2 per degree of freedom is 1.03; noise alone gives 1)"
     assert lines[-2] == good
     assert all(fact in lines[-1] for fact in ("converged", "done", "4 iterations", "1.0 s"))
     assert any(line.startswith("Recorded torques") for line in told("yid-solve/1", solved(unused_efforts=True)))
@@ -103,24 +103,24 @@ def test_a_solve_says_what_is_not_found():
     assert "±" not in "".join(lines[1:-4])
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
-    assert "the values are the best point that was reached; their uncertainty is unknown" in lines
+    assert "the fit failed: do not use the values, which are the best that were reached; their ± is unknown" in lines
 
 
 def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     worse = {"recording": "run", "channel": "w_T2", "rmse": 0.05, "unit": "m", "baseline": "stays", "guess": 0.02}
     said = solved(fit=BAD, parameters={"a": parameter("not_trusted")})
-    first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7, 1 is noise alone); run "
-    first += "`yid-ocp diagnose`"
+    first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7; noise alone gives 1); "
+    first += "to find the cause, run `yid-ocp diagnose`"
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    sure = "only if no effect is missing are these known to within 10 %, with the misfit in the ±: a = 2 ± 0.1"
+    sure = "use these values only if no effect is missing; their ± (up to 10 %) has the model error: a = 2 ± 0.1"
     assert lines[:2] == [first, f"{sure} N m/rad"]
     unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
     assert "no value is known to within 10 %" in told("yid-solve/1", unsure)[1]
-    assert "to within 10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"data_trusted": False}})[1]
+    assert "10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"data_trusted": False}})[1]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
     lines = told("yid-solve/1", said)
-    worse = "worse than a guess without a model: w_T2 of run, 50 mm against 20 mm (stays)"
+    worse = "larger than that of a guess without a model: w_T2 of run, 50 mm instead of 20 mm (stays)"
     assert (lines[0], worse in lines[2], "; 2 more in" in " ".join(lines[2:5])) == (first, True, True)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in lines[:6]
@@ -132,18 +132,18 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
 @pytest.mark.parametrize(
     ("error", "noise", "fit", "said"),
     [
-        (0.012, 0.010, GOOD, ". This is no gap: torque noise of the stated size accounts for 10 mm"),
-        (0.012, 0.002, GOOD, ". This is a gap: noise accounts for 2 mm; run `yid-ocp diagnose`"),
+        (0.012, 0.010, GOOD, "; torque noise of the stated size accounts for 10 mm, so there is no gap. A guess "),
+        (0.012, 0.002, GOOD, "; noise accounts for 2 mm, so there is a gap: run `yid-ocp diagnose` before you"),
         (0.003, 0.002, GOOD, None),
-        (0.003, 0.0027, GOOD, ". This is no gap: torque noise of the stated size accounts for 2.7 mm"),
-        (0.003, 0.002, BAD, ". Noise accounts for 2 mm"),
+        (0.003, 0.0027, GOOD, "; torque noise of the stated size accounts for 2.7 mm, so there is no gap. A guess "),
+        (0.003, 0.002, BAD, "; noise accounts for 2 mm. A guess without a model has 30 mm (every reading keeps"),
     ],
 )
 def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
     own = "points.p"
     entry = {"recording": "r", "rmse": {own: error}, "baselines": {"stays": {own: 0.03}}, "expected": {own: noise}}
     known = {"residuals": {own: {"rmse": 0.0018, "unit": "m", "n": 9}}, "torque_offsets": {"r": {}}}
-    head = f"errors of points (rms): {1e3 * error:.3g} mm on held-out recordings, 1.8 mm on fitted ones; without "
+    head = f"points: rms error {1e3 * error:.3g} mm on held-out recordings, 1.8 mm on fitted ones; "
     text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:5]))
     assert (head in text) == (said is not None)
     assert said is None or said in text
@@ -189,8 +189,8 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
     methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
-    assert lines[0].startswith("values by single_shooting, late are not trusted, as they ignore the noise that drives")
-    assert "a is 9 ± 0.1 N m/rad, not 7 (single_shooting)" in lines
+    assert lines[0].startswith("do not use values by single_shooting, late: they ignore noise of the inputs")
+    assert "a is 9 ± 0.1 N m/rad by `solve`, but 7 by single_shooting" in lines
     assert "late: no values, because the time was up before the first iteration" in lines
     assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "verdict"]
     assert "a          7                stopped  9 ± 0.1  found" in lines
@@ -234,7 +234,7 @@ def test_tables_are_aligned_without_empty_columns():
     assert lines == ["a   long head", "--  ---------", "1   x", "22"]
     recording = Recording(JointGroup(("a", "b"), np.array([0.0, 0.1]), np.zeros((2, 2))))
     *_, row, _, end = terminal.recording_summary_lines(recording)
-    assert (row.split(), end) == (["joints", "2", "10", "0.1", "position", "[rad]", "a,", "b"], "0.1 s")
+    assert (row.split(), end) == (["joints", "2", "10", "0.1", "position", "[rad]", "a,", "b"], "duration: 0.1 s")
 
 
 def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():

@@ -248,7 +248,7 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
     made = moved(SHORT)
     commands = np.vstack([made.joints.position[6:], np.tile(made.joints.position[-1:], (6, 1))])
     run = proposed(replace(made, joints=replace(made.joints, position_command=commands)))
-    assert "mode: servo: commanded positions were recorded" in capsys.readouterr().out
+    assert "mode: servo (commanded positions were recorded" in capsys.readouterr().out
     assert (run.model.arms.mode, run.model.arms.servo.command_interpolation) == ("servo", "held")
     system = build_system(run)
     assert set(system.servos) == set(system.driven) == {"roll", "pitch"}

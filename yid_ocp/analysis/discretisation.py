@@ -309,8 +309,8 @@ def parameter_shifts_at_finer_discretisation(
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
             least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
             if not model_difference_only and excess - rest > least:
-                said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the misfit beyond noise"
-                notes.append(f"{said}: {_REFINED_SETTINGS[key]}")
+                said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise"
+                notes.append(f"{said}: first {_REFINED_SETTINGS[key]} and run `solve` again")
     if kinds and not model_difference_only and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()

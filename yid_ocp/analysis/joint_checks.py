@@ -247,9 +247,9 @@ def slow_motion_excitation_issues(
     seen = float(np.sqrt(len(joints.t) * np.sum((size / noise) ** 2)))
     if seen < _MIN_SIGNAL_STDS:
         j = int(np.argmax(size / noise))
-        asked = f"speed and acceleration require {size[j]:.2g} N m (rms) of {arm.joint_names[j]}, the best joint"
-        words = f"{asked}; noise between samples is {noise[j]:.2g} N m"
-        advice = "move faster; static configurations determine weight and stiffness, not damping, friction or inertia"
+        asked = f"even at {arm.joint_names[j]}, the best joint, speed and acceleration require only {size[j]:.2g} N m"
+        words = f"{asked} (rms), and noise between samples is {noise[j]:.2g} N m"
+        advice = "move faster; slow motions determine weight and stiffness, not damping, friction or inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
 
@@ -275,9 +275,9 @@ def joint_excitation_issues(
             if not name or width > widest:
                 widest, name = width, recording.name
         if name and widest < limit:
-            least = f"{limit:.2g} rad is the least that distinguishes {', '.join(parameters)} from a constant effort"
-            words = f"{joint} turns by {widest:.2g} rad at most, in {name}; {least}"
-            advice, depth = f"record a motion that turns {joint}, or fix {parameters[0]}", limit / max(widest, 1e-9)
+            least = f"from {limit:.2g} rad on, {', '.join(parameters)} can be distinguished from a constant effort"
+            words = f"{joint} turns by at most {widest:.2g} rad, in {name}; only {least}"
+            advice, depth = f"turn {joint} further, or fix {' and '.join(parameters)}", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
             where = name, "joints", f"position.{joint}"
             yield Issue("weak_excitation", words, "warning", depth, advice, *where, setting=line)
@@ -415,8 +415,8 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
         strange = f"efforts of {lost.sum()} of {len(names)} joints do not match this robot and motion"
-        words = f"{strange}: {left:.2g} times the usual model error"
-        advice = "check that the recording is of this robot, its unit of time, and the order of its joints"
+        words = f"{strange}: errors are {left:.2g} times the usual model error ({', '.join(np.array(names)[lost])})"
+        advice = "check that the recording is of this robot, and check its unit of time and the order of its joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
 
@@ -446,7 +446,7 @@ def _offsets(data: _Data, fit: _EffortFit, told: BoolArray) -> Iterator[Issue]:
             words = f"the effort of {name} has a constant error of {value:+.3g} N m"
             depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
             setting = known_effect_config_line("effort_offset", name, "offset", value)
-            yield _issue("effort_offset", words, depth, "estimate it, or correct the sensor's zero", name, setting)
+            yield _issue("effort_offset", words, depth, "estimate it, or correct the zero", name, setting)
 
 
 def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
@@ -467,7 +467,7 @@ def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         words = f"efforts fit the motion best if their times are {abs(lag):.2g} s {when}"
         lines = [known_effect_config_line("effort_delay", name, "delay", lag) for name in arms]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
-        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
+        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift the times of efforts", setting=setting)
 
 
 def _fitted(data: _Data) -> _EffortFit:

@@ -101,9 +101,9 @@ def _explained(
     error, far = _rms(apart), ", ".join(name for i, name in enumerate(names) if _rms(apart[:, i]) > allowed)
     best = min((change.error for change in changes), default=math.inf)
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
-    words, depth = f"points ({far or 'all'}) are {error:.3g} m (rms) away from the model", error / allowed
+    words, depth = f"points ({far or 'all'}) are {error:.3g} m (rms) from the model", error / allowed
     for chosen in good:
-        words = f"{words}; {chosen.words} they are {chosen.error:.2g} m away"
+        words = f"{words}; {chosen.words}, they are {chosen.error:.2g} m from the model"
         place = recording, "joints" if chosen.channel else group, chosen.channel
         return Issue(chosen.cause, words, "not_trusted", depth, chosen.advice, *place, setting=chosen.setting)
     words = f"{words}, and no simple change explains it"
@@ -124,7 +124,7 @@ def _rms(difference: Array) -> float:
 def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     """Yield corrections: another unit of length, or axes exchanged or flipped about the world's origin."""
     for scale in _UNIT_SCALES:
-        words = f"divided by {scale:g}"
+        words = f"if divided by {scale:g}"
         yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
     errors = {turn: _rms(seen[..., list(turn[0])] * np.array(turn[1]) - place) for turn in list(turns)[1:]}
@@ -132,15 +132,16 @@ def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     order, signs = min(reversed(errors), key=lambda turn: errors[turn])
     axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
     mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
-    words = f"with ({axes}) for (x, y, z){', a mirror image,' if mirror else ''}"
-    yield _Change("point_mirrored", words, f"use ({axes}) for (x, y, z)", errors[order, signs])
+    words = f"if (x, y, z) is replaced by ({axes}){' (a mirror image)' if mirror else ''}"
+    advice = f"replace x, y, z of the points by {axes} and import them again"
+    yield _Change("point_mirrored", words, advice, errors[order, signs])
 
 
 def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[_Change]:
     for i, j in itertools.combinations(range(len(names)), 2):
         order = list(range(len(names)))
         order[i], order[j] = j, i
-        words = f"with {names[i]} and {names[j]} exchanged"
+        words = f"if {names[i]} and {names[j]} are exchanged"
         advice = f"exchange the names of {names[i]} and {names[j]}"
         yield _Change("point_swapped", words, advice, _rms(seen[:, order] - place))
 
@@ -153,12 +154,12 @@ def _changed_times(
     late, _, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
-        words, advice = f"with times {late:+.3g} s off the joints' clock", f"subtract {late:.3g} s from their times"
-        yield _Change("clock_offset", words, advice, error)
+        words = f"if their times are {late:+.3g} s off the joints' clock"
+        yield _Change("clock_offset", words, f"subtract {late:.3g} s from their times", error)
         return
     late, drift, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
-        words = f"with times {late:+.3g} s off the joints' clock, and {1e3 * drift:+.3g} parts per thousand fast,"
+        words = f"if their times are {late:+.3g} s off the joints' clock and {1e3 * drift:+.3g} parts per thousand fast"
         yield _Change("clock_drift", words, clock_checks.timestamp_correction_advice(late, drift, middle), error)
 
 
@@ -181,7 +182,7 @@ def _changed_zeros(
             place, by_angle = arm.frame_positions_and_jacobians(frames, moved)
         else:
             setting = known_effect_config_line("encoder_offset", name, "offset", -offset)
-            words, advice = f"with {offset:+.3g} rad more at {name}", f"set the zero of {name}, or let it be estimated"
+            words, advice = f"if {offset:+.3g} rad are added to {name}", f"set the zero of {name}, or estimate it"
             found.append(_Change("encoder_offset", words, advice, _rms(seen - place), setting, f"position.{name}"))
     yield from sorted(found, key=lambda change: change.error)[:1]
 
@@ -194,13 +195,13 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
         return
     shift = b.mean(axis=0) - a.mean(axis=0)
     words = "shifted by ({:.3g}, {:.3g}, {:.3g}) m".format(*shift)
-    yield _Change("point_frame", words, f"give positions in the robot's frame: {words}", _rms(a + shift - b))
+    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame: {words}", _rms(a + shift - b))
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     turn = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
     left = _rms((a - a.mean(axis=0)) @ turn + b.mean(axis=0) - b)
     angle = math.degrees(math.acos(float(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
     words = f"turned by {angle:.3g} degrees and shifted"
-    yield _Change("point_frame", words, f"give positions in the robot's frame: {words}", left)
+    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame: {words}", left)
 
 
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
@@ -288,14 +289,14 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
         return seen @ by[:3, :3].T + by[:3, 3]
 
     advice = "give positions in the world, not in the camera's frame"
-    yield _Change("point_frame", "with the camera's pose applied", advice, _rms(moved(pose) - place))
-    turned, advice = "with the camera's pose inverted", "invert the pose: it must be that of the camera in the world"
+    yield _Change("point_frame", "if the camera's pose is applied", advice, _rms(moved(pose) - place))
+    turned, advice = "if the camera's pose is inverted", "invert the pose: it must be that of the camera in the world"
     yield _Change("point_frame", turned, advice, _rms(moved(pose @ pose) - place))
     for i, axis in enumerate("xyz"):
         flip = np.eye(4)
         flip[i, i] = -1
-        words = f"with the camera's {axis} axis reversed"
-        yield _Change("point_mirrored", words, words, _rms(moved(pose @ flip @ back) - place))
+        words, advice = f"if the camera's {axis} axis is reversed", f"reverse the camera's {axis} axis"
+        yield _Change("point_mirrored", words, advice, _rms(moved(pose @ flip @ back) - place))
 
 
 def cable_point_geometry_issues(cable: CableVertices, recording: Recording, gravity: Array) -> Iterator[Issue]:

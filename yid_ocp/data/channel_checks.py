@@ -77,8 +77,8 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         if evidence >= 1:
             start, stop = float(t[begin]), float(t[end])
             what = f"{channel} repeats one value for {stop - start:.3g} s"
-            what += f", while by its velocity it turns by {turned:.2g} rad" if turned > unseen else ""
-            advice = "exclude this part or this channel, and check the sensor"
+            what += f", but the recorded velocity gives a turn by {turned:.2g} rad" if turned > unseen else ""
+            advice = "check the sensor; use only the other times (Python: Recording.time_slice) or other channels"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
@@ -225,7 +225,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             if alone and again and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
-                advice = "exclude the saturated samples, or record within the sensor's range; if the efforts are "
+                advice = "record within the sensor's range, or cut out these times; if the efforts are "
                 advice += "commands of a controller, set sensors.joints.effort.effort_sampling_kind: command"
                 yield Issue("saturated", what, "not_trusted", at.sum() / least, advice, "", group, channel, begin, end)
 

@@ -101,11 +101,11 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         fastest = float(np.max(speed))
         at_once = np.max(way) < _MAX_CLOCK_JUMP_PERIODS * median_sample_period(t) * fastest
         jumped = fastest * length > _MIN_JUMP_ROTATION and bool(at_once)
-    what = f"the data that drive the model have a gap of {length:.3g} s"
+    what = f"for {length:.3g} s there are no samples of the data that move the model"
     if jumped:
         what = f"the clock jumps by {length - median_sample_period(t):.3g} s while the joints continue smoothly"
     cause, group = "clock_jump" if jumped else "gap", "joints" if joints is not None else ""
-    advice = "find out why samples are missing, or list the wanted part as a separate recording"
+    advice = "find out why samples are missing, or write the wanted part to a file of its own (Recording.time_slice)"
     what, begin, end = f"{what}; {said}", float(t[gap]), float(t[gap + 1])
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
@@ -287,7 +287,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         moved.append(size / max(QUALITY_LIMITS.min_point_travel, noise))
     if max(moved, default=2.0) < 1.0:
         what = f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise"
-        advice = "record a motion; at rest only static parameters can be found"
+        advice = "record a motion; at rest only parameters of statics (weights, stiffnesses) can be found"
         yield Issue("standstill", what, "warning", 1 / max(*moved, 1e-3), advice, "")
 
 

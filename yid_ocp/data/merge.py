@@ -91,7 +91,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     shared = overlap >= _MIN_SHARED_FRACTION * shortest
     for recording in (first, other):
         _check_time_unit(recording, shortest, default="ms" if shared else "")
-    said = f"{first.name} and {other.name} are assumed to have one clock: their times overlap by {overlap:.4g} s"
+    said = f"{first.name} and {other.name} are taken to have one clock, because their times overlap by {overlap:.4g} s"
     seen, joints = _seen_path(other), first.joints
     best = at_zero = None
     if seen is not None and joints is not None and len(joints.t) >= _MIN_SAMPLES:

@@ -445,10 +445,10 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     """Return a sentence that states whether a model explains its recordings, with advice for a poor fit."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "whether the model explains the recordings is not known"
-    size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}"
+    size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}; noise alone gives 1"
     if explains:
         return f"the model explains the recordings to within their noise ({size})"
-    return f"the model does not explain the recordings ({size}, 1 is noise alone); run `yid-ocp diagnose`"
+    return f"the model does not explain the recordings ({size}); to find the cause, run `yid-ocp diagnose`"
 
 
 def value_and_uncertainty_text(

@@ -67,10 +67,11 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    yield "refitted candidates come first; closure alone: part of the held-out gap that a refit with this one closes"
+    yield "refitted candidates come first; closure alone: part of the held-out error beyond noise that this one removes"
     yield "the others are ordered by score (significance before a refit); p: probability of such a score by noise alone"
     yield f"{left} more candidates are in result.json" if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
-    yield f"not detectable in the data that are used: {', '.join(result['unseen'])}" if result.get("unseen") else ""
+    unseen = ", ".join(result.get("unseen", ()))
+    yield f"effects that these recordings cannot show, even if they exist: {unseen}" if unseen else ""
     for signals, kinds in result.get("not_candidates", {}).items():
         yield f"no candidates, because no recording has {signals}: {', '.join(kinds)}"
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
@@ -87,9 +88,9 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Errors on recordings made without and with the effects")
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     if any(own["severity"] != "warning" for own in result.get("issues", ())):
-        yield "issues of the recordings may have caused this verdict"
+        yield "issues of the recordings may have caused this verdict: correct the issues, then diagnose again"
     if result["next_plan"] is not None:
-        yield "to separate these effects, plan a motion:"
+        yield "to plan a motion that separates the effects which these recordings cannot distinguish:"
         yield CodeBlock(_planning_command(result["next_plan"]))
     yield from copyable_estimates_blocks(result)
     yield f"verdict: {verdict} ({sum(result['seconds'].values()):.1f} s)"
@@ -251,7 +252,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         drifted, wrong = _drifted_and_distrusted(alike)
         changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
         said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
-        said += [f"Distrust {', '.join(wrong)}: without it the others agree (far) better."] if wrong else []
+        said += [f"Do not trust {', '.join(wrong)}: the other runs agree (far) better without it."] if wrong else []
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
@@ -309,14 +310,15 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
     found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
     if result["disturbed"]:
-        words = f"values by {', '.join(methods)} are not trusted, as they ignore the noise that drives the motion"
-        yield f"{words}; `solve` includes it, and verdict and ± are those of its column"
+        words = f"do not use values by {', '.join(methods)}: they ignore noise of the inputs that move the model"
+        yield f"{words}. Use the column `solve`, which includes this noise; the verdicts are for this column"
         for name, entry in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
-            off = {m: v for m, v in values.items() if abs(v - entry["value"]) > 2 * (entry["std"] or 0.0)}
+            near = 2 * (entry["std"] or 0.0)
+            off = ", ".join(f"{v:.4g} by {m}" for m, v in values.items() if abs(v - entry["value"]) > near)
             if off:
                 said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
-                yield f"{name} is {said} {entry['unit']}, not {', '.join(f'{v:.4g} ({m})' for m, v in off.items())}"
+                yield f"{name} is {said} {entry['unit']} by `solve`, but {off}"
     if stopped:
         yield f"{', '.join(stopped)}: no values, because the time was up before the first iteration"
     if not fit["explains"]:
@@ -327,7 +329,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
         yield "no parameter can be found from these recordings, so there is nothing to agree on"
         yield "`yid-ocp identifiability CONFIG --what-if` lists measurements that would help"
     elif not result["agree"]:
-        yield "the methods do not agree on the parameters that are found"
+        yield "the methods do not agree on the parameters that are found; the reasons are below the tables"
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
@@ -369,7 +371,7 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "run", "chi2 from the others", "degrees of freedom", "p", "most in", "model explains it", ""
+    yield "run", "chi2 of difference from the others", "degrees of freedom", "p", "largest in", "model explains it", ""
     for entry in history["runs"]:
         apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
         yield entry["name"], *apart, "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
@@ -386,23 +388,23 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         p = _relation(result["p_value"])
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
     elif not drifted:
-        differ = f"The runs differ over all parameters together (p {_relation(result['p_value'])})"
-        yield f"{differ}, although no single parameter does significantly."
+        differ = f"All parameters together differ between the runs (p {_relation(result['p_value'])})"
+        yield f"{differ}, but no single parameter differs significantly."
     for name in drifted:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
         yield f"{name} is not the same in all runs: {ends} (p {_relation(entry['p_value'])})."
     if wrong:
-        yield f"Distrust {' and '.join(wrong)}: without it the others agree (far) better."
+        yield f"Do not trust {' and '.join(wrong)}: the other runs agree (far) better without it."
     elif drifted and len(runs) == 2:
-        yield "Two differing runs do not show which one is wrong; add a third."
+        yield "Two runs that differ do not show which one is wrong; add a third run."
     elif drifted:
         yield "No single run differs from the others."
     poor = [entry["name"] for entry in runs if not entry["explains"]]
     if poor:
         text = f"The model did not explain the recordings of {', '.join(poor)}"
-        yield f"{text}: their ± includes the misfit and may still be too small."
+        yield f"{text}. The ± of such a run includes the model error, but may still be too small."
 
 
 def _relation(p_value: float) -> str:
@@ -434,7 +436,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     none, names = f"no parameter differs by more than {_MAX_RUN_DIFFERENCE} std", abbreviated_names_text(differing)
     text = f"different by more than {_MAX_RUN_DIFFERENCE} std: {names}"
     yield SummaryStatement(text if differing else none, "verdict")
-    yield "std is the larger of the two; both runs have the same data, so this is no test of significance"
+    yield "a std is the larger one of both runs. Both have the same data, so this is no test of significance"
     rows = [("recording", "channel", first, second, "difference", "unit")]
     for entry in result["channels"]:
         three = (*entry["rmse"].values(), entry["difference"])

@@ -36,10 +36,10 @@ from yid_ocp.report.terminal import (
 )
 
 _BASELINE_DESCRIPTIONS = {
-    "stays": "readings keep their first value",
+    "stays": "every reading keeps its first value",
     "zero": "the effort is zero",
-    "moves_with_clamps": "points move with the mean of the clamps",
-    "linear_carry": "the cable carries the clamps' motion linearly",
+    "moves_with_clamps": "every point moves like the mean of the clamps that hold the cable",
+    "linear_carry": "the motion of a point is interpolated linearly between the clamps",
 }
 _MAX_DIRECTIONS = 8
 _MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
@@ -74,7 +74,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     yield from discretisation_shift_sentences(result)
     if failed:
-        said = "the values are the best point that was reached; their uncertainty is unknown"
+        said = "the fit failed: do not use the values, which are the best that were reached; their ± is unknown"
         yield SummaryStatement(said, "verdict")
     else:
         texts = *_found_and_lost(free), unused_efforts_sentence(result)
@@ -120,17 +120,18 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))
         sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
-        guess = f"; without a model {sizes[3]}, if {_BASELINE_DESCRIPTIONS.get(best, best)}" if best else ""
-        text = f"errors of {group} (rms): {sizes[0]} on held-out recordings, {sizes[1]} on fitted ones{guess}"
+        guess = f". A guess without a model has {sizes[3]} ({_BASELINE_DESCRIPTIONS.get(best, best)})" if best else ""
+        text = f"{group}: rms error {sizes[0]} on held-out recordings, {sizes[1]} on fitted ones"
         if noise is None or error is None or fitted is None:
             continue
         is_by_torques = bool(result.get("torque_offsets")) and noise**2 > (error**2 + fitted**2) / 2
         if not result["fit"]["explains"]:
-            yield f"{text}. Noise accounts for {sizes[2]}"
+            yield f"{text}; noise accounts for {sizes[2]}{guess}"
         elif error > _MAX_NOISE_RATIO * noise:
-            yield f"{text}. This is a gap: noise accounts for {sizes[2]}; run `yid-ocp diagnose`"
+            advice = "run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'"
+            yield f"{text}; noise accounts for {sizes[2]}, so there is a gap: {advice}{guess}"
         elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{text}. This is no gap: torque noise of the stated size accounts for {sizes[2]}"
+            yield f"{text}; torque noise of the stated size accounts for {sizes[2]}, so there is no gap{guess}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -165,7 +166,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
     yield from (f"held-out recording {name} could not be predicted: {why}" for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
-    yield f"guesses without a model: {legend}" if legend else ""
+    yield f"in the column 'without a model': {legend}" if legend else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -185,13 +186,13 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     found, weak, lost = (by[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
-        yield f"{text} or, near zero, of their usual size: {abbreviated_names_text(found)}"
+        yield f"{text} (near zero: of a typical value): {abbreviated_names_text(found)}"
     if lost:
         yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {abbreviated_names_text(lost)}"
     if weak:
-        yield f"only {VERDICT_TABLE_TEXTS['weak']}: {abbreviated_names_text(weak)}"
+        yield f"only {VERDICT_TABLE_TEXTS['weak']}, so use the 95 % interval: {abbreviated_names_text(weak)}"
         if any(free[name]["interval"] is None for name in weak):
-            yield "`yid-ocp identifiability` computes intervals for them, which may be asymmetric"
+            yield "`yid-ocp identifiability --intervals all` computes intervals of weak parameters more exactly"
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
@@ -225,7 +226,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"and {len(hidden) - _MAX_DIRECTIONS} more directions, in result.json"
     if not result["profiles"]:
-        yield "intervals of parameters are computed on request: --intervals NAME,NAME or --intervals all"
+        yield "for exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all"
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]", "note")]
@@ -242,7 +243,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    yield SummaryStatement(f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else "", "verdict")
+    said = f"not found if initial state and grasps were unknown: {', '.join(lost)}" if lost else ""
+    yield SummaryStatement(said, "verdict")
 
 
 @register_summary("yid-friction/1")
@@ -268,8 +270,8 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
-    text = f"the law '{best}' is chosen: it is the simplest whose error is within one standard error of the least; "
-    text += f"each kind of motion was held out in turn: {', '.join(result['kinds'])}"
+    text = f"use the law '{best}': it is the simplest whose held-out error is within one standard error of the least. "
+    text += f"Each kind of motion was held out in turn: {', '.join(result['kinds'])}"
     yield SummaryStatement(text, "conclusion")
     if not result["to_use"]:
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
@@ -496,9 +498,9 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Points", is_key_table=True)
     good = sum(not frame["reason"] for frame in result["frames"])
     spent = 1e3 * result["fit_seconds"]
-    said = result["refused"] or f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each"
+    said = result["refused"] or f"{good} of {len(result['frames'])} frames are used; a fit took {spent:.0f} ms"
     yield SummaryStatement(said, "verdict")
-    yield from (f"dropped {number}: {reason}" for reason, number in result["dropped"].items())
+    yield from (f"{count_with_noun(n, 'frame')} left out: {reason}" for reason, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
 
@@ -520,7 +522,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if gate is None:
         return
     if gate["status"] != "done":
-        yield f"the file is written, but its motion was not compared with a recording in MuJoCo: {gate['reason']}"
+        yield f"the file is written, but was not tested by a replay in MuJoCo: {gate['reason']}"
         return
     rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
@@ -528,5 +530,6 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
     yield SummaryTable(rows)
     if gate["fall"] is not None:
-        held = "held-out recordings" if gate["which"] == "held_out" else "the recordings that were fitted"
-        yield f"replayed in MuJoCo, the error beyond noise on {held} falls by {100 * gate['fall']:.3g} %"
+        held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
+        less = f"{100 * gate['fall']:.3g} % less error beyond noise on {held}"
+        yield f"replayed in MuJoCo, the exported model has {less} than the nominal model"

@@ -110,7 +110,7 @@ def p_value_text(p_value: float) -> str:
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
     issues = result.get("issues", ())
-    rows: TableRows = [("issue", "where", "certainty", "times its limit")]
+    rows: TableRows = [("issue", "where", "certainty", "factor beyond limit")]
     advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in issues):
         alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
@@ -118,11 +118,13 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
             left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
             where = entry["where"] + (f" and {left} more" if left else "")
             rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}"))
-            advice += [f"{words}: {entry['what']}; {entry['advice']}", CodeBlock(entry["setting"])]
+            configured = ". In the configuration:" if entry["setting"] else ""
+            advice += [f"{words}: {entry['what']}; {entry['advice']}{configured}", CodeBlock(entry["setting"])]
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
-    if any(entry["severity"] != "warning" for entry in issues):
-        yield SummaryStatement("no value counts as found, because a recording has a severe issue", "verdict")
+    severe = dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning")
+    said = f"no value counts as found until these issues are corrected: {'; '.join(severe)}" if severe else ""
+    yield SummaryStatement(said, "verdict")
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -137,7 +139,7 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
     if use := result.get("to_use"):
         left_out = " and ".join(use["uncounted_errors"])
         stated = f"± is one standard deviation{f', without the error {left_out}' if left_out else ''}"
-        stated = stated if "±" in use["values"][0] else f"`solve` tells their ± with the error {left_out}"
+        stated = stated if "±" in use["values"][0] else f"for their ± with the error {left_out}, run `solve`"
         yield f"to use these numbers ({stated}):"
         lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
         yield CodeBlock("\n".join(lines))
@@ -162,15 +164,16 @@ def misfit_summary_blocks(
                     known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "if this misfit is counted in the ±, no value is known to within 10 %"
-            said = f"only if no effect is missing are these known to within 10 %, with the misfit in the ±: {shown}"
+            none = "do not use the values: no value is known to within 10 %, if its ± includes the model error"
+            said = f"use these values only if no effect is missing; their ± (up to 10 %) has the model error: {shown}"
             yield SummaryStatement(said if known else none, "conclusion")
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
-        texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} ({entry['baseline']})")
+        texts.append(f"{entry['channel']} of {entry['recording']}, {' instead of '.join(sizes)} ({entry['baseline']})")
     texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
-    yield SummaryStatement(f"worse than a guess without a model: {'; '.join(texts)}" if texts else "", "verdict")
+    said = f"rms error of the model larger than that of a guess without a model: {'; '.join(texts)}" if texts else ""
+    yield SummaryStatement(said, "verdict")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
@@ -238,7 +241,7 @@ def recording_summary_lines(recording: Recording) -> list[str]:
         sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", span
         names = abbreviated_names_text(group.names, math.inf)
         rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), names))
-    return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
+    return [*aligned_table_lines(rows), "", f"duration: {recording.duration:g} s", *_note_lines(recording.notes)]
 
 
 def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) -> list[str]:

@@ -163,7 +163,7 @@ def propose_config_choices(
     for recording in recordings:
         start = min(group.t[0] for group in recording.joint_and_point_groups)
         if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
-            moving = f"{mover} of {recording.name} moves at the start, which is estimated along"
+            moving = f"{mover} of {recording.name} moves at the start, so the initial state is estimated"
     return ProposedConfigChoices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
@@ -272,13 +272,13 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if is_servo:
         return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
     if joints.effort is None:
-        return "prescribed", "no efforts were recorded, so the arm moves as its encoders say"
+        return "prescribed", "no efforts were recorded, so the arm moves as measured"
     if not has_object:
-        return "prescribed", "the arm moves as its encoders say, and the model predicts the efforts that this takes"
+        return "prescribed", "the arm moves as measured, and the model predicts the efforts that this motion requires"
     if closed:
-        return "driven", "efforts were recorded, and grasps close loops, which angles taken as exact would strain"
+        return "driven", "efforts were recorded, and grasps close loops, which inexact measured angles would strain"
     if seen:
-        return "prescribed", f"the object hangs on the arm and {seen} see it, so the arm moves as its encoders say"
+        return "prescribed", f"the object hangs on the arm and {seen} see the object, so the arm moves as measured"
     return "prescribed", "no sensor measures the object, so its parameters are estimated from the arm's efforts"
 
 
@@ -428,7 +428,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     for key, group, channel in _mounted_channels(recording):
         other = ("", "no moving link has that name: write frames: {NAME: FRAME} in place of use: false")
         if channel.group == "wrist":
-            other = (holder, "a guess: the sensor carries this link and all that is attached to it")
+            other = (holder, "a guess: the sensor carries this link and its load; if not, set frame_by_recorded_name")
         own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
         found[key] = tuple(
             _PointPlacement(name, name, "a link has that name") if moves else _PointPlacement(name, *other)

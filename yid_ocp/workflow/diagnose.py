@@ -348,8 +348,8 @@ class _SingleJsonFileRefitStore(RefitStore):
             held = files.read_input_json(self.file)
             if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
                 return {name: files.dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
-            reason = "they belong to other inputs, another configuration or another version"
+            reason = "the refits are of other inputs, settings or another version"
         except (DataError, ValueError, LookupError, TypeError, AttributeError):
             reason = "the file cannot be read"
-        log.warning("stored refits in %s are not used, and all effects are fitted again: %s", self.file, reason)
+        log.warning("all effects are fitted again, without stored refits in %s: %s", self.file, reason)
         return {}

@@ -187,16 +187,16 @@ def _summary_lines(
     lines = [
         f"joints: {abbreviated_names_text(proposal.joints, math.inf)}",
         f"held by: {', '.join(held)}" + f" (frames there, for --holder: {', '.join(others)})" * bool(others),
-        f"mode: {proposal.arm_mode}: {proposal.arm_mode_reason}",
-        f"start: {proposal.initial_state}: {proposal.initial_state_reason}",
+        f"model.arms.mode: {proposal.arm_mode} ({proposal.arm_mode_reason})",
+        f"problem.initial_state: {proposal.initial_state} ({proposal.initial_state_reason})",
     ]
     damping = _value(proposal.urdf_joint_damping)
     lines += [f"damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
-        lines += [f"{group}: {points} at {frame}, {reason}" for points, frame, reason in _merged_places(places)]
+        lines += [f"sensors.{group}: {points} at {frame}, {reason}" for points, frame, reason in _merged_places(places)]
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
     for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
-        lines.append(f"diagnose does not try {', '.join(kinds)}: nothing was recorded of {signals}")
+        lines.append(f"diagnose will not try {', '.join(kinds)}, because no recording has {signals}")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "diagnose cannot see joint_*, payload and effort_* of the arm: efforts are off (sensors.joints.effort.use)"
