@@ -515,7 +515,7 @@ ROLLED = {
     "as predicted": (lambda p: p + 0.1, True, None, ""),
     "in the camera's frame": (applied(BACK), True, "point_frame", "if the camera's pose is applied"),
     "pose inverted": (applied(BACK @ BACK), True, "point_frame", "if the camera's pose is inverted"),
-    "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis is reversed"),
+    "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis is rev"),
     "no pose is known": (applied(BACK), False, None, ""),
     "in millimetres": (lambda p: 1e3 * p, False, "point_scale", "divided by 1000"),
     "exchanged": (lambda p: p[:, [1, 0, 2]], False, "point_swapped", "if a and b are exchanged"),

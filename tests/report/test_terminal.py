@@ -84,8 +84,8 @@ def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", solved())
     assert "cannot be found from these recordings: p_not_identifiable" in lines
     assert "only weakly determined, so use the 95 % interval: p_weak" in lines
-    good = "the model explains the recordings to within their noise (chi2 per degree of freedom is 1.03; noise alone gives 1)"
-    assert lines[-2] == good
+    size = "chi2 per degree of freedom is 1.03; noise alone gives 1"
+    assert lines[-2] == f"the model explains the recordings to within their noise ({size})"
     assert all(fact in lines[-1] for fact in ("converged", "done", "4 iterations", "1.0 s"))
     assert any(line.startswith("Recorded torques") for line in told("yid-solve/1", solved(unused_efforts=True)))
     assert not any("p_fixed" in line for line in lines)
@@ -120,7 +120,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert "10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"data_trusted": False}})[1]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
     lines = told("yid-solve/1", said)
-    worse = "larger than that of a guess without a model: w_T2 of run, 50 mm instead of 20 mm (stays)"
+    worse = "larger error than a guess without a model: w_T2 of run, 50 mm instead of 20 mm (stays)"
     assert (lines[0], worse in lines[2], "; 2 more in" in " ".join(lines[2:5])) == (first, True, True)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in lines[:6]

@@ -58,7 +58,7 @@ def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, carried_out
     free = [entry for entry in result["parameters"].values() if entry["free"]]
     assert {entry["verdict"] for entry in free} <= {"not_trusted", "not_identifiable"}
     assert any(line.split("  ")[0] == "issue" for line in done.out.splitlines()[:6])
-    for words in ("no value counts as found until these issues are corrected: ", "sensors.joints.effort.std: 0.1"):
+    for words in ("no value counts as found until corrected: ", "sensors.joints.effort.std: 0.1"):
         assert words in done.out
     page = (done.folder / "report.html").read_text()
     assert "<h3>Issues of the recordings</h3>" in page

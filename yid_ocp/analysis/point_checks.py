@@ -133,8 +133,7 @@ def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
     mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
     words = f"if (x, y, z) is replaced by ({axes}){' (a mirror image)' if mirror else ''}"
-    advice = f"replace x, y, z of the points by {axes} and import them again"
-    yield _Change("point_mirrored", words, advice, errors[order, signs])
+    yield _Change("point_mirrored", words, f"import the points with {axes} as x, y, z", errors[order, signs])
 
 
 def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[_Change]:

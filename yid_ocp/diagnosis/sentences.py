@@ -63,8 +63,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     if result.verdict not in ("insufficient_data", "no_gap"):
         (error, change), found = _remains(result), [_places(result), *_causes(result)]
         text += [*found, error, change] if result.accepted_effects else [error, *found, change]
-    if result.law is not None:
-        text.append(result.law.sentence)
+    text += [] if result.law is None else [result.law.sentence]
     text += [*map(held_out_truncation_message, result.truncated_recordings)]
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
@@ -211,8 +210,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         for name in own.amplitude_parameter_names:
             by = mask_of_priors_determining_unknown(data, priors, names.index(name))
             others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
-        beside = f"To determine {own.label}, measure and fix (`free: false`) one of these parameters: "
-        text.append(_listed(beside, others))
+        text.append(_listed(f"To determine {own.label}, measure and fix (`free: false`) one of ", others))
     return text
 
 

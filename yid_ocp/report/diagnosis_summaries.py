@@ -70,8 +70,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield "refitted candidates come first; closure alone: part of the held-out error beyond noise that this one removes"
     yield "the others are ordered by score (significance before a refit); p: probability of such a score by noise alone"
     yield f"{left} more candidates are in result.json" if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
-    unseen = ", ".join(result.get("unseen", ()))
-    yield f"effects that these recordings cannot show, even if they exist: {unseen}" if unseen else ""
+    yield f"effects that these recordings cannot show: {', '.join(result['unseen'])}" if result.get("unseen") else ""
     for signals, kinds in result.get("not_candidates", {}).items():
         yield f"no candidates, because no recording has {signals}: {', '.join(kinds)}"
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
@@ -312,13 +311,12 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     if result["disturbed"]:
         words = f"do not use values by {', '.join(methods)}: they ignore noise of the inputs that move the model"
         yield f"{words}. Use the column `solve`, which includes this noise; the verdicts are for this column"
-        for name, entry in found.items():
+        for name, e in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
-            near = 2 * (entry["std"] or 0.0)
-            off = ", ".join(f"{v:.4g} by {m}" for m, v in values.items() if abs(v - entry["value"]) > near)
+            off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
             if off:
-                said = value_and_uncertainty_text(entry["value"], entry["std"], entry["interval"])
-                yield f"{name} is {said} {entry['unit']} by `solve`, but {off}"
+                said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
+                yield f"{name} is {said} {e['unit']} by `solve`, but {', '.join(off)}"
     if stopped:
         yield f"{', '.join(stopped)}: no values, because the time was up before the first iteration"
     if not fit["explains"]:
@@ -384,12 +382,11 @@ def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list
 
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
+    p = _relation(result["p_value"])
     if not drifted and result["p_value"] >= result["level"]:
-        p = _relation(result["p_value"])
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
     elif not drifted:
-        differ = f"All parameters together differ between the runs (p {_relation(result['p_value'])})"
-        yield f"{differ}, but no single parameter differs significantly."
+        yield f"All parameters together differ between the runs (p {p}), but no single one significantly."
     for name in drifted:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
@@ -401,8 +398,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield "Two runs that differ do not show which one is wrong; add a third run."
     elif drifted:
         yield "No single run differs from the others."
-    poor = [entry["name"] for entry in runs if not entry["explains"]]
-    if poor:
+    if poor := [entry["name"] for entry in runs if not entry["explains"]]:
         text = f"The model did not explain the recordings of {', '.join(poor)}"
         yield f"{text}. The ± of such a run includes the model error, but may still be too small."
 

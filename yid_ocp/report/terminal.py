@@ -116,15 +116,14 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
         alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
         for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE], start=1):
             left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
-            where = entry["where"] + (f" and {left} more" if left else "")
+            where = entry["where"] + f" and {left} more" * bool(left)
             rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}"))
             configured = ". In the configuration:" if entry["setting"] else ""
             advice += [f"{words}: {entry['what']}; {entry['advice']}{configured}", CodeBlock(entry["setting"])]
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
-    severe = dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning")
-    said = f"no value counts as found until these issues are corrected: {'; '.join(severe)}" if severe else ""
-    yield SummaryStatement(said, "verdict")
+    if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
+        yield SummaryStatement(f"no value counts as found until corrected: {'; '.join(severe)}", "verdict")
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -172,8 +171,7 @@ def misfit_summary_blocks(
         sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
         texts.append(f"{entry['channel']} of {entry['recording']}, {' instead of '.join(sizes)} ({entry['baseline']})")
     texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
-    said = f"rms error of the model larger than that of a guess without a model: {'; '.join(texts)}" if texts else ""
-    yield SummaryStatement(said, "verdict")
+    yield SummaryStatement(f"larger error than a guess without a model: {'; '.join(texts)}" if texts else "", "verdict")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
