@@ -700,7 +700,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
 def test_noise_that_settings_state_ten_times_too_large(springs):
     (doubt,) = doubts(springs, std=1e-2)
     assert (doubt.cause, doubt.severity, doubt.group) == ("noise_overstated", "warning", "points_camera")
-    assert "the fit leaves 0.001 m of points_camera" in doubt.what
+    assert "the fit leaves 0.001 m of points_camera as error" in doubt.what
     name, value = doubt.setting.split(": ")
     assert name == "sensors.points_camera.std"
     assert float(value) == pytest.approx(1e-3, rel=0.15)

@@ -279,7 +279,7 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     told, rough = copied(system, {"T1.bend": 22.0}, (), **found), copied(system, {"T1.bend": 22.0}, **found)
     assert (told["values"], rough["values"]) == (["T1.bend = 22 ± 0.5 N m/rad"], ["T1.bend = 22 N m/rad"])
     assert (rough["latex"], rough["uncounted_errors"]) == ([r"T1.bend & $22$ & N m/rad \\"], ["of discretisation"])
-    assert "`solve` tells their ±" in next(copyable_estimates_blocks({"to_use": rough}))
+    assert "± with the error of discretisation, run `solve`" in next(copyable_estimates_blocks({"to_use": rough}))
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']

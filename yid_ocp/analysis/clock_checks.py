@@ -334,9 +334,9 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
-        leaves = f"the fit leaves {seen * usual:.2g} {unit} of {group} (rms, slow errors included)"
+        leaves = f"the fit leaves {seen * usual:.2g} {unit} of {group} as error (rms, slow errors included)"
         words = f"{leaves}; the stated noise is {usual:.2g} {unit}"
-        advice = "state the actual noise: with the stated one every ± is too wide, and a small gap is not found"
+        advice = "set the std to the actual noise: the stated std makes every ± too wide and hides small gaps"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         severity = 1 / (least * max(seen, 1e-9))
         where = group.partition(".")[0]

@@ -379,9 +379,9 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             if better := _clearly_better_baseline(entry, channels):
                 best, guess, error = better
                 unit = units[channels[0]]
-                what = f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by"
+                what = f"the model has an error of {error:.3g} {unit} (rms), the guess '{best}' without a model of"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
-                advice = "look at the residuals; `yid-ocp diagnose` can find what the model lacks"
+                advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])
                 what = f"{what} {guess:.3g} {unit}"
                 found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))

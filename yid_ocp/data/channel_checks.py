@@ -150,7 +150,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
             what = f"{channel} is quantised in steps of {step:.3g}, which give noise with the std {size:.2g}"
             what += f"; the stated std is {stated:.2g}" if stated else ""
             ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
-            advice, line = "state the std of the steps, or record with more digits", f"{setting}: {size:.2g}"
+            advice, line = "set the std to that of the steps, or record with more digits", f"{setting}: {size:.2g}"
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
@@ -158,9 +158,9 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
             # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            what = f"the noise of {channel} between samples has the std {seen:.2g}; the stated std is {stated:.2g}"
+            what = f"the noise of {channel} between samples has the std {seen:.2g}; the stated std is only {stated:.2g}"
             ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
-            advice = "state the std of the actual noise"
+            advice = "set the std to that of the actual noise"
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
@@ -203,7 +203,7 @@ def overstated_noise_std_issues(recording: Recording, options: SensorOptionsFunc
         what = f"the noise of {channel} has the std {seen_of[channel]:.2g} or less; the stated std is {stated:.2g}"
         what += f" (also too large for others: {len(low)} of {len(entries)} channels in all)" if len(low) > 1 else ""
         ratio = stated / most[channel]
-        advice = "state the std of the actual noise: a larger one makes every ± too wide and hides small gaps"
+        advice = "set the std to that of the actual noise: a larger std makes every ± too wide and hides small gaps"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
         yield Issue("noise_overstated", what, "warning", ratio, advice, "", group, channel, setting=setting)
