@@ -511,8 +511,8 @@ def _failed(error: Exception, as_json: bool) -> int:
         return _wrong(OutputError(what, where="standard output", allowed="an open pipe or file", hint=hint), False)
     if isinstance(error, OSError):
         what = f"the operating system reports: {error.strerror or error}"
-        where, allowed = str(error.filename or "files of this command"), "usable paths, and enough free disk space"
-        hint = "check the path" if isinstance(error, FileNotFoundError) else "check permissions and free disk space"
+        where, allowed = str(error.filename or "files of this command"), "readable inputs, and writable disk space"
+        hint = "correct the path" if isinstance(error, FileNotFoundError) else "check permissions, and space with df -h"
         return _wrong(OutputError(what, where=where, allowed=allowed, hint=hint), as_json)
     if isinstance(error, ValueError) and "embedded null" in str(error):  # what Python says of a NUL in a path
         what, allowed = "a path contains a null character", "paths without null characters"

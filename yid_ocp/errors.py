@@ -17,7 +17,7 @@ class YidError(Exception):
     """
 
     _usual_allowed = "what docs/reference and docs/howto describe"
-    _usual_hint = "correct it and run the command again"
+    _usual_hint = "correct the value or file that `where` names"
 
     def __init__(self, what: str, *, where: str = "", allowed: str = "", hint: str = "") -> None:
         self.what, self.where, self.allowed, self.hint = what, where, allowed, hint
@@ -71,8 +71,8 @@ class SolverError(YidError):
 
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
     """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
-    hint = "in this order: a smaller problem.time_step, more damping, other initial values (parameters.NAME.initial)"
-    what, allowed = f"the model cannot be simulated: {reason}", "a simulation that reaches the end of the motion"
+    hint = "set, in this order, a smaller problem.time_step, a larger model.damping, other parameters.NAME.initial"
+    what, allowed = f"the model cannot be simulated: {reason}", "settings for which every time step has a solution"
     return SolverError(what, where=where, allowed=allowed, hint=hint)
 
 

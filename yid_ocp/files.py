@@ -34,7 +34,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
     Every file that this package did not write or ship is checked, so pipes and devices are refused before reading.
     """
-    allowed = "a file that can be read"
+    allowed = "the path of a readable file"
     try:
         info = path.stat()
         readable = os.access(path, os.R_OK)
@@ -44,7 +44,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         if isinstance(error, ValueError):
             what, allowed = "the path contains a null character", "a path without null characters"
         near = os.listdir(path.parent) if absent and os.access(path.parent, os.R_OK) else ()
-        hint = nearest_name_question(path.name, near) or "check the path"
+        hint = nearest_name_question(path.name, near) or "correct the path: nothing has this name"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
     if not readable:
         hint = "allow reading with chmod, or copy it to a folder of your own"
@@ -56,7 +56,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
     if max_bytes is not None and info.st_size > max_bytes:
         what = f"the file has {info.st_size / 2**20:.3g} MiB, more than allowed"
         allowed = f"at most {max_bytes / 2**20:.3g} MiB"
-        raise DataError(what, where=str(path), allowed=allowed, hint="check that it is the right file")
+        raise DataError(what, where=str(path), allowed=allowed, hint="give the right file, or a smaller one")
     return path
 
 

@@ -108,7 +108,7 @@ def test_a_full_disk_is_the_users_business(printed, pendulum, left_nothing, monk
     with monkeypatch.context() as patch:
         patch.setattr(estimation, "solve", Mock(side_effect=FileNotFoundError(2, "No such file", "a")))
         said = printed("solve", pendulum, code=2)
-        assert re.search("reports: No such file\n.*: a\n.*\n  try: check the path\n", said)
+        assert re.search("reports: No such file\n.*: a\n.*\n  try: correct the path\n", said)
     monkeypatch.setattr("yid_ocp.workflow.run_folder.os.replace", Mock(side_effect=OSError(28, "No space left on")))
     assert "No space left on device" in printed("solve", pendulum, code=2)
     left_nothing()

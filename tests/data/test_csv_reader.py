@@ -376,7 +376,7 @@ def test_exports_of_motion_capture_are_read_in_their_unit_and_unseen_markers_are
     )
     for broken in (without_rate, text.splitlines()[0] + "\n"):
         (tmp_path / name).write_text(broken)
-        refused(tmp_path / name, "does not have the structure that the program writes")
+        refused(tmp_path / name, "the motion capture export lacks")
 
 
 # ------------------------------------------------------------------------------------------------------- any format

@@ -223,7 +223,7 @@ def test_constants_of_joints_come_into_the_model_unless_the_settings_have_others
 def test_bad_files_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "robot.xml"
     file.write_text("<mujoco><worldbody><body><joint type='ball'/><geom size='1'/></body></worldbody></mujoco>")
-    with pytest.raises(ModelError, match="has the type free or ball"):
+    with pytest.raises(ModelError, match="has the type ball"):
         read_urdf(file)
     file.write_text("<mujoco><worldbody><body><geom type='mesh' mesh='none'/></body></worldbody></mujoco>")
     with pytest.raises(ModelError, match="MuJoCo cannot read the file"):

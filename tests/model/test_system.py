@@ -118,7 +118,7 @@ def test_effects_are_appended(robot):
 
 
 WRONG = {
-    "nothing": (lambda robot: System.build(), ["no joint", "an object, or both"]),
+    "nothing": (lambda robot: System.build(), ["no joint", "model.object, or both"]),
     "driven": (lambda robot: System.build(robot, driven=["slid"]), ["'slid'", "'slide'"]),
     "prescribed": (lambda robot: System.build(robot, prescribed=["tool"]), ["joint 'tool'"]),
     "both": (lambda robot: System.build(robot, driven=["nod"], prescribed=["nod"]), ["'nod'", "one of the two"]),
@@ -129,7 +129,7 @@ WRONG = {
     "held": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "noses")]), ["'noses'", "'nose'"]),
     "grasp_twice": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "nose")] * 2), ["'g'", "grasps"]),
     "point": (lambda robot: System.build(robot, point_frames=["w_T1"]), ["'w_T1'"]),
-    "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "three finite numbers"]),
+    "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "3 finite numbers"]),
     "frame": (lambda robot: System.build(robot, objects=[(foam_y_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
     "objects": (lambda robot: System.build(objects=[(foam_y_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
     "segment": (lambda robot: System.build(robot).find_segment_layout("T1"), ["segment 'T1'"]),

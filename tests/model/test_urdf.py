@@ -198,7 +198,7 @@ def test_a_broken_urdf_is_refused(refused_with, name, tmp_path):
     [
         (lambda path: read_urdf("nowhere.urdf"), ["'nowhere.urdf'", "package:NAME"]),
         (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?", "allowed: baxter, "]),
-        (lambda path: read_urdf("so101"), ["'so101'", "write package:so101"]),
+        (lambda path: read_urdf("so101"), ["'so101'", "package:so101"]),
         (lambda path: read_urdf("package:anymal"), ["has 2 robots 'anymal'", "package:anymal_b_simple_description/"]),
         (lambda path: read_urdf("default:y_objekt.urdf"), ["'y_objekt.urdf'", "did you mean 'y_object.urdf'?"]),
         (lambda path: read_urdf(path, joints=["swimg"]), ["'swimg'", "did you mean 'swing'?"]),

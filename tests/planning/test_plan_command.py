@@ -131,7 +131,7 @@ def test_a_plan_that_fails_says_so(config, carried_out):
         (["plan.parameter_run_folder=nowhere"], ("no finished run", "nowhere", "plan.parameter_run_folder")),
         (["plan.goal=throw"], ("plan.goal", "place, path, box")),
         (["plan.limits.velocity_fraction=2"], ("plan.limits.velocity_fraction", "up to 1")),
-        (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?", "pendulum.yaml")),
+        (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?", "--set plan.point")),
     ],
 )
 def test_wrong_input_leaves_nothing(config, refused, settings, words):
@@ -197,7 +197,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.parameters_to_identify=[elbow.stif]"], ("no parameter 'elbow.stif'", "did you mean", "pendulum.yaml")),
+        (["plan.parameters_to_identify=[elbow.stif]"], ("no parameter 'elbow.stif'", "did you mean", "--set plan")),
         (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
         (["recordings.estimate=[]"], ("no recording is listed for estimation",)),
         (["plan.duration=0.1", "plan.hold_duration=0.1"], ("too short", "plan.duration")),

@@ -369,8 +369,8 @@ def test_a_problem_cannot_be_changed_through_its_parameters(make):
     [
         ({"free": ("elbow.stiffness", "elbow.stiffness")}, "listed twice"),
         ({"free": ("elbow.stiff",)}, "elbow.stiffness"),
-        ({"local_parameters": ("elbow.damping",)}, "'elbow.damping' has a prior or differs per recording"),
-        ({"prior_stds": {"elbow.damping": 0.1}}, "'elbow.damping' has a prior or differs per recording"),
+        ({"local_parameters": ("elbow.damping",)}, "'elbow.damping' has a value per recording"),
+        ({"prior_stds": {"elbow.damping": 0.1}}, "'elbow.damping' has a prior, but"),
         ({"values": {"elbow.stiffness": -1.0}}, "elbow.stiffness"),
         ({"seeds": (1, 1)}, "two recordings are called 'run_1'"),
         ({"parameters_by_recording": {"run_2": {"elbow.rest": 0.3}}}, "elbow.rest is free, but this recording has a"),

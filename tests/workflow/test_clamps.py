@@ -137,7 +137,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
         ({"format": "yid-plan/1"}, "another command"),
         ({"format": "yid-diagnosis/1"}, "table of CHANGELOG.md"),
         ({"status": "failed", "message": "no"}, "the run failed"),
-        ({"covariance": {}}, "parameters or covariance are missing"),
+        ({"covariance": {}}, "the key .names. is missing"),
         ({"covariance": {"names": [], "matrix": []}}, "determined no parameter"),
     ],
 )

@@ -219,7 +219,7 @@ def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path, export
     said = ("output.write_report=false", "sensors.joints.effort.std=0.02", f"model.robot={robot}")
     said += ("model.effects=[{kind: effort_offset, location: shoulder}]", "parameters.effort_offset@*={free: true}")
     assert cli("solve", pendulum, "--out", "run", *(word for entry in said for word in ("--set", entry))).code == 0
-    assert "the file is an input of the run" in cli("export", "run", "--lossy", "--out", robot).err
+    assert "the file to write is an input of the run" in cli("export", "run", "--lossy", "--out", robot).err
     manifest = exported("run", tmp_path / "pendulum.xml")
     [(name, entry)] = manifest["gate"]["channels"].items()
     assert (name, entry["unit"]) == ("joints.effort", "N m")

@@ -250,7 +250,7 @@ def typical_point_pair_distances(
         if not seen:
             what = f"no frame shows both points of the edge {edge[0]} to {edge[1]}, so its length is unknown"
             where = ", ".join(f"recording '{r.name}'" for r in recordings)
-            hint = "add a recording in which both points are visible"
+            hint = "list a recording under recordings.estimate in which both points are visible"
             raise DataError(what, where=where, allowed="at least one frame with both points", hint=hint)
         result[edge] = float(np.median(seen))
     return result

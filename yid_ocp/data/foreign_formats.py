@@ -236,9 +236,9 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _broken(where: str, allowed: str) -> DataError:
-    what = "the motion capture export does not have the structure that the program writes"
-    return DataError(what, where=where, allowed=allowed, hint="export it again, with its header, and do not edit it")
+def _broken(where: str, lacking: str) -> DataError:
+    allowed, hint = "an unedited export with its header", "export the motion again, and do not edit the file"
+    return DataError(f"the motion capture export lacks {lacking}", where=where, allowed=allowed, hint=hint)
 
 
 OTHER_JOINT_MESSAGE_TYPES = (

@@ -373,7 +373,7 @@ def _sampled(t: Array) -> str:
 def raise_data_error_unless(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
     """Raise a `DataError` with the texts `what`, `where`, `allowed` and `hint` unless a condition holds."""
     if not condition:
-        hint = hint or "correct the entry that `where` names, or import the original data again"
+        hint = hint or "correct the entry that `where` names, or repeat `yid-ocp import` with the original data"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -524,7 +524,7 @@ def _check_pose(pose: Array, where: str) -> None:
 def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, where: str) -> None:
     place, allowed = f"{where}, names", "one name for every column, each once"
     raise_data_error_unless(group.names, "the group has no names", where, allowed, "write the attribute `names`")
-    allowed, hint = "one sample or more", "leave the group out, or import the data again"
+    allowed, hint = "one sample or more", "leave the group out, or import data with samples"
     raise_data_error_unless(group.t.size > 0, "the group has no samples", where, allowed, hint)
     for name, count in Counter(group.names).items():
         usable = isinstance(name, str) and name and not _CONTROL_CHARACTER.search(name)
@@ -549,7 +549,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
     what, allowed = f"the array has shape {array.shape}", f"{shape}, that is {letters}"
-    raise_data_error_unless(array.shape == shape, what, where, allowed, "write an array of the allowed shape")
+    raise_data_error_unless(array.shape == shape, what, where, allowed, "write an array of this shape")
 
 
 def _check_text(where: str, *texts: tuple[str, str]) -> None:

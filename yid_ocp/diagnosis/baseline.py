@@ -82,7 +82,7 @@ def _add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
             what = f"the effect {effect}" if at and "@" in effect else f"the parameter '{name}'"
             hint = "add it under model.effects" if "@" in effect else nearest_name_question(name, parameters.names)
             what = f"the baseline has {what}, which this model lacks"
-            raise ConfigError(what, where=baseline.run_name, allowed="a run of the same model", hint=hint)
+            raise ConfigError(what, where=baseline.run_name, allowed="a run of this model", hint=hint or "leave it out")
         if name in problem.options.local_parameters:
             what = f"the baseline cannot give a prior of '{name}', which has its own value in every recording"
             where = f"parameters.{name}.per_recording"
@@ -285,6 +285,6 @@ def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:
         what = "the nominal model cannot be fitted to the recordings without the effects"
-        allowed, hint = "recordings that the nominal model can follow", "check recordings.without_effect"
+        allowed, hint = "recordings of this setup without effects", "correct the list recordings.without_effect"
         raise SolverError(f"{what}: {outcome.message}", where="recordings", allowed=allowed, hint=hint)
     return {name: problem.unknowns.named_values(outcome.x)[name] for name in shared}

@@ -77,7 +77,7 @@ def plan_blind_cases(
     needs an experiment in `chains`. `seed` and `purpose` determine the order. Raises `ConfigError` if `count` < 1.
     """
     if count < 1:
-        raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
+        raise ConfigError(f"the number of cases is {count}", where="--cases", allowed="a whole number from 1")
     total = sum(weights.values())
     kept = {name: part / total for name, part in weights.items() if count * part / total >= _MIN_CASES_PER_EXPERIMENT}
     kept = kept or {max(weights, key=lambda name: weights[name]): 1.0}
@@ -178,7 +178,7 @@ def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]
 def read_labels_checking_sha256(text: str, commitment: str) -> list[CaseGroundTruth]:
     """Read the sealed labels of cases from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
-        what, hint = "the labels are not those sealed before the diagnosis", "restore this file of the blind test"
+        what, hint = "the labels are not those sealed before the diagnosis", "copy the original file back"
         where, allowed = "sealed/labels.json", f"the file with the SHA-256 in commitment.json, {commitment[:12]}..."
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
@@ -353,8 +353,8 @@ class BlindCaseGenerator:
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
-        what, allowed = f"MuJoCo could simulate none of {MAX_DRAWS_PER_CASE} motions", "motions that do not diverge"
-        where, hint = f"{name} of {planned.experiment}", "use another --seed, which draws other motions"
+        what, allowed = f"all {MAX_DRAWS_PER_CASE} random motions diverge in MuJoCo", "one motion that stays finite"
+        where, hint = f"{name} of {planned.experiment}", "set another --seed; next, a larger model.damping"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:

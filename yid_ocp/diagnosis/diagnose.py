@@ -453,7 +453,7 @@ def _fitted_nominal_model(
     for own in (start, {}):
         if fit := refit_with_effects(nominal, (), own, search.store, name, search.thresholds):
             return reevaluate_refit_with_all_candidates(problem, fit)
-    raise failed_rollout_error("a fit from the initial values fails, too", "nominal model")
+    raise failed_rollout_error("all fits fail, also from the initial values", "nominal model")
 
 
 def fit_nominal_model(

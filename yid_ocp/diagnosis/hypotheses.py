@@ -58,7 +58,7 @@ def make_candidate_effects(
         return [_make_candidate(kind, place, system) for kind, place in possible]
     if isinstance(choice, str) or not choice:
         what = f"'{choice}' is neither 'all' nor a list" if choice else "the list of candidates is empty"
-        raise ConfigError(what, where=where, allowed="all, or a list of kinds", hint="leave the key out to try all")
+        raise ConfigError(what, where=where, allowed="all, or a list of kinds", hint=f"leave {where} out to try all")
     pairs: list[tuple[str, str]] = []
     for text in choice:
         kind, _, place = text.partition("@")
@@ -95,7 +95,7 @@ def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> 
             raise ConfigError(what, where=where, allowed=f"{allowed}, or kind@location", hint=hint)
     kept = [effect for effect in effects if not {effect.kind, effect.label} & set(names)]
     if not kept:
-        what, allowed = "all candidates are excluded", "at least one candidate that is not excluded"
+        what, allowed = f"all {len(effects)} candidates are excluded", f"at most {len(effects) - 1} excluded candidates"
         raise ConfigError(what, where=where, allowed=allowed, hint="exclude fewer candidates")
     return kept
 

@@ -33,7 +33,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     places = EFFECTS[kind].possible_locations(system)
     # a payload or point mass may be at any frame, including frames of the arm that are not in `system.point_frames`
     if location not in places and not (EFFECTS[kind].is_at_point_groups and location.partition("_")[0] == "points"):
-        said = {"allowed": "no location of this model", "hint": "leave the effect out"}
+        said = {"allowed": "no location of this model", "hint": "remove the effect from model.effects"}
         said = unknown_name_error_arguments(location, places) if places else said
         raise ModelError(f"the effect {kind} is not possible at '{location}'", where=f"{kind}@{location}", **said)
     return base.make_effect_unchecked(kind, location, system, values or {})

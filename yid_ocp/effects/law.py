@@ -232,7 +232,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
     differ from `depends_on`.
     """
     allowed = f"a header {','.join(_TABLE_COLUMNS)}, then rows of a quantity, its unit and three numbers"
-    hint = "write it like the file law.csv of `diagnose`"
+    hint = "write the table like law.csv in a run folder of `yid-ocp diagnose`"
     lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]
     if not lines or tuple(word.strip() for word in lines[0]) != _TABLE_COLUMNS:
         raise DataError("the file is not a table of a torque law", where=f"{path}, line 1", allowed=allowed, hint=hint)
@@ -256,8 +256,8 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
         knots, torque, std = np.array(rows[quantity]).T
         gaps = np.diff(knots)
         if len(knots) < 4 or np.any(gaps <= 0) or np.ptp(gaps) > _SPACING_RTOL * float(np.mean(gaps)):
-            what = f"the values `at` of the quantity {quantity} are too few, or not increasing and evenly spaced"
-            hint = "interpolate the table at evenly spaced values"
+            fault = "fewer than 4" if len(knots) < 4 else "not increasing" if np.any(gaps <= 0) else "not evenly spaced"
+            what, hint = f"values `at` of {quantity} are {fault}", "interpolate the table at evenly spaced values"
             raise DataError(what, where=str(path), allowed="four or more evenly spaced, increasing numbers", hint=hint)
         tables.append(TorqueLawTable(quantity, knots, torque, std))
     return tuple(tables)

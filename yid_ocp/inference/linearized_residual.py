@@ -89,8 +89,8 @@ class ResidualDerivativesByStateAndEffort:
             used = samples.evaluation_node_indices
             if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
-                message = f"sensor '{name}' measures velocities, accelerations or constraint forces"
-                allowed = "only sensors of positions, while recorded torques with noise drive the arms"
+                message = f"the Kalman filter for noisy torques cannot use '{name}', which is no sensor of positions"
+                allowed = "sensors of positions, such as points and encoders"
                 hint = f"set sensors.{name}.use: false, or model.arms.mode: prescribed"
                 raise DataError(message, where=f"sensors.{name}", allowed=allowed, hint=hint)
             # derivatives of each reading by the states and efforts of the previous node, its own and the next

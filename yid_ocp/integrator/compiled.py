@@ -303,7 +303,7 @@ def _theta_columns(model: StepEquationsAndFunctions, kernel: ctypes.CDLL, names:
     library = compiler.compile_and_load_library(told, source)
     if library is None:
         what, where = "the C compiler failed on the code for parameter derivatives", "the environment variable CC"
-        raise ModelError(what, where=where, allowed="a C compiler, or CC=none for no compiled code", hint="set CC=none")
+        raise ModelError(what, where=where, allowed="a C compiler, or none", hint="set CC=none (slower)")
     function = ca.external("by_theta", library._name)
     sizes = model.sizes
     rows = (sizes["n"] + sizes["nz"] + sizes["m"], sizes["n"], sizes["nc"])

@@ -97,8 +97,8 @@ def private_cache_folder() -> Path:
     if not writable and not wanted:  # as in containers
         return _temporary_cache_folder(folder)
     if not _is_mine_alone(folder.stat()):
-        what = "the folder of compiled code belongs to another user, or other users can write to it"
-        hint = "delete its files and run chmod 700 on it, or set YID_OCP_CACHE to another folder"
+        what = "other users can write to the folder of compiled code, or own it"
+        hint = "set YID_OCP_CACHE to another folder; or, if it is yours, delete its files and run chmod 700 on it"
         raise OutputError(what, where=str(folder), allowed=allowed, hint=hint)
     return folder
 

@@ -277,8 +277,8 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     """Create the error for a lack of memory, because `what` needs `size` bytes."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     said = f"{_STATUS_MESSAGES[NewtonStatusCode.OUT_OF_MEMORY]}: {what} needs {amount}"
-    hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
-    allowed = "less memory than is free"
+    hint = "close other programs; else cut the recording, or estimate fewer parameters at once (parameters.NAME.free)"
+    allowed = "a need below the free memory, which `free -h` shows"
     return InsufficientMemoryError(said, where="this machine", allowed=allowed, hint=hint)
 
 

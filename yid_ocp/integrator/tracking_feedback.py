@@ -36,7 +36,7 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     values = np.atleast_1d(np.asarray(gains, float))
     if values.size not in (1, nu) and nu % max(values.size, 1):
         what = f"the settings have {values.size} gains for {nu} driven joints"
-        allowed = f"1 or {nu} gains, or one for each joint of one arm (all arms then have the same gains)"
+        allowed = f"1 or {nu} gains, or one for each joint of one arm (equal gains for all arms)"
         raise ModelError(what, where="problem.arm_proportional_gains", allowed=allowed)
     values = np.resize(values, nu)
     if np.any(values < 0):

@@ -112,7 +112,7 @@ def _body(
     for j in range(first, first + count):
         label, kind = _joint_name(model, j), _JOINT_TYPE_NAMES.get(int(model.jnt_type[j]))
         if kind is None:
-            what, allowed = f"joint '{label}' has the type free or ball", "hinge and slide joints"
+            what, allowed = f"joint '{label}' has the type {'ball' if model.jnt_type[j] else 'free'}", "hinge, slide"
             raise ModelError(what, where=where, allowed=allowed, hint="delete a free joint; replace a ball by hinges")
         place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         origin = at @ _shift(place - last) @ joint_displacement_transform(axis, -ref, kind)

@@ -37,7 +37,7 @@ class Parameter:
             is_low = self.value < self.lower
             side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)
             what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
-            where, hint = f"parameter {self.name}", "change the value, or widen the bounds under `parameters`"
+            where, hint = f"parameter {self.name}", f"change parameters.{self.name}.initial, or its `bounds`"
             raise ConfigError(what, where=where, allowed=f"{self.lower:g} to {self.upper:g} {self.unit}", hint=hint)
 
 

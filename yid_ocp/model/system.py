@@ -287,7 +287,7 @@ class System(ReprMixin):
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
-            raise ModelError(f"gravity = {gravity} is invalid", where="gravity", allowed="three finite numbers [m/s^2]")
+            raise ModelError(f"gravity = {gravity} is invalid", where="gravity", allowed="3 finite numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
@@ -460,7 +460,7 @@ def _check_names(
 ) -> None:
     """Raise `ModelError` for a name that does not exist or is used twice, or a tree without joints."""
     if not tree.joints:
-        what, hint = "the model has no joint", "give a robot with movable joints, an object, or both"
+        what, hint = "the model has no joint", "set model.robot (with movable joints), model.object, or both"
         raise ModelError(what, where=f"model '{tree.name}'", allowed="one joint or more", hint=hint)
     for joint in [*driven, *prescribed]:
         tree.joint_index(joint)

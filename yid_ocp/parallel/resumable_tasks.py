@@ -147,7 +147,7 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     if first.partition(":")[0] in {kind.__name__ for kind in YidError.__subclasses__()}:
         told = dict(line.strip().partition(": ")[::2] for line in rest.splitlines())  # as `YidError.__str__` writes it
         where = f"task '{failed[0].name}': {told.get('where', 'its arguments')}"
-        hint = f"{told.get('try', 'correct this cause')}. The command, run again, repeats only the failed tasks"
+        hint = f"{told.get('try', 'correct this cause')}. Then repeat this command: only the failed tasks run again"
         raise ParallelWorkError(what, where=where, allowed=told.get("allowed", "tasks without errors"), hint=hint)
     raise RuntimeError(f"{what}; the same command tries them again")
 
@@ -338,7 +338,7 @@ def _dask_executor(
         client = _client(distributed, where)
     except AssertionError:
         what = f"the event loop of Dask did not start within {10 * _MAX_CLIENT_STARTS} s"
-        hint = "run the command again when this machine is less busy"
+        hint = "close other programs, or wait until they end; then repeat this command"
         refusal = ParallelWorkError(what, where=scheduler, allowed="a machine with free processors", hint=hint)
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
         what = f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}"

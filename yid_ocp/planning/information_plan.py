@@ -106,7 +106,7 @@ def plan_informative_motion(
     begins = [_smooth(experiment, search.shrink_coefficients_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
         what, allowed = "none of the random initial motions keeps the limits", "limits within which the arms can move"
-        raise ConfigError(what, where="plan.limits", allowed=allowed, hint="widen plan.limits")
+        raise ConfigError(what, where="plan.limits", allowed=allowed, hint="widen plan.limits, or plan.duration")
     unseen = _unseen(experiment, [rows for _, rows in begins])
     _check_seen(chosen, rivals, unseen, experiment)
     found = []
@@ -282,8 +282,8 @@ def _plan(
     best = int(np.argmax([one.configured_criterion for one in judged]))
     chosen = judged[best]
     if not np.isfinite(chosen.configured_criterion):
-        what, hint = "no motion found can be simulated with the torques it needs", "lower plan.limits.max_acceleration"
-        raise SolverError(what, where="plan", allowed="a motion whose torques reproduce it", hint=hint)
+        what, hint = "no planned motion can be simulated by its torques", "lower plan.limits.max_acceleration"
+        raise SolverError(what, where="plan", allowed="a motion that the model follows with its torques", hint=hint)
     w, message = chosen.w, "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
         way = "lower plan.limits, or set another plan.start_joint_positions"

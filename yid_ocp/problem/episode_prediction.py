@@ -552,7 +552,7 @@ def _first_points_error(predictor: EpisodePredictor, early: Episode, theta: Arra
 
 def sensor_not_predictable_at_nodes_error(group: str) -> SolverError:
     """Make the `SolverError` for a sensor whose readings cannot be computed from the states at nodes."""
-    what = f"multiple shooting cannot use '{group}', which measures velocities, accelerations or constraint forces"
+    what = f"multiple shooting cannot use '{group}', which is no sensor of positions"
     hint = f"set solver.name: gauss_newton, or sensors.{group}.use: false"
-    allowed = "sensors whose readings follow from the states at nodes"
+    allowed = "sensors of positions, such as points and encoders"
     return SolverError(what, where=f"sensors.{group}", allowed=allowed, hint=hint)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.effects import EffectBase
-from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel
 from yid_ocp.problem.measurements import (
@@ -341,15 +341,15 @@ def check_free_parameter_names(system: System, free: Sequence[str], options: Pro
         raise ConfigError(what, where="free parameters", allowed="every name once", hint=hint)
     for name in (*options.local_parameters, *options.prior_stds):
         if name not in free:
-            what = f"the parameter '{name}' has a prior or differs per recording, but is not free"
-            where = f"parameters.{name}"
-            raise ConfigError(what, where=where, **unknown_name_error_arguments(name, free, f"set {where}.free: true"))
+            noun, where = "value per recording" if name in options.local_parameters else "prior", f"parameters.{name}"
+            what, allowed = f"the parameter '{name}' has a {noun}, but is not free", f"{where}.free: true"
+            raise ConfigError(what, where=where, allowed=allowed, hint=f"set {where}.free: true")
 
 
 def check_unique_recording_names(names: Sequence[str]) -> None:
     """Check that no two estimation recordings have the same name. Raises `ConfigError`."""
     if twice := [name for name in names if names.count(name) > 1]:
-        what, hint = f"two recordings are called '{twice[0]}'", "rename one of them"
+        what, hint = f"two recordings are called '{twice[0]}'", "rename one of the two files"
         raise ConfigError(what, where="recordings.estimate", allowed="every name once", hint=hint)
 
 

@@ -60,7 +60,7 @@ def rollout_time_grid(recording: Recording, time_step: float, duration: float | 
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if steps < 2:
         what = f"{span:.3g} s of data are shorter than two time steps"
-        hint, allowed = "record longer, or set a smaller time step", f"at least {2 * time_step:g} s of data"
+        hint, allowed = "set a smaller problem.time_step, or record longer", f"at least {2 * time_step:g} s of data"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     return TimeGrid(float(t[0]), time_step, steps)
 

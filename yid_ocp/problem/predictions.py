@@ -70,7 +70,7 @@ def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
     at, where = recorded_point_positions(recording, points), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
         what, allowed = f"there are {len(at)} frames of the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
-        raise DataError(what, where=where, allowed=allowed, hint="remove the recording from the settings")
+        raise DataError(what, where=where, allowed=allowed, hint="remove it from the list in `recordings`")
     start = np.asarray(at[_GIVEN_FRAMES - 1])
     if not np.all(np.isfinite(start)):
         hidden = points[int(np.argmin(np.isfinite(start).all(axis=1)))]

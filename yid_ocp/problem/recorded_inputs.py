@@ -290,7 +290,7 @@ def _clamp_course(
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if np.any(length < 1e-6):
         what = f"points '{clamp.origin_point_name}' and '{clamp.z_axis_point_name}' coincide"
-        allowed, hint = "two points at least 1e-6 m apart", "choose two other points for the pose of the clamp"
+        allowed, hint = "two points at least 1e-6 m apart", "choose other points for this clamp under model.object"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     d = direction / length
     about_y = np.arcsin(np.clip(d[:, 0], -1, 1))

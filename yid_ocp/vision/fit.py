@@ -161,8 +161,8 @@ class ShapeFitter:
         shape). Passes on points run from the best result. Raises `DataError` if the filtered `cloud` has no points.
         """
         if not len(cloud.points) or not len(cloud.skeleton_nodes):
-            what, allowed = "the cloud has no points or no skeleton nodes", "a cloud with points and skeleton nodes"
-            raise DataError(what, where="argument cloud", allowed=allowed, hint="check the filters of the cloud")
+            what = f"the cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
+            raise DataError(what, where="cloud", allowed="one of them or more", hint="loosen track.options.filters")
         free = list(self.free_joints)
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]

@@ -105,8 +105,8 @@ def _read_depth_image(path: Path) -> Array:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
-        what, hint = "the depth image is empty, damaged or not one channel of 16 bits", "write it as 16-bit grey PNG"
-        raise DataError(what, where=str(path), allowed="16-bit grey PNG", hint=hint)
+        what = f"the depth image has shape {image.shape}, type {image.dtype}" if image.size else "the image is damaged"
+        raise DataError(what, where=str(path), allowed="16-bit grey PNG", hint="write the image again as 16-bit PNG")
     return image.astype(np.float64)
 
 
@@ -215,7 +215,7 @@ def read_frame_folder(
     path = Path(folder)
     if not path.is_dir():
         allowed = f"a folder with {STAMP_FILE} and clouds or depth images"
-        raise DataError("the folder of frames does not exist", where=str(path), allowed=allowed, hint="check the path")
+        raise DataError("there is no such folder", where=str(path), allowed=allowed, hint="correct track.frames_path")
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
     camera = frames.validated_camera_pose(head.get("pose") if pose is None else pose, where)
@@ -304,8 +304,8 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        what, hint = "the intrinsics lack keys or have unknown keys", "write exactly the allowed keys"
-        raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
+        what = f"the intrinsics have the keys: {', '.join(map(str, entry)) if isinstance(entry, dict) else 'none'}"
+        raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint="write exactly the allowed keys")
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
     if not isinstance(coefficients, (list, tuple)) or not all(type(k) in (int, float) for k in coefficients):

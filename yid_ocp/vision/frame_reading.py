@@ -84,7 +84,7 @@ def _decoded(bag: OpenBag, message: BagMessage) -> Any:
             if number == before:
                 return bag.reader.deserialize(data, connection.msgtype)
     what, allowed = "the bag has changed since it was opened", "a bag that is not being written"
-    raise DataError(what, where=str(bag.path), allowed=allowed, hint="run the command again when the bag is complete")
+    raise DataError(what, where=str(bag.path), allowed=allowed, hint="repeat this command when the recording has ended")
 
 
 def _first(bag: OpenBag, topic: str) -> Any:
@@ -234,5 +234,5 @@ def read_frames(
         allowed = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})"
         hint = "write depth images as 16-bit PNG into a folder with timestamps.csv and camera.json"
         raise DataError("the file or folder is not a frame sequence", where=str(place), allowed=allowed, hint=hint)
-    allowed = "a folder of frames, or a bag"
-    raise DataError("there is no such file or folder", where=str(place), allowed=allowed, hint="check the path")
+    allowed, hint = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})", "correct track.frames_path"
+    raise DataError("there is no such file or folder", where=str(place), allowed=allowed, hint=hint)

@@ -275,7 +275,7 @@ def load_robot_meshes_by_joint(
     path = urdf_path_from_robot_name(urdf)
     if not is_file(path):
         what, allowed = f"there is no URDF file '{path}'", "the path of a URDF file, or package:NAME"
-        raise ModelError(what, where=str(urdf), allowed=allowed, hint="check the path")
+        raise ModelError(what, where=str(urdf), allowed=allowed, hint="correct model.robot")
     bare = {"build_scene_graph": False, "load_meshes": False, "load_collision_meshes": False}
     try:
         robot = yourdfpy.URDF.load(str(check_input_file(path)), **bare)
@@ -299,7 +299,7 @@ def load_robot_meshes_by_joint(
                 joint, placement = _carrier(mechanism, link.name)
                 parts.setdefault(joint, []).append(mesh.transformed(placement @ origin))
     if not parts:
-        what, hint = f"the URDF has no {kind} meshes", "set track.options.robot_mesh_kind to the other kind"
+        what, hint = f"the URDF has no {kind} meshes", "set track.options.robot_mesh_kind to visual or collision"
         raise ModelError(what, where=str(path), allowed="a URDF with meshes or primitive shapes", hint=hint)
     return {joint: TriangleMesh.concatenate(entries) for joint, entries in parts.items()}
 
@@ -347,7 +347,7 @@ def extra_meshes_by_joint_index(extra: Sequence[ExtraMesh], mechanism: Mechanism
         if entry.mesh_file is not None:
             if not is_file(Path(entry.mesh_file)):
                 what, allowed = f"there is no mesh file '{entry.mesh_file}'", "an STL, OBJ or DAE file"
-                raise ModelError(what, where=where, allowed=allowed, hint="check the path")
+                raise ModelError(what, where=where, allowed=allowed, hint="correct mesh_file")
             mesh = _load_mesh_file(Path(entry.mesh_file))
         assert mesh is not None
         joint, placement = -1, np.eye(4)

@@ -72,11 +72,11 @@ def batch_runs_from_configs(
     for i, path in enumerate(paths):
         if not path.is_file():
             near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            hint, what = nearest_name_question(path.name, near) or "check the path", "there is no such configuration"
+            hint, what = nearest_name_question(path.name, near) or "correct the path", "there is no such configuration"
             raise ConfigError(what, where=str(path), allowed="an existing YAML file", hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
             what, allowed = "the configuration is given twice", "every configuration once"
-            raise ConfigError(what, where=str(path), allowed=allowed, hint="leave one of them out")
+            raise ConfigError(what, where=str(path), allowed=allowed, hint="remove one of the two arguments")
     entries = [(path.stem, path, tuple(overrides)) for path in paths]
     if recordings is not None:
         files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())

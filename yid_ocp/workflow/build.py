@@ -214,7 +214,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             value = entry.value if given.initial is None else factor * given.initial
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
-                what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are out of range or reversed"
+                what = f"bounds {lower:g} to {upper:g} {entry.unit}: {'reversed' if lower > upper else 'too wide'}"
                 allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
             with add_setting_location_to_errors(run, "parameters", key, "initial"):
@@ -226,15 +226,15 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
 def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
     if said.kind != "law":
         if said.law_csv is not None or said.depends_on is not None:
-            what, where = f"{said.kind} has `law_csv` or `depends_on`, keys of a law", f"{said.kind}@{said.location}"
-            allowed, hint = "`law_csv` and `depends_on` with kind: law", "leave them out, or set kind: law"
+            what, where = "`law_csv` and `depends_on` belong to kind: law", f"{said.kind}@{said.location}"
+            allowed, hint = f"kind: {said.kind} with `location` and `values`", "remove both keys, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         made = make_effect(said.kind, said.location, system, dict(said.values))
         return lower_smoothing_speed_to_joint_min(made, system)
     if said.law_csv is None or said.depends_on is None or said.values:
-        what, hint = "the law lacks `law_csv` or `depends_on`, or has `values`", "set the two keys, and remove `values`"
-        allowed = "`law_csv` and `depends_on`, without `values`"
-        raise ConfigError(what, where=f"law@{said.location}", allowed=allowed, hint=hint)
+        fault = "has `values`" if said.values else "has no `law_csv`" if said.law_csv is None else "has no `depends_on`"
+        where, allowed = f"law@{said.location}", "law_csv: FILE.csv and depends_on: QUANTITY, without `values`"
+        raise ConfigError(f"the law {fault}", where=where, allowed=allowed, hint="write exactly these two keys")
     return torque_law_from_tables(said.location, system, read_torque_law_tables(Path(said.law_csv), said.depends_on))
 
 

@@ -149,7 +149,7 @@ def build_problem(
     estimate, held_out = read_recordings_of_role(run), read_recordings_of_role(run, "held_out")
     if not estimate:
         what, allowed = "no recording is listed for estimation", "one recording or more"
-        raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
+        raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="list a recording")
     _check_sensors(run, [*estimate, *held_out])
     estimate, held_out, issues = _check_recordings(run, system, free, estimate, held_out)
     said = replace(make_problem_options(run, system, [*estimate, *held_out, *reference_recordings]), data_issues=issues)
@@ -371,7 +371,7 @@ def _raise_for_issues(run: RunSettings, issues: Sequence[Issue]) -> None:
     more = [f"{issue.location_text}: {issue.what}" for issue in others]
     what = "; ".join([f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}", *more])
     hint = first.advice + (f" ({first.setting})" if first.setting else "")
-    raise DataError(what, where=first.location_text, allowed="recordings without this issue", hint=hint)
+    raise DataError(what, where=first.location_text, allowed="the limits in docs/reference/data_checks.md", hint=hint)
 
 
 def _gravest_first(issues: Sequence[Issue]) -> list[Issue]:

@@ -156,7 +156,7 @@ def propose_config_choices(
     joints = tuple(tree.joint_names[j] for j in sorted(needed)) if branches else tree.joint_names
     for other in recordings:
         for name in (name for name in joints if name not in other.joint_names):
-            what, hint = f"the recording lacks joint '{name}', which {first.name} has", "record it, or leave this out"
+            what, hint = f"the recording lacks joint '{name}', which {first.name} has", "leave this file out"
             raise ConfigError(what, where=other.name, allowed=f"the joints {', '.join(joints)}", hint=hint)
     mode, why = _mode(first, recorded, bool(held), has_object=bool(branches))
     moving = ""

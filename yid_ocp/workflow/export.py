@@ -137,7 +137,7 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         values = {name: float(entry["value"]) for name, entry in parameters.items()}
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         where = str(folder / "result.json")
-        allowed, hint = "a result of `solve` or `diagnose` of this version", "run the command again"
+        allowed, hint = "a result of `solve` or `diagnose` of this version", "repeat the command that made the folder"
         raise DataError("the result has no parameters", where=where, allowed=allowed, hint=hint) from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
@@ -157,7 +157,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         raise ConfigError(f"there is no format '{form}'", where=where, allowed=allowed, hint=hint)
     calibrated = _read_calibrated_model(folder)
     if out.exists() and any(map(out.samefile, input_files_by_name(calibrated.nominal_settings).values())):
-        what, hint = "the file is an input of the run", "choose another --out"
+        what, hint = "the file to write is an input of the run", "choose another --out"
         raise OutputError(what, where=str(out), allowed="a file that the run does not read", hint=hint)
     progress.begin_stage("building the model")
     full = calibrated.system()

@@ -64,7 +64,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds, parts))
             solved[law] = (settings, problem, solution)
         if not fits:
-            what, hint = "no friction law could be fitted", "run `yid-ocp check` with this configuration"
+            what, hint = "no friction law could be fitted", "correct the issues that `yid-ocp check` lists"
             where = run.setting_location("recordings")
             raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
         best = friction_law_comparison.simplest_fit_within_one_std_error(fits, kinds)

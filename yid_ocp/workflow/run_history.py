@@ -70,15 +70,15 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
         effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
-        what = "parameters or covariance are missing or not readable: the run failed, or another version wrote it"
+        what = f"the key {error} is missing" if isinstance(error, KeyError) else f"a value is not valid ({error})"
         hint = "repeat the `solve` or `diagnose` that made this folder"
-        raise DataError(what, where=str(file), allowed="keys as this version writes them", hint=hint) from error
+        raise DataError(what, where=str(file), allowed="keys and values of this version", hint=hint) from error
     if not names:
         what, hint = "the run determined no parameter", "give a run that estimated one with a standard deviation"
         raise DataError(what, where=str(file), allowed="one parameter or more in `covariance`", hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
-        raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint="run the command again")
+        raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint="repeat the `solve` of this folder")
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
 
 
@@ -121,11 +121,11 @@ def read_result_file(file: Path) -> dict[str, Any]:
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), allowed=allowed, hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
-        what, hint = "the file does not hold the result of a run", "run the command again"
+        what, hint = "the file is not a result of a run", "repeat the command that made the folder"
         raise DataError(what, where=str(file), allowed="an object in JSON", hint=hint)
     if result.get("format") in _OLD_FORMATS or "doubts" in result:  # an old key
         what = f"an earlier version wrote this result ({result.get('format')}), with other names of keys"
-        what, hint = f"{what}; {RENAMED_NAMES_HINT}", "run the command again with this version"
+        what, hint = f"{what}; {RENAMED_NAMES_HINT}", "repeat the command that made the folder, with this version"
         raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_FORMAT_BY_COMMAND.values()), hint=hint)
     return result
 
@@ -218,7 +218,7 @@ def recordings_without_effect_or_reason(run: RunSettings) -> tuple[tuple[Recordi
         if not is_file(file):
             where = ("recordings", "without_effect", i)
             what, allowed = f"there is no such recording: {file}", "the path of an existing file"
-            raise run.config_error(what, *where, allowed=allowed, hint="check the path")
+            raise run.config_error(what, *where, allowed=allowed, hint="correct the path")
         found.append(read_recording(file))
     for folder in () if found else run.diagnosis.baseline_run_folders:
         there = _settings(folder)
@@ -243,7 +243,7 @@ def require_recordings_not_in_baseline(
             if not runs or run.recordings.without_effect:
                 where = ("recordings", "without_effect")
                 what = f"the recording {episode.name} is also a reference recording"
-            raise run.config_error(what, *where, allowed="other recordings", hint="leave it out of one of the two")
+            raise run.config_error(what, *where, allowed="other recordings", hint="remove it from one of the two lists")
 
 
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:

@@ -119,10 +119,9 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
     try:
         yield
     except YidError as error:
-        own = tuple(error.where.split("."))
-        where = run.setting_location(*(own if own[: len(path)] == path else path))
-        if error.where and error.where not in where:
-            where = f"{where} ({error.where})"
+        inner = tuple(error.where.split("."))  # the key itself may come from --set
+        where = run.setting_location(*(inner if inner[: len(path)] == path else path))
+        where = where if error.where in where else f"{where} ({error.where})"
         raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error
 
 
@@ -166,7 +165,7 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
         return file
     near = file.parent.glob(f"*{file.suffix}") if file.parent.is_dir() else ()
     names = [entry.name for entry in near if entry.is_file()]
-    hint = nearest_name_question(file.name, names) or "check the path, which is relative to the configuration file"
+    hint = nearest_name_question(file.name, names) or "correct the path (relative to the configuration file)"
     raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 

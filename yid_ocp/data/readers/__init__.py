@@ -75,7 +75,7 @@ def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
 def _format_of(path: Path) -> str:
     if not path.suffix and not path.exists():
         near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-        hint = nearest_name_question(path.name, near) or "check the path"
+        hint = nearest_name_question(path.name, near) or "correct the path: no file of its folder has a similar name"
         raise DataError("there is no such file", where=str(path), allowed="an existing file or folder", hint=hint)
     key = path.suffix.lower()
     if path.is_dir():

@@ -193,7 +193,7 @@ def _read_bag(
     if not groups and not seen and not bag.mounted:
         kinds = ", ".join((*_KNOWN, _TREES[0]))
         allowed = f"topics of the types {kinds}, or fields of any: --field position=/TOPIC.FIELD"
-        what, hint = "the bag has no joint states and no points", "name a topic's field by --field, or another bag"
+        what, hint = "the bag has no joint states and no points", "add --field position=/TOPIC.FIELD"
         raise bag.file.no_usable_topics_error(what, allowed, hint)
     places = [message for entries in seen.values() for _, message in entries]
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]

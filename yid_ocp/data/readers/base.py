@@ -117,7 +117,7 @@ def parse_old_to_new_joint_names(entries: Iterable[str], where: str) -> dict[str
             raise DataError(f"the entry '{entry}' lacks the name of a joint", where=where, allowed=allowed, hint=hint)
         if recorded in found or name in found.values():
             what, allowed = f"the joint '{name}' is chosen twice", "every joint once"
-            raise DataError(what, where=where, allowed=allowed, hint="remove one of the two entries")
+            raise DataError(what, where=where, allowed=allowed, hint="remove one of its two entries in --joints")
         found[recorded] = name
     return found
 

@@ -196,7 +196,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     table = np.array(numbers).reshape(-1, len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
     if not numeric.any():
-        hint = "check that the file is a table, and set its --delimiter"
+        hint = "set the --delimiter between its columns; --preview shows how the columns are read"
         raise DataError("the table has no column of numbers", where=str(path), allowed=_ALLOWED, hint=hint)
     text = ~np.isfinite(table) & (np.array(blank).reshape(table.shape) == 0)
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
@@ -284,7 +284,7 @@ def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
     while line := file.readline(_MAX_LINE_LENGTH + 1):
         if len(line) > _MAX_LINE_LENGTH:
             what, allowed = f"a line has more than {_MAX_LINE_LENGTH} characters", "one row of numbers per line"
-            raise DataError(what, where=str(path), allowed=allowed, hint="check that the file is a table of numbers")
+            raise DataError(what, where=str(path), allowed=allowed, hint="export the measurements as CSV")
         yield line
 
 
@@ -310,7 +310,7 @@ def _read_table(
             bad.append(line)
     table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
     if not len(table):
-        allowed, hint = "one header row, then one row per time", "check that the export is complete"
+        allowed, hint = "one header row, then one row per time", "export the measurements again, with their rows"
         raise DataError("the table has no rows", where=str(path), allowed=allowed, hint=hint)
     n_lines = len(table) + len(bad)
     if len(bad) > _MOST_BAD * n_lines:

@@ -102,7 +102,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         allowed = "columns point, x, y, z with numbers in metres"
         is_lost = isinstance(error, KeyError)
         what = f"the table of vertices has no column {error}" if is_lost else f"a coordinate is not a number: {error}"
-        raise DataError(what, where=str(path), allowed=allowed, hint="correct the table") from error
+        raise DataError(what, where=str(path), allowed=allowed, hint="correct it, one row for each point") from error
 
 
 def length_parameters_from_edges(cable: CableVertices, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
