@@ -208,7 +208,7 @@ def test_a_configuration_has_a_law_by_its_table(tmp_path):
     assert [effect.label for effect in made.effects] == ["law@T1"]
     assert made.parameters["law@T1.angle3"].value == pytest.approx(tables()[0].torque[3])
     for wrong, text in (
-        ("{kind: law, location: T1}", "lacks `law_csv` or `depends_on`"),
+        ("{kind: law, location: T1}", "has no `law_csv`"),
         (f"{{kind: kelvin_voigt, location: T1, law_csv: {file}}}", "kelvin_voigt has `law_csv` or `depends_on`"),
     ):
         with pytest.raises(ConfigError, match=text):

@@ -375,7 +375,7 @@ class Poor:
             except InsufficientMemoryError as error:
                 messages.append(str(error))
             else:
-                assert all("not enough memory for" in m and " MB" in m and "fewer parameters" in m for m in messages)
+                assert all("not enough memory: " in m and " MB" in m and "fewer parameters" in m for m in messages)
                 return grants
             finally:
                 assert self.held.value == 0

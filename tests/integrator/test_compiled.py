@@ -87,7 +87,7 @@ def test_a_rollout_beyond_all_memory(refused_with, urdf_folder, use_compiler):
     ):
         simulate(step, theta, start, 10**14)
     wide = SensitivityDirections((), np.broadcast_to(0.0, (4, 10**15)))
-    said = r"3 steps with 1000000000000000 derivatives, which needs 1\.28e\+08 GB"
+    said = r"3 steps with 1000000000000000 derivatives needs 1\.28e\+08 GB"
     with pytest.raises(InsufficientMemoryError, match=said):
         step.kernel.rollout(RolloutInputs(theta, start, nothing, np.zeros((4, 0)), None, wide))
 

@@ -206,5 +206,5 @@ def test_rates_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
         ends = [problem.evaluate(x + sign * size * np.eye(3)[i]).residual[rows] for sign in (1, -1)]
         numeric, exact = (ends[0] - ends[1]) / (2 * size), evaluation.jacobian[rows, i]
         np.testing.assert_allclose(exact, numeric, atol=1e-5 * np.abs(numeric).max())
-    with pytest.raises(SolverError, match=r"measures .*constraint forces"):
+    with pytest.raises(SolverError, match=r"no sensor of positions"):
         transcribe(problem)
