@@ -202,14 +202,15 @@ def _none_good(
         f"{len(reasons)} of {len(frames)} because {reasons[0]}{' (one of them)' * (len(set(reasons)) > 1)}"
         for reasons in often
     )
-    cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFIT_REASONS))
+    most = next((reasons[0] for reasons in often), "")
+    cause = _because(sizes, most.startswith(_MISFIT_REASONS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
     of_cause = {
         "stamp is late": "set track.options.clock_offset_search.initial_stamp_minus_joint_time, or drop late frames",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
         "crosses or touches itself": "record the object without crossings, or look whether the filters join its parts",
     }
-    hint = next((own for words, own in of_cause.items() if words in listed), _hint(sizes, things, hint))
+    hint = next((own for words, own in of_cause.items() if words in most), _hint(sizes, things, hint))
     what, allowed = f"{cause}no frame could be used: {listed}", "one usable frame or more"
     return DataError(what, where=source, allowed=allowed, hint=hint)
 
