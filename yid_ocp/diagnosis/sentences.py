@@ -265,7 +265,7 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         rivals = abbreviated_names_text(result.confusable_parameter_changes)
         alike = [f"a change of {rivals} explains the recordings about as well as the effects"] * bool(rivals)
         moved = [*moved, *alike] or ["no parameter has changed detectably"]
-        text.append(_listed("Since the baseline, ", moved))
+        text.append(_listed("Compared with the baseline: ", moved))
         differ = f"The runs of the baseline differ from each other (p = {since.between_runs_p_value:.2g})"
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
         notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}; the ± of the baseline includes this.")

@@ -129,7 +129,7 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if right["of"]:
         said.append(f"of {right['of']} gaps found, {right['count']} had the true kind and place as first answer")
     if result.get("not_judged"):
-        said.append(f"{result['not_judged']} not judged: these thresholds require refits that were not made")
+        said.append(f"{result['not_judged']} not judged: these thresholds need fits that the diagnosis did not make")
     if alarms["of"]:
         said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
     yield from (SummaryStatement(text, "verdict") for text in said)
