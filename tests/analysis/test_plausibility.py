@@ -480,7 +480,7 @@ def errors_of_guess(names, value, run=None, cable=None):
     seen = SimpleNamespace(sensor=sensor, value=value, node=np.arange(len(value)), fraction=0.0)
     grid = SimpleNamespace(start_time=0.5, node_times=np.array([0.5, 1.0]))
     episode = SimpleNamespace(recording=run, name="run", measurements=[seen], grid=grid)
-    options = ProblemOptions(initial_state="equilibrium", cable_topology=cable)
+    options = ProblemOptions(initial_state="equilibrium", cable_vertices=cable)
     problem = SimpleNamespace(options=options, step=SimpleNamespace(time_step=0.1))
     fit = SimpleNamespace(evaluation=None)
     [told], *_ = prediction_errors_units_and_fit_rmse(problem, fit, [(episode, "not predicted")])

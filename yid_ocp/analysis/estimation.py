@@ -289,7 +289,7 @@ def _prediction_error_entry(
         for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
             entry["rmse"] |= _errors(samples, predicted, fixed)
     for samples in episode.measurements:
-        for name, predicted in _baselines(episode, samples, options.cable_topology).items():
+        for name, predicted in _baselines(episode, samples, options.cable_vertices).items():
             if errors := _errors(samples, predicted, fixed):
                 entry["baselines"].setdefault(name, {}).update(errors)
     return entry

@@ -90,7 +90,7 @@ class ProblemOptions:
         Discretisation errors that the standard deviations include: `links`, `time_step`.
     divided_links_model : DividedLinksModel, optional
         Model with divided links, required to check `links`.
-    cable_topology : CableVertices, optional
+    cable_vertices : CableVertices, optional
         Topology of a cable held by clamps, for its baselines.
     """
 
@@ -162,7 +162,7 @@ class ProblemOptions:
     excess_residual_criteria: ExcessResidualCriteria = ExcessResidualCriteria()
     checked_discretisations: tuple[RefinementKind, ...] = ("links", "time_step")
     divided_links_model: DividedLinksModel | None = field(default=None, compare=False, repr=False)
-    cable_topology: CableVertices | None = field(default=None, compare=False, repr=False)
+    cable_vertices: CableVertices | None = field(default=None, compare=False, repr=False)
 
     @property
     def has_no_data_issue_above_warning(self) -> bool:

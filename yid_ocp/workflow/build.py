@@ -61,7 +61,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     model, arms = run.model, run.model.arms
     run_inputs.input_files_by_name(run)
     run_inputs.load_plugins(run)
-    if (cable := cable_topology_between_clamps(run)) is not None:
+    if (cable := cable_vertices_between_clamps(run)) is not None:
         return _completed(run, _clamped_system(run, cable))
     robot = None
     if model.robot is not None:
@@ -130,10 +130,10 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
     return build_system(load_config(path, overrides))
 
 
-def cable_topology_between_clamps(run: RunSettings) -> CableVertices | None:
+def cable_vertices_between_clamps(run: RunSettings) -> CableVertices | None:
     """Return the measured vertices and clamps of a run's cable. None for an object that is not held by clamps."""
     with add_setting_location_to_errors(run, "model", "object"):
-        return None if run.model.object is None else run.model.object.clamped_cable_topology()
+        return None if run.model.object is None else run.model.object.clamped_cable_vertices()
 
 
 def are_arm_states_estimated(run: RunSettings) -> bool:

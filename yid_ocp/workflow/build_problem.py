@@ -35,7 +35,7 @@ from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
-from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
+from yid_ocp.workflow.build import build_step, build_system, cable_vertices_between_clamps, free_parameter_names
 from yid_ocp.workflow.run_inputs import check_names_in_setting, read_recordings_of_role
 
 log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         for name in {group.name for group in groups if is_point_group_measured_by_arm(group)}:
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
-    cable = cable_topology_between_clamps(run)
+    cable = cable_vertices_between_clamps(run)
     own = build.marker_position_values_by_recording(run, system, recordings)
     for name, factors in servo_gain_parameters_by_recording(system, recordings).items():
         # gains in the settings take precedence over recorded ones
@@ -107,7 +107,7 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
         excess_residual_criteria=run.diagnosis.fit_excess_residual_criteria,
         checked_discretisations=kinds.get(checked, ()),
         divided_links_model=divided,
-        cable_topology=cable,
+        cable_vertices=cable,
     )
 
 
@@ -228,7 +228,7 @@ def _check_recordings(
 ) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:
     """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
     issues: list[Issue] = []
-    cable = cable_topology_between_clamps(run)
+    cable = cable_vertices_between_clamps(run)
     kept: tuple[list[Recording], list[Recording]] = [], []
     arm = None if cable is not None else RecordedJointsModel.from_system(system, free)
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices

@@ -25,7 +25,7 @@ from yid_ocp.problem.measurements import rollout_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes, select_path_cutoff
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
-from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
+from yid_ocp.workflow.build import build_step, cable_vertices_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -89,7 +89,7 @@ def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Map
     """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
-    [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system
+    [recording], cable, system = read_recordings_of_role(run, count=1), cable_vertices_between_clamps(run), step.system
     clamps = () if cable is None else cable.clamp_pose_point_names
     grid = rollout_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):

@@ -188,7 +188,7 @@ class ObjectBuilder:
     """The base class of all kinds of flexible objects in `OBJECT_KINDS`. Its fields are the object's settings.
 
     A subclass overrides `kind`, and `segment_definitions` or `build`. A kind that forms a whole system with its clamps,
-    such as a cable, overrides `clamped_cable_topology` and the two methods after it.
+    such as a cable, overrides `clamped_cable_vertices` and the two methods after it.
     """
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
@@ -228,7 +228,7 @@ class ObjectBuilder:
         per_joint = {segment.name for segment in self.segment_definitions() if not segment.values_given_as_rigidities}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
-    def clamped_cable_topology(self) -> CableVertices | None:
+    def clamped_cable_vertices(self) -> CableVertices | None:
         """Return the object's vertices and the clamps that hold it at measured points. None for other objects.
 
         Raises `DataError` or `ModelError` if they are inconsistent.

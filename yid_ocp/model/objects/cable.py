@@ -290,7 +290,7 @@ model:
         OptionInfo("CSV table with the columns point, x, y, z [m]"),
     ]
 
-    def clamped_cable_topology(self) -> CableVertices:
+    def clamped_cable_vertices(self) -> CableVertices:
         undeformed = read_vertex_positions_by_name(self.undeformed_shape_file)
         found = CableVertices(self.main_branch_vertex_names, dict(self.child_branch_vertex_names), undeformed)
         for name in self.branch_properties_by_name:
@@ -299,9 +299,9 @@ model:
         return found
 
     def build_system_with_clamps(self, edge_lengths: Mapping[tuple[str, str], float], gravity: Vector3) -> System:
-        return clamped_cable_system(edge_lengths, self.clamped_cable_topology(), replace(self, gravity=gravity))
+        return clamped_cable_system(edge_lengths, self.clamped_cable_vertices(), replace(self, gravity=gravity))
 
     def edge_length_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         if not self.has_edge_lengths_per_recording:
             return {}
-        return length_parameters_from_edges(self.clamped_cable_topology(), edge_lengths)
+        return length_parameters_from_edges(self.clamped_cable_vertices(), edge_lengths)
