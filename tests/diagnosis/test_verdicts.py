@@ -145,6 +145,11 @@ def test_the_error_of_a_long_step_is_no_gap_alone_or_beside_an_effect(bench, joi
     is_finer = steps[0] != steps[1]
     assert ("Time steps of 0.04 s are too long" in told["summary"], finding.discretisation_chi2 > 0) == (is_finer,) * 2
     assert ("the nominal model at 0.02 s" in names) is (steps[0] != steps[1])
+    fit = finding.final_model
+    assert finding.has_time_step_error_in_std
+    for name, value in fit.values.items():
+        error = value - (0.1 if "tau_c" in name else 0.05)
+        assert abs(error) < 2 * fit.std[name], "± counts the error of the step that was used"
 
 
 @pytest.mark.usefixtures("without_law")

@@ -245,11 +245,11 @@ def test_a_group_without_a_sample_has_no_expected_error():
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
 
 
-def copied(system, values, *uncounted, **estimates):
+def copied(system, values, uncounted=(), **estimates):
     """Texts to copy, of estimates given as (value, std, unit, verdict); all parameters have `values`."""
     made = {n: ParameterEstimate(*own[:3], 3.0, 0.0, np.inf, True, own[3]) for n, own in estimates.items()}
     theta = system.parameters.vector(values)
-    return prediction_outputs.copyable_estimate_texts(system, theta, made, ("export", "my runs/a"), *uncounted)
+    return prediction_outputs.copyable_estimate_texts(system, theta, made, ("export", "my runs/a"), uncounted)
 
 
 def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
@@ -276,10 +276,9 @@ def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_fo
 def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     system, lost = build_system(load_config(None)), {"T1.twist": (7.0, 0.5, "N m/rad", "not_identifiable")}
     found = {"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")} | lost
-    told, rough = copied(system, {"T1.bend": 22.0}, (), **found), copied(system, {"T1.bend": 22.0}, **found)
-    assert (told["values"], rough["values"]) == (["T1.bend = 22 ± 0.5 N m/rad"], ["T1.bend = 22 N m/rad"])
-    assert (rough["latex"], rough["uncounted_errors"]) == ([r"T1.bend & $22$ & N m/rad \\"], ["of discretisation"])
-    assert "± with the error of discretisation, run `solve`" in next(copyable_estimates_blocks({"to_use": rough}))
+    told, rough = (copied(system, {"T1.bend": 22.0}, errors, **found) for errors in ((), ["of the time step"]))
+    assert told["values"] == rough["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
+    assert "without the error of the time step" in next(copyable_estimates_blocks({"to_use": rough}))
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 
 import casadi as ca
@@ -158,6 +158,26 @@ def predicted_refit_residual_at_finer_step(
     start = refined._unknowns(coarse.unknown_names, x)
     fitted = fine.evaluate(GaussNewton().minimize_cost(fine, start, None).x, False, at_x.equilibrium_guesses)
     return fitted.residual if fitted.ok and fitted.cost < before.cost else left
+
+
+def stds_with_time_step_and_encoder_errors(
+    fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation, stds: Mapping[str, float]
+) -> dict[str, float] | None:
+    """Add the errors of the time step and of encoder noise to standard deviations of a fit `x` (nx,), as `solve` does.
+
+    `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. Returns None if the
+    motions cannot be predicted with the shorter step.
+    """
+    made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
+    if isinstance(made, str):
+        return None
+    shifts = made[0], _shifts_by_more_encoder_noise(coarse, x, at_x)
+    return {name: _std_with_shifts(std, [own[name] for own in shifts if name in own]) for name, std in stds.items()}
+
+
+def _std_with_shifts(std: float, shifts: Iterable[float]) -> float:
+    """Standard deviation with the errors of finite refinements. Shifts below the standard deviation are ignored."""
+    return math.hypot(std, *(EXTRAPOLATION_FACTOR * move for move in shifts if abs(move) > std))
 
 
 def problem_data_corrected_for_few_links(
@@ -366,8 +386,7 @@ def estimates_widened_by_discretisation_error(
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
         entry = counted[name]
-        shifts = [move for move in astuple(own) if move is not None and abs(move) > entry.std]
-        std = math.hypot(entry.std, *(EXTRAPOLATION_FACTOR * move for move in shifts))
+        std = _std_with_shifts(entry.std, [move for move in astuple(own) if move is not None])
         if not entry.free or not std > entry.std:
             continue
         verdict, said = entry.verdict, verdict_by_relative_std(entry.value, std, sizes.get(name, 0.0))

@@ -36,7 +36,7 @@ from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers import base as solvers
 from yid_ocp.solvers.base import IterationCallback, Solver
 
-_UNCOUNTED_ERROR_TEXTS = {"links": "of the object's links", "time_step": "of the time step"}
+UNCOUNTED_ERROR_TEXTS = {"links": "of the object's links", "time_step": "of the time step"}
 
 
 def solve(
@@ -125,9 +125,9 @@ def add_discretisation_errors(
     sizes = typical_parameter_magnitudes(problem, solution.x)
     inflated = discretisation.estimates_widened_by_discretisation_error(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}
-    uncounted = tuple(words for kind, words in _UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
+    uncounted = tuple(words for kind, words in UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
-        uncounted = tuple(words for words in uncounted if words != _UNCOUNTED_ERROR_TEXTS["links"])
+        uncounted = tuple(words for words in uncounted if words != UNCOUNTED_ERROR_TEXTS["links"])
     checks = EstimateChecksBeyondFit(discretisation_shifts=shifts, notes=tuple(notes), uncounted_errors=uncounted)
     return replace(solution, parameters=inflated), checks
 

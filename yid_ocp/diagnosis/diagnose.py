@@ -13,7 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.discretisation import predicted_refit_residual_at_finer_step, problem_data_corrected_for_few_links
+from yid_ocp.analysis.discretisation import (
+    predicted_refit_residual_at_finer_step,
+    problem_data_corrected_for_few_links,
+    stds_with_time_step_and_encoder_errors,
+)
 from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
@@ -258,8 +262,7 @@ def _with_changed_parameters(
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
     """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 12.0)
-    composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
-    fine = problem_corrected_for_events(composed.problem_with_nominal_and_effects_free(fit.effects), events)
+    fine = _at_finer_step(search, fit, events)
     left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
     if left is None:
         return -math.inf
@@ -269,6 +272,21 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
         [_excess_of(r[at]) for at in part] for r, part in zip((fit.evaluation.residual, left), rows, strict=True)
     )
     return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
+
+
+def _at_finer_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> EstimationProblem:
+    """The problem of a fit at half the time step, without events and without held-out recordings."""
+    composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
+    return problem_corrected_for_events(composed.problem_with_nominal_and_effects_free(fit.effects), events)
+
+
+def _with_errors_of_step_and_encoders(
+    search: RefitContext, fit: RefittedModel, events: EventSet
+) -> tuple[RefittedModel, bool]:
+    """The fit with standard deviations that contain these errors, and whether they could be computed."""
+    found = fit.problem, fit.unknowns, fit.evaluation, fit.std
+    std = stds_with_time_step_and_encoder_errors(_at_finer_step(search, fit, events), *found)
+    return (fit, False) if std is None else (replace(fit, std=std), True)
 
 
 def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined | None:
@@ -393,10 +411,14 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.record_stage_end_time("localisation")
-    remaining, events, final = evidence.nominal_held_out_test, seen.events, nominal
+    remaining, events, final, is_counted = evidence.nominal_held_out_test, seen.events, nominal, False
+    if judged.verdict == "no_gap":
+        final, is_counted = _with_errors_of_step_and_encoders(search, nominal, events)
+        evidence = replace(evidence, nominal_model=final)
     if accepted := judged.accepted_selected_effects:
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
         final = reevaluate_refit_with_all_candidates(search.problem, accepted[-1].refitted_model)
+        final, is_counted = _with_errors_of_step_and_encoders(search, final, events)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
         remaining, rest = _held_out_null_test_and_spread(final, limits)[0], ()
         tests = _estimation_null_test(final, limits), remaining
@@ -436,6 +458,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_used_time_step=(problem.step.time_step, nominal.problem.step.time_step),
         is_corrected_for_links=seen.is_corrected_for_links,
+        has_time_step_error_in_std=is_counted,
         search_seconds=ends["refits"] - ends[""],
         law=law,
     )

@@ -56,6 +56,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     # [s]; they differ if the stated step's error was part of the gap
     stated_and_used_time_step: tuple[float, float] = (0.0, 0.0)
     is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links
+    has_time_step_error_in_std: bool = False  # whether this error was computed, for the final model
     law: NonparametricLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprTexts:

@@ -74,13 +74,12 @@ def copyable_estimate_texts(
     theta: Array,
     estimates: Mapping[str, ParameterEstimate],
     command: Sequence[str],
-    uncounted_errors: Sequence[str] | None = None,
+    uncounted_errors: Sequence[str],
     model_yaml: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return texts to copy, with those of the `estimates` that are identifiable. Empty without such a parameter.
 
-    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±; None: there is no ±, because the
-    error of discretisation, which may be the largest, is unknown), `joints` (number of links and range
+    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `joints` (number of links and range
     of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of
     `latex`, `export` (the `command` to continue with) and `cite`. `theta` (ntheta,) holds all parameters.
     """
@@ -104,11 +103,11 @@ def copyable_estimate_texts(
             shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}
-    told = {n: f"{e.value:.4g}" + ("" if uncounted_errors is None else f" ± {e.std:.2g}") for n, e in found.items()}
+    told = {n: f"{e.value:.4g} ± {e.std:.2g}" for n, e in found.items()}
     rows = [rf"{labels[n]} & ${told[n]}$ & {e.unit} \\".replace("±", r"\pm") for n, e in found.items()]
     return {
         "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in found.items()],
-        "uncounted_errors": ["of discretisation"] if uncounted_errors is None else list(uncounted_errors),
+        "uncounted_errors": list(uncounted_errors),
         "joints": joints,
         "yaml": [*model_yaml, "parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
         "mjcf": lines,
