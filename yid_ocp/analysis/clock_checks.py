@@ -183,8 +183,7 @@ def point_clock_offset_drift_and_rms_error(
     """Find the clock offset [s] and drift that bring points nearest to a known path, and the remaining rms error [m].
 
     The search goes from coarse to fine steps. The path is known from the first to the last time in `knots` [s]. The
-    points `seen` (N, np, 3) [m] have the time stamps `t` (N,). With `drifts`, a drift of up to ± `_MAX_DRIFT` is
-    searched, too; otherwise it is zero.
+    points `seen` (N, np, 3) [m] have the time stamps `t` (N,). `drifts`: also search drifts up to ± `_MAX_DRIFT`.
     """
     middle, span = 0.5 * float(t[0] + t[-1]), float(t[-1] - t[0])
 

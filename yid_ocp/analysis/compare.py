@@ -29,8 +29,7 @@ from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, fit_problem
 from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
 
 _MEMORY_SAMPLING_PERIOD = 0.02
-# Two estimates agree if they differ by less than this many of the larger standard deviation, or by this fraction of the
-# value (below that, the methods' stopping rules dominate).
+# Two estimates agree if they differ by less than this many of the larger std, or this fraction (stopping rules).
 _AGREEMENT_STDS, _AGREEMENT_RTOL = 2.0, 0.005
 _SOLVE_LABEL = "solve"  # the run that gives the verdicts, by all noise
 

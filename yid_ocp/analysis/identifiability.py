@@ -126,8 +126,7 @@ def identifiability(
     whitened residual r with respect to the unknowns x. The standard deviation of an unknown is the root of the
     corresponding diagonal entry of the inverse of I, which includes all nuisances (Ljung 1999, System Identification,
     section 7.4; Raue et al. 2009, Bioinformatics 25:1923, doi:10.1093/bioinformatics/btp358). Raises `SolverError` if
-    the rollout at the point fails, and `ConfigError` if the point is beyond a bound, or if `intervals` contains a name
-    that is not a free parameter.
+    the rollout at the point fails, and `ConfigError` for a point beyond a bound or names in `intervals` that are fixed.
 
     Parameters
     ----------

@@ -222,8 +222,7 @@ def slow_motion_excitation_issues(
     """Yield an issue if the motion is too slow to reveal damping, friction and inertia in the measured efforts.
 
     The efforts due to speed and acceleration must exceed the noise of measured efforts. They are computed by inverse
-    dynamics, plus friction of a typical size. `effort` holds the options of the effort sensor. The recording must
-    contain all angles of `arm`.
+    dynamics, plus friction of a typical size. `effort` holds the options of the effort sensor.
     """
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)

@@ -140,8 +140,7 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
 
     A run is an outlier if it differs significantly from the mean of the others, and the others agree: their own chi2 is
     not significant, or less than half of what it is without any other run. With two runs no outlier is reported. A
-    parameter is tested with its variances, a run with its whole covariance. The significance `level` is divided by the
-    number of parameters or of runs.
+    parameter is tested with its variances, a run with its covariance. `level` is divided by their number.
     """
     mean, chi2, degrees = pool_estimates_and_chi2(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)

@@ -1,7 +1,6 @@
 """Checks of a recording without a model: clocks, gaps, motion, channels and duplicated data.
 
-Limits come from physics or statistics. Checks against a model are in `analysis` (`clock_checks`, `joint_checks`,
-`point_checks`).
+Limits come from physics or statistics. Checks against a model are in `analysis`.
 """
 
 from __future__ import annotations

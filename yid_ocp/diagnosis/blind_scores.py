@@ -325,8 +325,7 @@ def _of(name: str) -> _Statistic:
 def _odds(said: _Statistics, limits: Thresholds, truth: str) -> float:
     """Return the log odds of the most likely single effect against the true effect alone.
 
-    Only refits that leave noise alone are compared, because likelihood separates only these. Minus infinity if the
-    refit of the true effect leaves more.
+    Likelihood separates only refits that leave noise alone: minus infinity if that of the true effect leaves more.
     """
     most = 1 + limits.min_excess_chi2_per_dof
     known = {

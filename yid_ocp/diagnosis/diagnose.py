@@ -77,8 +77,7 @@ def diagnose(
     """Diagnose the gap between model and recordings: find out whether it exists, where it is, and what causes it.
 
     Raises `ConfigError` or `ModelError` if a candidate does not fit the system, `DataError` if a held-out recording is
-    also estimated on or there is no noise level, and `SolverError` if the nominal model cannot be rolled out or its
-    residual is not whitened.
+    also estimated on or there is no noise level, and `SolverError` if the nominal model cannot be rolled out.
 
     Parameters
     ----------

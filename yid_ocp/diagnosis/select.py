@@ -133,8 +133,7 @@ def _near_best_models(
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
         best = min(fits, key=lambda fit: bic_difference(fit, nominal), default=nominal)
-        # errors of the models' responses leave a part of what the best one explains; more than a standard deviation of
-        # chi2 would be found by a test
+        # errors of the models' responses leave a part of what the best one explains; a test would find a std of chi2
         samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
         errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
         decisive = max(_decisive_bic_difference(limits), errors)

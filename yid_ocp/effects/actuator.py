@@ -112,8 +112,7 @@ class _Backlash(_DistortedReading):
     """The backlash of a gear with its encoder on the motor side, so that the measured angle depends on the effort.
 
     A position servo controls the measured angle, so its torque depends on the play z between motor and joint. For a
-    joint with a servo, z is an internal coordinate that solves z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`) in every
-    step and has no memory.
+    joint with a servo, z is an internal coordinate without memory: z = width/2 tanh(torque(q + z)/`_PLAY_TORQUE`).
     """
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"

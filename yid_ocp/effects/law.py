@@ -228,8 +228,7 @@ def torque_law_from_tables(
 def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> tuple[TorqueLawTable, ...]:
     """Read a law's tables, one for each quantity in `depends_on`, from a CSV file as `torque_law_tables_csv` makes it.
 
-    Raises `DataError` if the file is malformed, its knots are not evenly spaced and increasing, or its quantities
-    differ from `depends_on`.
+    Raises `DataError` for a malformed file, knots that are not evenly spaced and increasing, or other quantities.
     """
     allowed = f"a header {','.join(_TABLE_COLUMNS)}, then rows of a quantity, its unit and three numbers"
     hint = "write the table like law.csv in a run folder of `yid-ocp diagnose`"

@@ -2,8 +2,7 @@
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
 (white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2). A chi-squared variable
-with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each parameter that the data determine removes one
-degree of freedom.
+with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each determined parameter removes one of them.
 """
 
 from __future__ import annotations
@@ -133,8 +132,7 @@ def residual_chi2_null_test(
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     """Return (I + F F')^(-1/2) r, which whitens the residual r of covariance I for k further, independent errors.
 
-    r (nr,) is `residual`. F (nr, k) is `spread`; its column j is the change of r by one standard deviation of error j.
-    Columns that are not finite are ignored.
+    r (nr,) is `residual`. F (nr, k) is `spread`; column j is the change of r by one std of error j, ignored if not finite.
     """
     columns, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))

@@ -296,8 +296,7 @@ def _responses(base: _Filtered, chosen: IntArray, correlation: float) -> Array:
     """Innovations caused by disturbances of unit variance of the u chosen unknowns, (rows of all intervals, J u)."""
     model, updates = base.model, base.updates
     ns, count, u, first = len(model.initial_state_std), len(updates), len(chosen), 0
-    # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown;
-    # all before the disturbance stays at zero
+    # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown
     behind, unknown = np.zeros((updates[0].covariance.shape[1], count * u)), np.zeros((count, 1))
     if correlation:  # the first disturbance acted before the start
         behind[:ns, :u] = model.initial_state_jacobian[:, chosen]

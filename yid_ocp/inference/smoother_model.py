@@ -288,8 +288,7 @@ def _steps(
     nx, width, forces = step.sizes["nx"], loads[1].shape[1], pushes.shape[1]
     inputs = np.zeros((len(pushes), step.sizes["nu"], width))
     if feedback is not None:
-        # the momentum of the measured motion contains half the impulse of an unknown force (of the previous step, taken
-        # as that of this step)
+        # the momentum of the measured motion contains half the impulse of an unknown force, taken from this step
         inputs = feedback.gain @ np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
     for pair in linearized_rollout_steps(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span):
         push, done = pushes[done : done + len(pair[0])], done + len(pair[0])

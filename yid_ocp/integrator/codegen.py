@@ -74,8 +74,7 @@ def build_casadi_step_functions(equations: DiscreteEquations) -> StepFunctions:
     outputs = {
         # balance and p1 without the constraints' pull; the share of Dphi(q_m)
         "residual": (balance, e.internal_residual, e.constraint_residual, p1, nonzeros(middle)),
-        # vectors per joint, the remaining entries of the Jacobians, and the derivative of the midpoint's constraint
-        # force by q_k, which equals the one by q_{k+1}
+        # vectors per joint, other entries of Jacobians, derivative of the midpoint's constraint force by q_k or q_{k+1}
         "linear": (_pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown), nonzeros(curve)),
         # share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1
         "matrix": (nonzeros(pulls.start_share * pulls.before_jacobian),),

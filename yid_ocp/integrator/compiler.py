@@ -36,8 +36,7 @@ _LOG = logging.getLogger(__name__)
 
 _COMMON_FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
 _NATIVE_FLAGS = ("-march=native",)
-# Code without branches gains nothing from these passes, which take a third of GCC's time on a step of 50 variables.
-# Other compilers reject these options.
+# Code without branches gains nothing from these passes, which take a third of GCC's time; other compilers refuse them.
 _GCC_FLAGS = ("-fno-tree-dominator-opts", "-fno-tree-ccp", "-fno-tree-bit-ccp")
 
 _OPTIMIZATION_FLAG = "-O1"  # -O2 takes 1.7 times as long on a step of 43 variables, for a gain of 2 to 4 %

@@ -99,8 +99,7 @@ class DiscreteEquations:
     p1: ca.SX
     rigid_body_terms: LagrangianFirstDerivatives
     effect_momentum: ca.SX  # derivative by v of the effects' part of the Lagrangian, such as rotor inertias, (n, 1)
-    # `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force: for
-    # Jacobians without differentiating the tree
+    # `momentum_balance` and `p1` without bodies, p_k, constraint impulses and closed force: for fast Jacobians
     balance_remainder: ca.SX
     p1_remainder: ca.SX
     # sum of those that effects give with their slopes, at the midpoint

@@ -41,8 +41,7 @@ class Equilibrium:
 # encoder error. Without one, the spring is stiff (`RIGID_HOLD_STIFFNESS`).
 _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 
-# A servo holds its joint at a known command. The value is not zero, so that derivatives with respect to the command
-# follow from those with respect to the posture.
+# A servo holds its joint at a known command. Not zero: derivatives by the command follow from those by the posture.
 _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
 _NEWTON_ITERATION_LIMIT = 100
@@ -58,8 +57,7 @@ _MAX_HOLD_DEFLECTION = 0.02  # larger deflections of a holding spring mean a pos
 class EquilibriumSolver:
     """A Newton solver for the static equilibrium of a system with given positions of driven and prescribed joints.
 
-    `known_coordinates` are the indices of these coordinates (driven, then prescribed), `free_coordinates` the indices
-    of the unknown coordinates.
+    `known_coordinates` are the indices of these (driven, then prescribed), `free_coordinates` those of unknown ones.
     """
 
     def __init__(self, step: Step) -> None:

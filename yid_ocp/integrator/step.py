@@ -247,8 +247,7 @@ def simulate(
 ) -> Rollout:
     """Simulate a system for N = `steps` time steps.
 
-    If Newton's method fails, `status` of the result reports it, and the later entries are NaN. Raises `ModelError` if
-    an array has the wrong shape.
+    If Newton's method fails, `status` reports it, and later entries are NaN. Raises `ModelError` for a wrong shape.
 
     Parameters
     ----------

@@ -98,8 +98,7 @@ _INSTABILITY_HINT = (
 class RolloutNewtonSummary:
     """The outcome of a rollout: status code, last Newton correction [rad or m], and counts over all steps.
 
-    `prescribed_effort` (nc,) is the effort at the first node of the last step [N m]. `internal_coordinates` (nz,) are
-    the values after the last step.
+    `prescribed_effort` (nc,) [N m] is that at the start of the last step, `internal_coordinates` (nz,) at its end.
     """
 
     code: NewtonStatusCode
@@ -210,8 +209,7 @@ class RolloutCostGradient:
     """The gradient of a scalar cost along a rollout, by the adjoint method. NaN if a step's equations are singular.
 
     It has the derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu)
-    and the prescribed coordinates at every node (N + 1, nc). The derivatives at node 0 are also part of
-    `by_initial_state`.
+    and the prescribed coordinates at every node (N + 1, nc). `by_initial_state` contains those at node 0.
     """
 
     by_theta: Array

@@ -126,8 +126,7 @@ def flexible_object(
 
     Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`). Parameters are `SEGMENT.length` (or `.length_0`, ...), `.mass`,
     `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` if given). Raises
-    `ModelError` for an unknown parent, a parent after its child, a length, mass or radius that is not positive, or
-    inconsistent links.
+    `ModelError` for an unknown or later parent, a length, mass or radius that is not positive, or inconsistent links.
 
     Parameters
     ----------

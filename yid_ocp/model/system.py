@@ -147,8 +147,7 @@ class EffectStepTerms:
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
     generalized_force: ca.SX | None = None  # F(q, v, u, z)
     dissipative_force: ca.SX | None = None  # part of the force that depends on velocity and dissipates energy
-    # equation (= 0) of each internal coordinate at the midpoint, and its replacement in a static equilibrium if it is
-    # undefined or cannot hold there
+    # equation (= 0) of each internal coordinate at the midpoint, and its replacement at rest if it cannot hold there
     internal_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     static_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     # a dissipative force on bodies with given derivatives, because automatic differentiation would be too expensive
@@ -160,8 +159,7 @@ class Effect:
     """The base class of effects, such as friction, that extend the nominal model. The base class changes nothing.
 
     With neutral parameters a subclass leaves the nominal model unchanged. `reading_from_true_value` computes a sensor
-    reading. Its inverse, `true_value_from_reading`, is for recorded inputs (torques that drive the model, angles that
-    are prescribed or followed).
+    reading. Its inverse, `true_value_from_reading`, is for recorded inputs (driving torques, given angles).
     """
 
     kind: str  # name under which its class is registered
@@ -196,8 +194,7 @@ class Effect:
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
         """Return the time constant [s] of a channel's first-order lag.
 
-        For `torque.JOINT`, the applied torque lags behind the recorded torque. For `joints.effort.JOINT`, the recorded
-        effort lags behind the true effort.
+        For `torque.JOINT` the applied torque lags, for `joints.effort.JOINT` the recorded effort.
         """
         return ca.SX(0)
 

@@ -135,8 +135,7 @@ class RestToRestSplineBasis:
     """A spline path of joints from rest to rest: q(t) = first + sum_k basis_k(t) w_k, constant after `duration`.
 
     The coefficients w_k (one row for each k) are control points of a spline of degree 5 with clamped ends. The path and
-    its derivatives lie within the convex hulls of their control points. Limits on control points therefore hold at all
-    times, not only at nodes.
+    its derivatives lie within the convex hulls of their control points. So limits on control points hold at all times.
     """
 
     duration: float  # [s]

@@ -115,8 +115,7 @@ class EpisodePredictor:
 
         `theta` comes from `theta_with_episode_values`. `offset` is the estimated deviation from equilibrium. `names`
         are parameters (default: the free ones). `guess` (n,) is a configuration near the equilibrium (default:
-        `Episode.equilibrium_guess`, else of least energy). `inputs` are the corrected inputs of `theta` and `names`, if
-        known.
+        `Episode.equilibrium_guess`, else of least energy). `inputs` are the known corrected inputs.
         """
         names = self.unknowns.free_parameter_names if names is None else names
         nx, rows = self.integrator_step.sizes["nx"], list(self.estimated_initial_state_indices)

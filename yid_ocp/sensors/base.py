@@ -327,8 +327,7 @@ class ZeroPhaseFilterInterface(Protocol):
 class SensorDataInputs:
     """The system, recording, options, nodes and filters from which a sensor's measurements are computed.
 
-    `joint_mass_matrices` maps k joint names and K configurations of these joints (K, k) to the joints' blocks (K, k, k)
-    of the mass matrix [kg m^2 or kg].
+    `joint_mass_matrices` maps k joint names and configurations (K, k) to blocks (K, k, k) of the mass matrix [kg m^2].
     """
 
     system: System

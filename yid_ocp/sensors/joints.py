@@ -164,8 +164,7 @@ def decorrelated_nodes_and_low_pass_values(
     """
     low_pass, times = inputs.path_filter if like_path else inputs.effort_filter, inputs.node_times
     # Neighbouring smoothed values are correlated: only nearly independent ones at samples are kept. Both ends are
-    # omitted: there the filter has data on one side only, and the impulses depend on the motion before or after the
-    # recording.
+    # omitted: there the filter has data on one side only, and impulses depend on motion outside the recording.
     step, steps, distorted = inputs.time_step, len(times) - 1, low_pass.end_distortion_duration
     period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     apart = max(1, round(period / step))

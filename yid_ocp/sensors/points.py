@@ -111,8 +111,7 @@ def _rates(t: Array, values: Array) -> Array:
 def camera_pose_of_point_group(group: base.RecordedPointsInterface) -> tuple[tuple[float, ...], ...] | None:
     """Return the pose (4, 4) of the camera that measured a point group. None if no camera measured it.
 
-    A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Without a pose, the camera is
-    assumed at the world origin.
+    A group was measured by a camera if it has a pose, or `camera` in its name or sensor. Default pose: the world's.
     """
     if group.camera_pose is not None:
         return tuple(tuple(float(x) for x in row) for row in group.camera_pose)

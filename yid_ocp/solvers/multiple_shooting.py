@@ -156,8 +156,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         acceptable = {"tol": 1e-3, "iter": 4, "constr_viol_tol": 1e-6, "obj_change_tol": 1e-5}
         ipopt = {
             **{"obj_scaling_factor": cost_factor, "nlp_scaling_method": "none", "print_level": 0, "sb": "yes"},
-            # the Hessian is positive definite by construction, but MUMPS misjudges signs of nearly zero pivots, and
-            # IPOPT would regularise and factorise again
+            # the Hessian is positive definite, but MUMPS misjudges signs of tiny pivots, and IPOPT would regularise
             "neg_curv_test_tol": 1e-11 if self.hessian == "gauss_newton" else 0.0,
             # measured on 50 variables and 500 steps: a sixth of the time of MUMPS's own choice
             **{"mumps_scaling": 8, "mumps_pivot_order": 0, "mumps_permuting_scaling": 0},

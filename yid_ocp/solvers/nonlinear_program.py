@@ -29,8 +29,7 @@ HessianKind = Literal["gauss_newton", "exact"]
 # Measured with IPOPT and MUMPS on 40 to 50 coordinates and 500 to 2000 steps [bytes an entry of Jacobian and Hessian].
 _BYTES_PER_ENTRY = 250.0
 
-# The solver rejects a trial point that cannot be evaluated, so no warning is printed. The thousands of multipliers of
-# the parameters are not computed unless requested.
+# No warnings, as the solver rejects points that cannot be evaluated; no multipliers of parameters unless requested.
 QUIET_NLPSOL_OPTIONS = {"show_eval_warnings": False, "error_on_fail": False, "print_time": False, "calc_lam_p": False}
 
 # Options that fit programs of one size only.

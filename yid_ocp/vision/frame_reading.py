@@ -1,7 +1,6 @@
 """Readers of frame sequences from a folder, a ROS bag, an MCAP file or a RealSense recording.
 
-Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`. They are
-read on demand.
+Bags contain `sensor_msgs/PointCloud2`, or `sensor_msgs/Image` with depth and its `sensor_msgs/CameraInfo`.
 """
 
 from __future__ import annotations
@@ -220,8 +219,7 @@ def read_frames(
 
     `path` is a folder (`read_frame_folder`), or a ROS 1 or ROS 2 bag, an MCAP or RealSense file with clouds or depth
     images under `topic`. `pose` (4, 4) is the pose of the camera in the world, `unit` the unit of clouds. Both replace
-    the values of a folder and are required for other formats. Raises `DataError` if the input cannot be read, or lacks
-    time stamps, pose or intrinsics.
+    the values of a folder and are required for other formats. Raises `DataError` for unreadable or incomplete input.
     """
     place = Path(path)
     if place.is_dir():

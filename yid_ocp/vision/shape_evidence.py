@@ -208,8 +208,7 @@ def fit_quality_and_point_classes(
 def tube_like_node_and_point_masks(cloud: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
     """Find skeleton nodes (K,) and points (N,) where the cloud is as narrow as a tube of radius r = `radius`.
 
-    Around a tube, points have a large spread in one direction and r/sqrt(3) across. On a table, wall or body they have
-    a large spread in two directions.
+    Around a tube, points have a large spread in one direction and r/sqrt(3) across; on a wall or body in two.
     """
     within = _SURROUNDING_RADII * radius
     thin = np.zeros(len(cloud.skeleton_nodes), bool)

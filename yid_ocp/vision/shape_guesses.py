@@ -266,8 +266,7 @@ class ShapeGuessFinder:
     def shape_guesses_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
         """Find initial shapes that follow a centerline whose path lengths between ends match the object's lengths.
 
-        Raises `DataError` if the number of ends or the lengths do not match, because a part of the object is hidden or
-        something else is connected to it.
+        Raises `DataError` for other ends or lengths: a part of the object is hidden, or something else touches it.
         """
         edges_of_node = np.bincount(trace.edges.ravel(), minlength=len(trace.nodes))
         leaves, n_ends = np.flatnonzero(edges_of_node <= 1), len(self._end_distances)

@@ -333,8 +333,7 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
 def extra_meshes_by_joint_index(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
     """Load meshes that the URDF lacks, by joint index (-1: the world).
 
-    Raises `ConfigError` if a link does not exist or an entry does not define exactly one shape, and `ModelError` if a
-    file is unreadable.
+    Raises `ConfigError` for an unknown link or an entry that is not one shape, `ModelError` for an unreadable file.
     """
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):

@@ -95,8 +95,7 @@ def run_blind(
     `sealed/labels.json`, `commitment.json` (hashes of the labels, written before the first diagnosis, and of the
     sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), `slice.json`
     (`yid-blind-slice/1`: labels, answers, hashes, for `score_joined_slices`), `result.json` (`yid-blind/1`), `table.md`
-    and pictures. A calibration ensemble also has `thresholds.json` (`yid-calibration/1`). Raises `OutputError` if the
-    folder holds another ensemble.
+    and pictures. A calibration ensemble has `thresholds.json`. Raises `OutputError` for a folder of another ensemble.
     """
     if count < 1:
         raise ConfigError(f"an ensemble cannot have {count} cases", where="--cases", allowed="a whole number from 1")

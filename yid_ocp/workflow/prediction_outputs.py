@@ -79,7 +79,7 @@ def copyable_estimate_texts(
 ) -> dict[str, Any]:
     """Return texts to copy, with those of the `estimates` that are identifiable. Empty without such a parameter.
 
-    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `joints` (number of links and range
+    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `joints` (number of links, range
     of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of
     `latex`, `export` (the `command` to continue with) and `cite`. `theta` (ntheta,) holds all parameters.
     """

@@ -51,8 +51,7 @@ _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 def read_estimates(folder: str | Path) -> RunEstimates:
     """Read the estimates and covariance of free parameters from the run folder of a `solve` or `diagnose`.
 
-    Raises `DataError` if the folder holds no finished run, if its result cannot be read, belongs to another command or
-    has an old format, or if the solve failed.
+    Raises `DataError` without a finished run, or for a result that is unreadable, old, of another command, or failed.
     """
     file, result = Path(folder) / "result.json", read_estimation_result(folder)
     try:

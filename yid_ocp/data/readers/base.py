@@ -129,8 +129,7 @@ class JointPointAndUnitOptions:
     joints: Sequence[str] | None = None  # entries `name` or `recorded=name`, in this order; None: all joints
     point_names: Mapping[str, str] | None = None  # new names by recorded name; None: all points
     units: Mapping[str, str] | None = None  # unit of `t`, a joint channel or `points`, if not SI
-    # if `effort` is a motor current, by joint or pattern: torque per current [N m/A], and motor turns per joint turn
-    # (default 1)
+    # for motor currents, by joint or pattern: torque per current [N m/A], and motor turns per joint turn (default 1)
     torque_constants: Mapping[str, float] | None = None
     gear_ratios: Mapping[str, float] | None = None
 

@@ -51,8 +51,7 @@ def _read_c3d(
     NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `point_names` maps the markers to
     keep to new names; by default all labelled markers that were ever seen are kept. `notes` lists omitted content:
     unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels. Raises
-    `DataError` if `ezc3d` is not installed, if the file cannot be read or has no markers, or if `validated_recording`
-    refuses the result.
+    `DataError` without `ezc3d`, for an unreadable file, without markers, or `validated_recording` refuses it.
     """
     path = Path(path)
     digest = file_sha256(path)

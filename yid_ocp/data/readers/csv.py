@@ -47,8 +47,7 @@ class _CsvOptions(base.JointPointAndUnitOptions):
     """Options of CSV files: meaning of columns, columns to keep, delimiter, header and clock.
 
     `column_meanings` maps names of columns that are not recognised to meanings: `t`, `channel:joint`,
-    `axis:point`, or `skip`. A `*` in a name matches any text, and this text replaces the `*` in the meaning. Example:
-    `*_pos` with the meaning `position:*`.
+    `axis:point`, or `skip`. A `*` in a name matches a text that replaces `*` in the meaning (`*_pos`: `position:*`).
     """
 
     column_meanings: Mapping[str, str] | None = None
