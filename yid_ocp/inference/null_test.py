@@ -132,7 +132,7 @@ def residual_chi2_null_test(
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     """Return (I + F F')^(-1/2) r, which whitens the residual r of covariance I for k further, independent errors.
 
-    r (nr,) is `residual`. F (nr, k) is `spread`; column j is the change of r by one std of error j, ignored if not finite.
+    r (nr,) is `residual`. F (nr, k) is `spread`; column j, if finite, is the change of r by one std of error j.
     """
     columns, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))

@@ -162,7 +162,7 @@ class Solution(ReprMixin):
     def parameters_to_dataframe(self) -> pandas.DataFrame:
         """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
 
-        `lower` and `upper` are the 95 % interval, infinite at an open end. `value` is NaN if it cannot be found. Requires pandas.
+        `lower` and `upper`: the 95 % interval, infinite at an open end. `value` is NaN if it cannot be found.
         """
         pandas = import_optional("pandas", "pandas", "a data frame needs the package pandas", ConfigError)
         columns, rows = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"], {}
