@@ -27,7 +27,7 @@ JOINTS = ("waist", "lift", "bend", "wrist")
 AXES = ("0 0 1", "0 1 0", "0 1 0", "0 1 0")
 EFFORT_LIMITS = (40, 60, 30, 8)  # [N m]
 FLANGE = 0.09  # from the wrist [m]
-LINKS, RADIUS, STEP, DURATION = 6, 0.004, 2e-4, 4.0
+LINKS, RADIUS, STEP, DURATION = 6, 0.004, 2e-4, 4.0  # RK4 needs steps that fall with the fourth power of the length of links
 POINT_STD = 3e-4  # [m]
 
 
@@ -92,7 +92,7 @@ def mjcf(arm: Arm, tip_mass: float, finer: int) -> str:
         load = f'<inertial pos="0 0 0" mass="{tip_mass}" diaginertia="1e-7 1e-7 1e-7"/>'
         body += f'<body pos="0 0 {long}">{load}</body>'
     motors = "".join(f'<motor joint="{joint}"/>' for joint in JOINTS)
-    option = f'<option timestep="{STEP / finer**2}"/>'
+    option = f'<option timestep="{STEP / finer**4}"/>'
     closed = "</body>" * (len(JOINTS) + count)
     return f"<mujoco>{option}<worldbody>{body}{closed}</worldbody><actuator>{motors}</actuator></mujoco>"
 
@@ -101,7 +101,7 @@ def recorded(
     arm: Arm, seed: int, tip_mass: float, encoder_std: float, brisk: bool, finer: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows (time, joint angles) and (time, marker coordinates in mm) of a motion that begins and ends at rest."""
-    step, model = STEP / finer**2, mujoco.MjModel.from_xml_string(mjcf(arm, tip_mass, finer))
+    step, model = STEP / finer**4, mujoco.MjModel.from_xml_string(mjcf(arm, tip_mass, finer))
     data, rng, noise = mujoco.MjData(model), np.random.default_rng(seed), np.random.default_rng(9000 + seed)
     rates = rng.uniform(0.35, 1.2, (4, 3)) * (1.6 if brisk else 1.0)
     phases, size = rng.uniform(0, 2 * np.pi, (4, 3)), np.array([0.5, 0.35, 0.45, 0.5])

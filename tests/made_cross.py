@@ -11,7 +11,8 @@ import numpy as np
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import write_recording
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings, run_virtual_experiment
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 
@@ -80,7 +81,9 @@ def configuration(
     return file
 
 
-def record(folder: Path, branches: Sequence[str], links: int = 12, duration: float = 1.5) -> None:
+def record(
+    folder: Path, branches: Sequence[str], links: int = 12, duration: float = 1.5, *withheld: InjectedEffect
+) -> None:
     """`cross.h5`: joint angles, and four points seen at 50 Hz to half a millimetre."""
     run = load_config(configuration(folder, links, branches, mode="driven"))
     camera = PointCamera(point_std=5e-4, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4))
@@ -92,7 +95,7 @@ def record(folder: Path, branches: Sequence[str], links: int = 12, duration: flo
         seed=5,
         recording_name="cross",
     )
-    made = run_virtual_experiment(build_system(run), None, experiment)
+    made = run_experiment_with_injected_effects(build_system(run), None, withheld, experiment)
     points = tuple(PointGroup("points_mocap", g.names, g.t, g.position, g.std, "mocap") for g in made.points)
     joints = replace(made.joints, effort=None, effort_std=None)
     write_recording(Recording(joints, points, source="test", name="cross"), folder / "cross.h5")

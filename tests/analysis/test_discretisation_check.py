@@ -11,6 +11,7 @@ from yid_ocp.analysis import discretisation
 from yid_ocp.config.reader import load_config
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.solvers import GaussNewton
+from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.workflow.solve import run_solve
 
 pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install '.[blind]'")
@@ -123,21 +124,29 @@ def test_a_large_change_by_more_links_is_fitted_before_it_counts(folder, monkeyp
     problem, made = yid.load_problem(configuration(folder, 4, ["north"], 1.5)), []
     found, search = yid.solve(problem), GaussNewton.minimize_cost
     monkeypatch.setattr(GaussNewton, "minimize_cost", lambda *given: made.append(given) or search(*given))
-    given = problem, problem, found.x, found.evaluation
+    given = problem, problem, found.x, found.evaluation, ()
     assert discretisation.problem_data_corrected_for_few_links(*given, 1.0) is not None
     assert len(made) == fits
 
 
-@pytest.mark.parametrize(("late", "causes"), [(0.0, []), (0.03, ["camera_latency@points_mocap"])])
-def test_the_error_of_few_links_is_no_gap_alone_or_beside_an_effect(tmp_path, late, causes):
+TIP = InjectedEffect("point_mass", "w_north", {"mass": 0.03})
+
+
+@pytest.mark.parametrize(
+    ("late", "load", "causes"), [(0.0, (), []), (0.03, (), ["camera_latency@points_mocap"]), (0.0, [TIP], [TIP.label])]
+)
+def test_the_error_of_few_links_is_no_gap_alone_or_beside_an_effect(tmp_path, late, load, causes):
     """Six links for twelve leave chi2/n of 2.3, and twelve none."""
-    record(tmp_path, ["north"], duration=1.2)
+    record(tmp_path, ["north"], 12, 1.2, *load)
     made = yid.read_recording(tmp_path / "cross.h5")
     shifted = replace(made, points=tuple(replace(group, t=group.t + late) for group in made.points))
     yid.write_recording(shifted, tmp_path / "cross.h5")
     file = configuration(tmp_path, 6, ["north"])
     file.write_text(file.read_text().replace("object: 0.002", "object: 0.001"))
-    found = yid.diagnose(yid.load_problem(file), ("density", "camera_latency"))
+    found = yid.diagnose(yid.load_problem(file), ("density", "camera_latency", "point_mass", "length_scale"))
     assert [effect.label for effect in found.accepted_effects] == causes
     assert (found.is_corrected_for_links, found.remaining_test.chi2_per_dof < 1.5) == (True, True)
     assert "Too few links cause an error like a gap" in found.summary
+    true, fit = {"bend": 1.5 * TRUTH["north.bend"], "delay": late, "mass": 0.03}, found.final_model
+    known = [(fit.values[name], fit.std[name], true[name.rpartition(".")[2]]) for name in fit.values]
+    assert all(abs(value - own) < 2 * std < 0.04 * own for value, std, own in known)

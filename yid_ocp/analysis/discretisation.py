@@ -13,6 +13,7 @@ import scipy.optimize
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.null_test import episodes_with_noisier_motion
@@ -20,7 +21,7 @@ from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation, Paramet
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step, compile_step, simulate, step_with_time_step
+from yid_ocp.integrator.step import Step, compile_step, compile_step_like, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK
@@ -75,6 +76,18 @@ class _FinerDiscretisationProblem:
                 for part in parts:
                     made[at[f"{_START_ANGLE_PREFIX}{part}{bracket}{recording}"]] = value / len(parts)
         return np.clip(made, *self.problem.bounds)
+
+    def _coarse_unknowns(self, names: Sequence[str], x: Array, fine: Array) -> Array:
+        """Return `x` with the values that fine unknowns have in the coarse model, the reverse of `_unknowns`."""
+        made, at = x.copy(), {name: i for i, name in enumerate(self.problem.unknown_names)}
+        for i, name in enumerate(names):
+            start, bracket, recording = name.removeprefix(_START_ANGLE_PREFIX).partition("[")
+            parts = self.subdivided_joints.get(start, ()) if name.startswith(_START_ANGLE_PREFIX) else ()
+            if name in at:
+                made[i] = fine[at[name]] / self._factor(name)
+            elif parts:
+                made[i] = sum(fine[at[f"{_START_ANGLE_PREFIX}{part}{bracket}{recording}"]] for part in parts)
+        return made
 
     def _guess(self, coarse: System, q: Array) -> Array:
         tree = self.problem.system.mechanism
@@ -168,11 +181,19 @@ def stds_with_time_step_and_encoder_errors(
     `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. Returns None if the
     motions cannot be predicted with the shorter step.
     """
+    # data may be corrected for the links
+    fine = fine.with_episodes(list(map(_with_data_of, fine.episodes, coarse.episodes)), ())
     made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
     if isinstance(made, str):
         return None
     shifts = made[0], _shifts_by_more_encoder_noise(coarse, x, at_x)
     return {name: _std_with_shifts(std, [own[name] for own in shifts if name in own]) for name, std in stds.items()}
+
+
+def _with_data_of(episode: Episode, other: Episode) -> Episode:
+    pairs = zip(episode.measurements, other.measurements, strict=True)
+    same = (replace(a, value=b.value) if a.value.shape == b.value.shape else a for a, b in pairs)
+    return replace(episode, measurements=tuple(same))
 
 
 def _std_with_shifts(std: float, shifts: Iterable[float]) -> float:
@@ -181,29 +202,32 @@ def _std_with_shifts(std: float, shifts: Iterable[float]) -> float:
 
 
 def problem_data_corrected_for_few_links(
-    problem: EstimationProblem, fitted: EstimationProblem, x: Array, at_x: Evaluation, min_chi2_decrease: float
+    problem: EstimationProblem,
+    fitted: EstimationProblem,
+    x: Array,
+    at_x: Evaluation,
+    effects: Sequence[EffectBase],
+    min_chi2_decrease: float,
 ) -> EstimationProblem | None:
     """Return `problem` with all data corrected for the error of too few links.
 
-    The change of the predictions by dividing each link in two is subtracted. `fitted` is the problem with the effects
-    of a fit, if any; `at_x` is its evaluation at the fit `x` (nx,), with Jacobian. If the change is large, the finer
-    model is refitted first, to data without the changes by effects, which it lacks. Returns None if a refit would not
-    lower r'r by `min_chi2_decrease`, if links cannot be divided, if torques have noise, or if the finer model fails.
+    The change of the predictions by dividing each link in two is subtracted. `fitted` is the problem with the `effects`
+    of a fit; `at_x` is its evaluation at the fit `x` (nx,), with Jacobian. If the change is large, the finer model is
+    refitted first. Returns None if a refit would not lower r'r by `min_chi2_decrease`, if links cannot be divided, if
+    torques have noise, or if the finer model fails.
     """
     if problem.has_process_noise or not (problem.options.divided_links_model and problem.system.segment_layouts):
         return None
     guesses, before = at_x.equilibrium_guesses, at_x.residual
-    own = problem.pack_unknowns(fitted.unknowns.named_values(x))
     try:
-        refined, coarse = _refined_problem(problem, "links"), problem.evaluate(own, False, guesses)
-        point, finer = refined._unknowns(problem.unknown_names, own), refined.problem
-        warm = tuple(None if q is None else refined._guess(problem.system, q) for q in guesses)
+        refined = _refined_problem(fitted, "links", effects=effects)
+        point, finer = refined._unknowns(fitted.unknown_names, x), refined.problem
+        warm = tuple(None if q is None else refined._guess(fitted.system, q) for q in guesses)
         for is_refitted in (False, True):
             if is_refitted:
-                by_effects = coarse.episode_predictions, at_x.episode_predictions
-                less = finer.with_episodes(list(map(_with_data_shifted, finer.episodes, *by_effects)), ())
-                point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(less, point, None).x
-            fine = finer.evaluate(point, False, warm)
+                point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(finer, point, None).x
+                x = refined._coarse_unknowns(fitted.unknown_names, x, point)
+            fine, coarse = finer.evaluate(point, False, warm), fitted.evaluate(x, False, guesses)
             if not (fine.ok and coarse.ok):
                 return None
             changes = coarse.episode_predictions, fine.episode_predictions
@@ -219,9 +243,9 @@ def problem_data_corrected_for_few_links(
                 return None
             if change <= _MAX_LINEAR_CHANGE:
                 break
-        finer = _refined_problem(problem, "links", [e.recording for e in problem.held_out], finer.step).problem
-        held_out = (one.predict_held_out(at) for one, at in ((problem, own), (finer, point)))
-        others = [_with_data_shifted(e, one, other) for (e, one), (_, other) in zip(*held_out, strict=True)]
+        finer = _refined_problem(fitted, "links", [e.recording for e in problem.held_out], finer.step).problem
+        held_out = zip(problem.held_out, fitted.predict_held_out(x), finer.predict_held_out(point), strict=True)
+        others = [_with_data_shifted(e, one, other) for e, (_, one), (_, other) in held_out]
     except YidError:
         return None
     return problem.with_episodes(episodes, others)
@@ -354,7 +378,11 @@ def _shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array, at_x: Ev
 
 
 def _refined_problem(
-    problem: EstimationProblem, what: RefinementKind, held_out: Sequence[Recording] = (), step: Step | None = None
+    problem: EstimationProblem,
+    what: RefinementKind,
+    held_out: Sequence[Recording] = (),
+    step: Step | None = None,
+    effects: Sequence[EffectBase] = (),
 ) -> _FinerDiscretisationProblem:
     options, fine = problem.options, problem.options.divided_links_model
     if what == "time_step" or fine is None:
@@ -363,6 +391,8 @@ def _refined_problem(
     factors = fine.parameter_factors
     if step is None:
         step = step_with_time_step(fine.build_step(problem.step.is_compiled), problem.step.time_step)
+        own = [make_effect(effect.kind, effect.location, step.system) for effect in effects]
+        step = compile_step_like(step, step.system.with_effects(own)) if own else step
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)

@@ -293,7 +293,8 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     search = seen.with_events
     search.progress.begin_stage("trying twice the links", 1.0, 11.0)
     own = search.problem.problem_with_nominal_and_effects_free(fit.effects)
-    corrected = problem_data_corrected_for_few_links(search.problem.problem, own, fit.unknowns, fit.evaluation, least)
+    known = search.problem.problem, own, fit.unknowns, fit.evaluation
+    corrected = problem_data_corrected_for_few_links(*known, fit.effects, least)
     if corrected is None:
         return None
     problem = replace(search.problem, problem=corrected)

@@ -203,6 +203,7 @@ class _PredictedEpisode(NamedTuple):
     theta: Array
     episode: Episode
     prediction: EpisodePrediction
+    expected_errors: Mapping[str, float]  # rms by channel from noise of sensors and torques, of held-out recordings
 
 
 def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
@@ -210,13 +211,14 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     problem, solution = findings.problem, findings.solution
     if problem is None or solution is None:
         return
+    expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
     fitted = zip(problem.episodes, solution.episode_predictions, strict=False)
     entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
     for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
         if not isinstance(prediction, str):
             shared, _ = problem.unpack_episode_unknowns(solution.x, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
-            yield _PredictedEpisode(role, problem, theta, episode, prediction)
+            yield _PredictedEpisode(role, problem, theta, episode, prediction, expected.get(episode.name, {}))
 
 
 @register_report_section("scene", 3, "In motion")
@@ -288,11 +290,14 @@ def _fitted_curves(own: _PredictedEpisode, noise_fraction: float) -> Iterator[tu
             course = own.problem.model_functions.compiled_sensor_function(sensor)(values, own.theta).output
         names, width = sensor.channel_names, sensor.outputs_per_channel
         parts = {name: range(width * c, width * (c + 1)) for c, name in enumerate(names)} if width > 1 else {}
+        by_sensor = np.sqrt(np.mean(samples.std**2, axis=0).reshape(-1, width).sum(axis=1))
+        wider = [own.expected_errors.get(n, noise) / noise for n, noise in zip(names, by_sensor, strict=True)]
         for title, columns in (parts or {sensor.group_name: range(len(names))}).items():
             curves: list[TimePlotData] = []
             for i in columns:
                 name = sensor.output_names[i].rsplit(".", 1)[1]
-                told = (t, samples.value[:, i], noise_fraction * samples.std[:, i], {"predicted": predicted[:, i]})
+                std = noise_fraction * wider[i // width] * samples.std[:, i]
+                told = (t, samples.value[:, i], std, {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
                 curves += figures.channel_prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
             yield title, curves
