@@ -27,7 +27,7 @@ JOINTS = ("waist", "lift", "bend", "wrist")
 AXES = ("0 0 1", "0 1 0", "0 1 0", "0 1 0")
 EFFORT_LIMITS = (40, 60, 30, 8)  # [N m]
 FLANGE = 0.09  # from the wrist [m]
-LINKS, RADIUS, STEP, DURATION = 6, 0.004, 2e-4, 4.0  # RK4 needs steps that fall with the fourth power of the length of links
+LINKS, RADIUS, STEP, DURATION = 6, 0.004, 2e-4, 4.0  # RK4 needs steps in the fourth power of a link's length
 POINT_STD = 3e-4  # [m]
 
 
