@@ -113,7 +113,7 @@ def test_a_change_that_explains_as_much_as_an_effect_is_told_and_shares_its_prob
     assert finding.confusable_parameter_changes[:1] == ("beam.bend",)
     assert finding.verdict == "confusable"
     assert finding.probability < 0.7
-    assert "a change of beam.bend explains" in finding.summary
+    assert "A change of beam.bend since the baseline explains" in finding.summary
 
 
 def test_a_prior_stays_where_the_model_does_not_explain_the_recordings_without_it(beam, tmp_path):
@@ -126,7 +126,7 @@ def test_nothing_differs_where_nothing_changed(beam, tmp_path):
     assert outcome.result["verdict"] == "no_gap"
     assert not any(entry["changed"] for entry in outcome.result["baseline"]["parameters"].values())
     assert outcome.result["counterfactual"] is None
-    assert "no parameter has changed" in outcome.result["summary"]
+    assert "No parameter differs significantly" in outcome.result["summary"]
 
 
 def test_a_recording_of_the_baseline_is_refused(beam, tmp_path):

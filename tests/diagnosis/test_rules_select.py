@@ -297,7 +297,7 @@ def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypa
     rounds = Rounds(monkeypatch, losses, before={}, left=1e-3)
     first, chosen, _ = rounds.compose(moved=True, is_late=True)
     assert (first, chosen) == (["a", "b", "c"], ["a"])
-    assert [("earlier run" in text, "next to a@x" in text) for text in rounds.skipped] == [(True, False), (False, True)]
+    assert [("earlier run" in text, "beside a@x" in text) for text in rounds.skipped] == [(True, False), (False, True)]
     assert rounds.screens == []
 
 
@@ -352,7 +352,7 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     closed = [entry.cumulative_closure.fraction for entry in added]
     assert closed == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2, 3]
-    assert "scoring the residual gap next to a@x and b@x" in rounds.heard.stages
+    assert "scoring further effects beside a@x and b@x" in rounds.heard.stages
     alone = [what for what, *_ in rounds.refits[3:] if "without" in what]
     assert alone == [f"a@x and b@x and c@x without {one}@x" for one in "ab"], "the last one has just been tried there"
 
@@ -486,7 +486,7 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
         "without each, and others in its place, as both stand in another company than when they were added"
     )
     assert [entry.effect for entry in added] == [B, C]
-    assert "left a@x out again: the others do as well" in rounds.heard.stages
+    assert "removed a@x: the other effects explain as much" in rounds.heard.stages
 
 
 def test_an_effect_that_is_not_there_any_more_beside_another_is_left_out_again(monkeypatch):
@@ -521,7 +521,7 @@ def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
     assert added[-1].refitted_model.held_out_loss.chi2_per_sample == pytest.approx(1.25)
     assert [e.label for e in added[-1].refitted_model.effects] == ["b@x", "c@x"], "the last one comes last"
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2]
-    assert "put c@x in the place of a@x" in rounds.heard.stages
+    assert "replaced a@x by c@x" in rounds.heard.stages
     assert [[of.kind for of in entry.equivalent_effects] for entry in added] == [["b"], ["c"]]
 
 

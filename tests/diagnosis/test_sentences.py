@@ -157,7 +157,7 @@ def unknown():
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
     yield (
         "stopped with an effect",
-        with_effect(FRICTION, 0.5, **hurried | {"untried": ("the residual gap next to a@x",)}),
+        with_effect(FRICTION, 0.5, **hurried | {"untried": ("further effects beside a@x",)}),
     )
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
@@ -247,7 +247,7 @@ def test_a_diagnosis_says_what_is_written_down():
 
 def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_suffice():
     alike = finding("effect", selected_effects=(added(FRICTION, rivals=[OFFSET]),))
-    assert recommended_experiment_text(alike).startswith("Move so that elbow and wrist work one at a time")
+    assert recommended_experiment_text(alike).startswith("Move elbow and wrist one after the other")
     sole = recommended_experiment_text(finding("effect", selected_effects=(added(FRICTION),)))
     assert sole.startswith("Record and diagnose other motions")
     few = recommended_experiment_text(replace(alike, verdict="insufficient_data"))

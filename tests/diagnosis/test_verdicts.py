@@ -77,7 +77,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
         limits = Thresholds(max_effects=2, budget=1e4, min_excess_chi2_per_dof=-0.5)
         problem = bench.problem(recordings[:1])
         finding = diagnose(problem, FRICTION, recordings[1:], thresholds=limits, progress=progress)
-        said = f"ended the search after {finding.search_seconds:.3g} s. Not done: {finding.untried[0]}"
+        said = f"ended the search after {finding.search_seconds:.0f} s. Not tested: {finding.untried[0]}"
         assert finding.summary.count(said) == 1
         assert finding.search_seconds == pytest.approx(sum(list(finding.stage_seconds.values())[:-4]))
         return json.loads(json.dumps(finding.to_dict(), allow_nan=False))
@@ -86,7 +86,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
     result = stopped(Hurried())
     assert (result["verdict"], result["effects"]) == ("effect", [{"kind": "joint_coulomb", "location": "elbow"}])
     assert [entry["closure"] is not None for entry in result["which"]] == [True, False, False, False]
-    assert result["untried"][-1].endswith("next to joint_coulomb@elbow")
+    assert result["untried"][-1].endswith("beside joint_coulomb@elbow")
     clock[0] = 1e9
     result = stopped(Progress())
     assert (result["verdict"], result["reason"], result["effects"]) == ("unknown", "none", [])

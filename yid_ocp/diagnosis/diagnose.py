@@ -188,7 +188,7 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) ->
 
 def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     h, search = seen.nominal.problem.step.time_step / 2, seen.with_events
-    search.progress.begin_stage(f"{why}: going on at {h:g} s")
+    search.progress.begin_stage(f"{why}: continuing with steps of {h:g} s")
     search = search.restarted_with(search.problem.with_time_step(h), search.store)
     return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
 
@@ -213,7 +213,7 @@ def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examin
     problem = seen.with_events.problem.with_encoder_noise_in_efforts(fit.effects, fit.values)
     if problem is None:
         return None
-    seen.search.progress.begin_stage(f"going on with the noise beside {hypotheses.join_effect_labels(fit.effects)}")
+    seen.search.progress.begin_stage(f"continuing with more noise beside {hypotheses.join_effect_labels(fit.effects)}")
     return _examined_with(seen, problem)
 
 
@@ -301,7 +301,7 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     refitted = refit_with_effects(problem, fit.effects, fit.values)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return None
-    search.progress.begin_stage("twice the links lower chi2: going on without their error")
+    search.progress.begin_stage("twice the links lower chi2: the error of too few links is subtracted")
     search = search.restarted_with(problem)
     nominal = _fitted_nominal_model(search, refitted.values)
     return _examined(search, nominal, seen.truncated, True, seen.removed + 2 * (fit.cost - refitted.cost))

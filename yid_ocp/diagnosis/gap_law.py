@@ -62,11 +62,9 @@ class NonparametricLaw:
     @property
     def sentence(self) -> str:
         """A sentence about the law that states its location, quantity and size, and the closed fraction of the gap."""
-        if self.depends_on == "time":
-            head = f"A torque at {self.location} that depends on time, as no quantity of the model predicts it better"
-        else:
-            words = " and its ".join("the time" if t.quantity == "time" else t.quantity for t in self.tables)
-            head = f"A torque at {self.location} that depends on its {words}"
+        is_over_time = self.depends_on == "time"
+        words = "time" if is_over_time else f"its {' and its '.join(t.quantity for t in self.tables)}"
+        end = ", and no function of motion or load predicts it better" * is_over_time
         sizes = []
         for table in self.tables:
             low, high = self.visited_range[table.quantity]
@@ -77,7 +75,8 @@ class NonparametricLaw:
                 sizes.append(f"{ends} between {low:.2g} and {high:.2g} {unit}")
         gap = f"error beyond noise{' that the effects leave' * self.has_accepted_effects} on held-out motions"
         closed = f"would remove {100 * self.closure.fraction:.3g} % of the {gap}"
-        return f"{head} ({', '.join(sizes)}) {closed}. No accepted effect describes this torque."
+        head = f"A torque at {self.location} that depends on {words}"
+        return f"{head} ({', '.join(sizes)}) {closed}. No accepted effect describes this torque{end}."
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the law to a dictionary with location, depends_on, table, closure, visited_range and runner_up."""

@@ -240,7 +240,7 @@ def select_effects(
         before, chosen = chosen.fit, chosen.replaced(better, [*rivals, *untried])
         base, beside = better.effects, join_effect_labels(better.effects)
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
-        rest = f"the residual gap next to {beside}"
+        rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"explained by {beside}: {closed.text}".rstrip(": "))
         is_full = len(base) >= limits.max_effects
         if is_full or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
@@ -295,7 +295,7 @@ def _reconsidered(search: RefitContext, nominal: RefitStatistics, chosen: _Choic
     while len(chosen.fit.effects) > 1:
         labels = frozenset(effect.label for effect in chosen.fit.effects)
         own = next((effect for effect in chosen.fit.effects if labels - {effect.label} not in tried), None)
-        if own is None or search.is_skipped_past_deadline("each effect without the other effects"):
+        if own is None or search.is_skipped_past_deadline("whether every effect is needed"):
             break
         tried.add(labels - {own.label})
         chosen = _revised(search, nominal, chosen, own)
@@ -311,10 +311,10 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     if without is None:
         return chosen
     if not _is_needed(without, full, limits):
-        search.progress.begin_stage(f"left {label} out again: the others do as well")
+        search.progress.begin_stage(f"removed {label}: the other effects explain as much")
         return replace(chosen, fit=without)
-    search.progress.begin_stage(f"looking for others in the place of {label}", 3.0, 13.0)
-    company = f"in the place of {label}"
+    search.progress.begin_stage(f"looking for effects in place of {label}", 3.0, 13.0)
+    company = f"in place of {label}"
     screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
     best = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
     tried = [start for start in best if start[0][0].label != label]
@@ -325,7 +325,7 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     found = chosen.replaced(better, [(fit.effects[-1], distance) for fit, distance in near])
     if better is own:
         return replace(found, fit=full)
-    search.progress.begin_stage(f"put {better.effects[-1].label} in the place of {label}")
+    search.progress.begin_stage(f"replaced {label} by {better.effects[-1].label}")
     return found
 
 

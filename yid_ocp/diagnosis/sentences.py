@@ -39,18 +39,18 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         at = next((f" of {place}" for place in places if place not in _IMMOVABLE_LOCATIONS), "")
         advice = (
             (aspects, f"Record one motion{at} in which these vary independently and widely: {', '.join(aspects)}."),
-            (places, f"Move so that {' and '.join(places)} work one at a time, or measure a point between them."),
+            (places, f"Move {' and '.join(places)} one after the other, or measure a point between them."),
             (rivals, f"Record a motion{at} in which this varies over a wider range: {aspects[0]}."),
         )
         if told := [text for several, text in advice if len(several) > 1]:
             return told[0]
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
-    mostly = _listed("Record motions in which ", place, " moves most: slow, fast, with pauses in several postures.")
+    mostly = _listed("Record slow and fast motions, with pauses, in which ", place, " moves most.")
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points of the object in view.",
-        "unknown": mostly or "Record other motions of all joints, faster and larger than these.",
-        "no_gap": "None is needed for these motions. Other motions may show a gap.",
-        "confusable": "Record other motions, in which the effects and the changed parameters act differently.",
+        "unknown": mostly or "Record faster and larger motions of all joints.",
+        "no_gap": "None is needed for motions like these. Other motions may still show a gap.",
+        "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. If the cause is right, its estimates stay the same.",
     }
     return texts[result.verdict]
@@ -58,8 +58,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
-    stopped = f"The time limit diagnosis.budget ended the search after {result.search_seconds:.3g} s. Not done: "
-    text = [_gap(result), _listed(stopped, result.untried)]
+    stopped = f"The time limit diagnosis.budget ended the search after {result.search_seconds:.0f} s. Not tested: "
+    text = [_gap(result), _listed(stopped, result.untried, ". Raise the limit to test them.")]
     if result.verdict not in ("insufficient_data", "no_gap"):
         (error, change), found = _remains(result), [_places(result), *_causes(result)]
         text += [*found, error, change] if result.accepted_effects else [error, *found, change]
@@ -68,11 +68,11 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     step = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
-    links = "Too few links cause an error like a gap. The diagnosis removed it; for other commands, add links."
+    links = "Too few links cause an error, which the diagnosis subtracted. For other commands, double the links."
     notes = (
         (stated != used, f"{step} (set problem.time_step: {used} for other commands)."),
         (result.is_corrected_for_links, links),
-        (result.is_split_in_blocks, "No whole recording could be held out, so every second block of time is held out."),
+        (result.is_split_in_blocks, "Held-out motions are every second block of time: no recording could be held out."),
     )
     text += _applying(notes)
     events = [f"{e.channel} at {e.start_time:.2f} s of '{e.recording}'" for e in result.events.disturbances]
@@ -83,14 +83,14 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
-    used = f"Only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out '{cut.recording}' are used"
-    return f"{used}: after that, the simulation of the nominal model fails."
+    used = f"only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s are used"
+    return f"Of held-out recording '{cut.recording}' {used}: then the simulation of the nominal model fails."
 
 
 def overspeed_truncation_messages(events: EventSet) -> list[str]:
     """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
-    ignored, why = "s are ignored in", "is faster than diagnosis.max_joint_speed."
-    return [f"Data after {e.start_time:.3g} {ignored} {e.recording}: {e.joint} {why}" for e in events.overspeeds]
+    cut, why = "s are ignored, because", "then moves faster than diagnosis.max_joint_speed."
+    return [f"Data of {e.recording} after {e.start_time:.3g} {cut} {e.joint} {why}" for e in events.overspeeds]
 
 
 def _listed(beginning: str, names: Iterable[str], end: str = ".", **limit: int) -> str:
@@ -115,10 +115,10 @@ def _gap(result: DiagnosisResult) -> str:
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
     p_value = min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    p_text, detectable = _p_value_relation(p_value), f"{sum(seen)} of {len(seen)} effects would be detectable"
+    p_text, detectable = _p_value_relation(p_value), f"would show {sum(seen)} of {len(seen)} effects"
     said = f"{tests[0].degrees_of_freedom:.0f} independent samples for {unknowns} unknowns, and {detectable}"
     texts = {
-        "insufficient_data": f"The recordings are insufficient for a diagnosis: {said}.",
+        "insufficient_data": f"The recordings are insufficient for a diagnosis: they have {said}.",
         "no_gap": "\n".join([f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)]),
     }
     if result.verdict in texts:
@@ -139,8 +139,8 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
     needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
-    small = f"The error is significantly larger than noise, but not enough for a gap, which needs {needs}."
-    seen = f"The error resembles that of {''.join(best)} more than noise would (p {_p_value_relation(along)})"
+    small = f"The error is significantly larger than noise, but too small to count as a gap. A gap needs {needs}."
+    seen = f"The error has the pattern of {''.join(best)} (noise alone: p {_p_value_relation(along)})"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
@@ -177,12 +177,12 @@ def _causes(result: DiagnosisResult) -> list[str]:
     rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
     text += [_listed(f"These recordings cannot distinguish {own} from ", others) for own, *others in rivals]
     causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
-    explained, enough = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
+    own, goal = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
         "none": "None of the effects that were tried explains the error well enough, so no cause is named.",
-        "little": f"On fitted motions, {names} explain{s} {explained:.3g} % of the error; {enough:.3g} % is needed.",
+        "little": f"{names} explain{s} {own:.3g} % of the error beyond noise on fitted motions ({goal:.3g} % needed).",
         "stand_in": f"No cause is named, because estimates differ between recordings: {'; '.join(apart)}.",
     }
     return [*text, reasons[result.unknown_reason], _several_places(result)]
@@ -194,13 +194,13 @@ def _several_places(result: DiagnosisResult) -> str:
     best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
     alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
     places = abbreviated_names_text([s.effect.location for s in alike])
-    advice = "add it to the model at all of them (`model.effects`, or `yid-ocp friction` for friction)"
-    return f"{best[0]} is significant at {places}: {advice}." if result.unknown_reason and len(alike) > 1 else ""
+    advice = "Add it there under model.effects; for friction of joints, run `yid-ocp friction`."
+    return f"{best[0]} is significant at {places}. {advice}" if result.unknown_reason and len(alike) > 1 else ""
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:
     """One sentence per refitted effect whose amplitudes only the priors of nominal parameters determine."""
-    text = []
+    text, remedy = [], "To determine the effect, measure one of these parameters and fix it (`free: false`)."
     for fit in result.single_effect_models:
         if not isinstance(fit, RefittedModel) or fit.evaluation.jacobian is None:
             continue
@@ -210,7 +210,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         for name in own.amplitude_parameter_names:
             by = mask_of_priors_determining_unknown(data, priors, names.index(name))
             others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
-        text.append(_listed(f"To determine {own.label}, measure and fix (`free: false`) one of ", others))
+        text.append(_listed(f"These recordings cannot separate {own.label} from ", others, f". {remedy}"))
     return text
 
 
@@ -233,7 +233,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in beyond}
-    mostly = "".join(f". Most of this comes from {place.location}" for place in result.remaining_gap_locations[:1])
+    mostly = "".join(f". Most of this error comes from {own.location}" for own in result.remaining_gap_locations[:1])
     effects = abbreviated_names_text([effect.label for effect in result.accepted_effects])
     who = f"On held-out motions, the error of the {f'model with {effects}' if effects else 'nominal model'} is"
     said = "within noise and the uncertainty of the parameters"
@@ -261,14 +261,14 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         for own in since.significant_parameter_shifts:
             before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
             now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
-            moved.append(f"{own.name} goes from {before} to {now} {own.unit}")
-        rivals = abbreviated_names_text(result.confusable_parameter_changes)
-        alike = [f"a change of {rivals} explains the recordings about as well as the effects"] * bool(rivals)
-        moved = [*moved, *alike] or ["no parameter has changed detectably"]
-        text.append(_listed("Compared with the baseline: ", moved))
-        differ = f"The runs of the baseline differ from each other (p = {since.between_runs_p_value:.2g})"
+            moved.append(f"{own.name} from {before} to {now} {own.unit}")
+        same = "No parameter differs significantly from the baseline (the earlier runs)."
+        rivals = result.confusable_parameter_changes
+        text.append(_listed("Changes since the baseline (the earlier runs): ", moved) or same * (not rivals))
+        text.append(_listed("A change of ", rivals, " since the baseline explains about as much as the effects."))
+        differ = f"Runs of the baseline differ by more than their uncertainty (p = {since.between_runs_p_value:.2g})"
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
-        notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}; the ± of the baseline includes this.")
+        notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}. The ± of the baseline includes this.")
         text += _applying([notes, (not since.is_baseline_explained, small)])
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
     for how, part in parts.items():
@@ -281,5 +281,5 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by the model before the diagnosis"
         text.append(f"{made} are predicted with an error of {errors}.")
         if not part.is_improved_by_counterfactual:
-            text.append(f"The effects do not lower the error on {names}, so another cause may be the true one.")
+            text.append(f"The diagnosis does not lower the error on {names}, so another cause may be the true one.")
     return text
