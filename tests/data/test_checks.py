@@ -166,7 +166,7 @@ def test_noise_stated_far_above_what_is_there():
     (doubt,) = recording_quality_issues(recording, lambda _: SensorOptions())
     assert (doubt.cause, doubt.severity, doubt.group) == ("noise_overstated", "warning", "joints")
     assert re.fullmatch(r"sensors.joints.effort.std: {a: 0.0[56]\d*, b: 0.05, c: 0.0[56]\d*}", doubt.setting)
-    assert "the stated std is 1 (also too large for others: 2 of 3 channels in all)" in doubt.what
+    assert "not 1 N m as stated (too large for 2 of 3 such channels)" in doubt.what
     # one number for all joints holds for the noisiest
     noisy = column(EFFORT, 0, lambda x: x + 0.5 * np.random.default_rng(3).standard_normal(len(x)))
     assert causes(changed(made(), effort=noisy, effort_std=0.5)) == set()
@@ -262,14 +262,14 @@ def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_i
     assert [p.name for p in parts.recordings] == ["made_part1", "made_part2"]
     (doubt,) = parts.issues
     assert (doubt.cause, doubt.severity, doubt.begin, doubt.end) == ("gap", "warning", 2.99, 5.01)
-    assert "2 parts of the data, 5.98 s, are used" in doubt.what
+    assert "2 parts of the data (5.98 s) are used" in doubt.what
 
 
 def test_where_a_model_starts_from_rest_only_parts_that_do_are_kept():
     recording = without(made(), 3.0, 5.0)
     parts = split_recording_at_gaps(recording, (), False)
     assert [(p.name, p.joints.t[-1]) for p in parts.recordings] == [("made", 2.99)]
-    assert "a part counts only where it starts at rest" in parts.issues[0].what
+    assert "a part must start at rest" in parts.issues[0].what
     resting = np.where(np.abs(recording.joints.t - 5.2) < 0.3, 0.0, 1.0)[:, None] * recording.joints.position
     assert len(split_recording_at_gaps(changed(recording, position=resting), (), False).recordings) == 2
 

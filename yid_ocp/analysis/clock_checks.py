@@ -152,13 +152,13 @@ def robot_held_point_clock_issues(
     if found.drifts_beyond(limit):
         yield _drift_issue(found, group.name, limit, severity)
     elif abs(late) > _MIN_Z * found.delay_std and abs(late) > limit:
-        error = f"{1e3 * late:+.3g} ± {1e3 * found.delay_std:.2g} ms off the clock of the joints"
-        words = f"time stamps of {group.name} are {error}; the sample periods hide errors below {1e3 * limit:.3g} ms"
+        error = f"{1e3 * abs(late):.3g} ± {1e3 * found.delay_std:.2g} ms {'late' if late > 0 else 'early'}"
+        words = f"time stamps of {group.name} are {error} on the joints' clock (limit: {1e3 * limit:.3g} ms)"
         camera = "camera" in f"{group.name} {group.sensor_name}".lower() or group.camera_pose is not None
         setting = f"sensors.{group.name}.use: false"
         if camera and late > 0:
             setting = known_effect_config_line("camera_latency", "camera", "delay", late)
-        advice = f"subtract {late:.3g} s from their times"
+        advice = f"add {-late:+.3g} s to their times"
         yield Issue("clock_offset", words, severity, abs(late) / limit, advice, "", group.name, "t", setting=setting)
 
 
@@ -166,8 +166,8 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSe
     late, drift, whole = found.delay, found.drift, found.whole_drift
     begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
     size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
-    words = f"time stamps of {group} are {begin} off the joints' clock at its beginning, {end} at its end"
-    words = f"{words}: its clock runs {size} parts per thousand too {how}"
+    words = f"time stamps of {group} are {begin} off the joints' clock at the beginning and {end} at the end"
+    words = f"{words}: their clock runs {size} parts per thousand too {how}"
     advice, setting = timestamp_correction_advice(late, drift, 0.5 * sum(found.span)), f"sensors.{group}.use: false"
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
@@ -245,10 +245,10 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
                     recordings[i] = replace(recordings[i], points=tuple(groups))
         made = recordings[:count], problem.free, problem.options, None, recordings[count:]
         problem = EstimationProblem(problem.step, *made)
-    issues, advice = list[Issue](), "import it with --clock-offset where the offset is known"
+    issues, advice = list[Issue](), "if the offset is known, import again with --clock-offset"
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
-        words = f"time stamps of {name} of {own} (stated: ± {1e3 * std:.3g} ms) are {said} by a fit; they are corrected"
+        words = f"a fit finds time stamps of {name} {said} and corrects them, but only ± {1e3 * std:.3g} ms is stated"
         if (ratio := abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)) > 1:
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
     return problem, issues
@@ -333,8 +333,8 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
-        leaves = f"the fit leaves {seen * usual:.2g} {unit} of {group} as error (rms, slow errors included)"
-        words = f"{leaves}; the stated noise is {usual:.2g} {unit}"
+        leaves = f"after the fit, the error of {group} is {seen * usual:.2g} {unit} (rms, slow errors included)"
+        words = f"{leaves}, but the stated noise is {usual:.2g} {unit}"
         advice = "set the std to the actual noise: the stated std makes every ± too wide and hides small gaps"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         severity = 1 / (least * max(seen, 1e-9))

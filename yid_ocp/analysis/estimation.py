@@ -210,10 +210,10 @@ def choose_fit_with_or_without_shape_memory(
     if other.evaluation is None:
         return FitWithOrWithoutShapeMemory(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
-        words = "cable memory is not kept: fewer than two recordings start in motion, too few to test it"
+        words = "cable memory is not kept, because testing it needs two recordings that start in motion"
         return FitWithOrWithoutShapeMemory(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
-    told = "recordings that start in motion, each predicted from the others, have the rms error"
+    told = "predicted from the others, recordings that start in motion have an rms error of"
     errors = f"{told} {kept:.3g} with memory and {dropped:.3g} without (in standard deviations of the noise)"
     if kept < dropped:
         return FitWithOrWithoutShapeMemory(problem, solution, f"cable memory is kept: {errors}")
@@ -379,11 +379,11 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             if better := _clearly_better_baseline(entry, channels):
                 best, guess, error = better
                 unit = units[channels[0]]
-                what = f"the model has an error of {error:.3g} {unit} (rms), the guess '{best}' without a model of"
+                what = f"the rms error of the model is {error:.3g} {unit}, that of the guess '{best}' without a model"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])
-                what = f"{what} {guess:.3g} {unit}"
+                what = f"{what} only {guess:.3g} {unit}"
                 found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))
     return found
 

@@ -184,14 +184,14 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
     beyond = np.maximum(low - position, position - high).max(axis=0)
     inside = np.all((degrees > low - margin) & (degrees < high + margin))
     if np.any(beyond > margin) and inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
-        words = f"angles reach {np.max(np.abs(position)):.3g} rad; read as degrees, all are within the joint limits"
-        advice = "convert angles to radians; to import a CSV with degrees, set import.units: {position: deg}"
+        words = f"angles reach {np.max(np.abs(position)):.3g} rad; if they are degrees, all are within the joint limits"
+        advice = "convert angles to radians, or for a CSV with degrees set import.units: {position: deg}"
         yield Issue("degrees", words, "refused", float(np.max(beyond)) / margin, advice, "", channel="position")
         return
     for j in np.flatnonzero(beyond > margin):
         name, unit = arm.joint_names[j], arm.joints[j].coordinate_unit
-        words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g}"
-        advice = "check the joint's zero, unit and column, and that the recording is this robot's"
+        words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g} {unit}"
+        advice = "check the joint's zero, unit and column, and whether the recording is of this robot"
         depth = float(beyond[j] / margin)
         yield Issue("angle_limits", words, "not_trusted", depth, advice, "", channel=f"position.{name}")
 
@@ -247,8 +247,8 @@ def slow_motion_excitation_issues(
     if seen < _MIN_SIGNAL_STDS:
         j = int(np.argmax(size / noise))
         asked = f"even at {arm.joint_names[j]}, the best joint, speed and acceleration require only {size[j]:.2g} N m"
-        words = f"{asked} (rms), and noise between samples is {noise[j]:.2g} N m"
-        advice = "move faster; slow motions determine weight and stiffness, not damping, friction or inertia"
+        words = f"{asked} (rms), but the noise of the efforts is {noise[j]:.2g} N m"
+        advice = "move faster: slow motions determine weight and stiffness, not damping, friction or inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
 
@@ -274,8 +274,8 @@ def joint_excitation_issues(
             if not name or width > widest:
                 widest, name = width, recording.name
         if name and widest < limit:
-            least = f"from {limit:.2g} rad on, {', '.join(parameters)} can be distinguished from a constant effort"
-            words = f"{joint} turns by at most {widest:.2g} rad, in {name}; only {least}"
+            least = f"distinguish {', '.join(parameters)} from a constant effort, it must turn by {limit:.2g} rad"
+            words = f"{joint} turns by at most {widest:.2g} rad (in {name}). To {least}"
             advice, depth = f"turn {joint} further, or fix {' and '.join(parameters)}", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
             where = name, "joints", f"position.{joint}"
@@ -413,8 +413,8 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     lost = fit.left > _WRONG_ROBOT_RMS
     if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
-        strange = f"efforts of {lost.sum()} of {len(names)} joints do not match this robot and motion"
-        words = f"{strange}: errors are {left:.2g} times the usual model error ({', '.join(np.array(names)[lost])})"
+        strange = f"efforts of {lost.sum()} of {len(names)} joints ({', '.join(np.array(names)[lost])})"
+        words = f"{strange} do not match this robot and motion: their error is {left:.2g} times the usual model error"
         advice = "check that the recording is of this robot, and check its unit of time and the order of its joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
@@ -427,7 +427,7 @@ def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright
         cases = [("all efforts have", float(np.max(depth[turned])), "")]
     for who, by, joint in cases:
         words = f"{who} the opposite sign of what gravity and motion require"
-        yield _issue("effort_sign", words, by, "reverse the sign; effort is the motor's torque on the joint", joint)
+        yield _issue("effort_sign", words, by, "reverse the sign: effort is the motor's torque on the joint", joint)
 
 
 def _offsets(data: _Data, fit: _EffortFit, told: BoolArray) -> Iterator[Issue]:
@@ -445,7 +445,7 @@ def _offsets(data: _Data, fit: _EffortFit, told: BoolArray) -> Iterator[Issue]:
             words = f"the effort of {name} has a constant error of {value:+.3g} N m"
             depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
             setting = known_effect_config_line("effort_offset", name, "offset", value)
-            yield _issue("effort_offset", words, depth, "estimate it, or correct the zero", name, setting)
+            yield _issue("effort_offset", words, depth, "correct the sensor's zero, or model the offset", name, setting)
 
 
 def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
@@ -466,7 +466,7 @@ def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         words = f"efforts fit the motion best if their times are {abs(lag):.2g} s {when}"
         lines = [known_effect_config_line("effort_delay", name, "delay", lag) for name in arms]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
-        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift the times of efforts", setting=setting)
+        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "correct the times of efforts", setting=setting)
 
 
 def _fitted(data: _Data) -> _EffortFit:

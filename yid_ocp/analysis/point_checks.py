@@ -103,10 +103,10 @@ def _explained(
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
     words, depth = f"points ({far or 'all'}) are {error:.3g} m (rms) from the model", error / allowed
     for chosen in good:
-        words = f"{words}; {chosen.words}, they are {chosen.error:.2g} m from the model"
+        words = f"{words}, but only {chosen.error:.2g} m {chosen.words}"
         place = recording, "joints" if chosen.channel else group, chosen.channel
         return Issue(chosen.cause, words, "not_trusted", depth, chosen.advice, *place, setting=chosen.setting)
-    words = f"{words}, and no simple change explains it"
+    words = f"{words}, and no simple change explains this"
     advice = "check the frame and the names of the points, and the URDF of the robot"
     return Issue("point_unlike", words, "not_trusted", depth, advice, recording, group)
 
@@ -124,7 +124,7 @@ def _rms(difference: Array) -> float:
 def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     """Yield corrections: another unit of length, or axes exchanged or flipped about the world's origin."""
     for scale in _UNIT_SCALES:
-        words = f"if divided by {scale:g}"
+        words = f"if positions are divided by {scale:g}"
         yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
     errors = {turn: _rms(seen[..., list(turn[0])] * np.array(turn[1]) - place) for turn in list(turns)[1:]}
@@ -153,12 +153,12 @@ def _changed_times(
     late, _, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen)
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
-        words = f"if their times are {late:+.3g} s off the joints' clock"
-        yield _Change("clock_offset", words, f"subtract {late:.3g} s from their times", error)
+        words = f"if {-late:+.3g} s are added to their times"
+        yield _Change("clock_offset", words, f"add {-late:+.3g} s to their times", error)
         return
     late, drift, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
-        words = f"if their times are {late:+.3g} s off the joints' clock and {1e3 * drift:+.3g} parts per thousand fast"
+        words = f"if their clock is corrected by {-late:+.3g} s and {-1e3 * drift:+.3g} parts per thousand"
         yield _Change("clock_drift", words, clock_checks.timestamp_correction_advice(late, drift, middle), error)
 
 
@@ -181,7 +181,7 @@ def _changed_zeros(
             place, by_angle = arm.frame_positions_and_jacobians(frames, moved)
         else:
             setting = known_effect_config_line("encoder_offset", name, "offset", -offset)
-            words, advice = f"if {offset:+.3g} rad are added to {name}", f"set the zero of {name}, or estimate it"
+            words, advice = f"if {offset:+.3g} rad are added to {name}", f"correct this, or model the offset of {name}"
             found.append(_Change("encoder_offset", words, advice, _rms(seen - place), setting, f"position.{name}"))
     yield from sorted(found, key=lambda change: change.error)[:1]
 
@@ -231,18 +231,18 @@ def points_too_distant_issues(
         noise = _noise(group)
         worst, words, ratio = 0.0, "", 1.0
         places = {name: group.position[:, group.names.index(name)] for name in ways}
-        pairs: list[tuple[str, Array, float]] = []
+        pairs: list[tuple[tuple[str, str], Array, float]] = []
         for name, way in ways.items():
             root = next(iter(way))
             if mechanism.joints[root].parent_index < 0:
                 at = ca.densify(mechanism.joints[root].placement.translation)
                 fixed = np.array(ca.Function("at", [system.parameters.symbols], [at])(theta)).ravel()
-                pairs.append((f"{name} from the object's root", places[name] - fixed, way[root]))
+                pairs.append(((name, "the object's root"), places[name] - fixed, way[root]))
         for (one, a), (two, b) in itertools.combinations(ways.items(), 2):
             if next(iter(a)) == next(iter(b)):
                 bound = min(a[i] + b[i] for i in a.keys() & b.keys())
-                pairs.append((f"{one} from {two}", places[one] - places[two], bound))
-        for said_as, apart, bound in pairs:
+                pairs.append(((one, two), places[one] - places[two], bound))
+        for (one, two), apart, bound in pairs:
             size = np.linalg.norm(apart, axis=1)
             if not np.isfinite(size).any():
                 continue
@@ -251,9 +251,9 @@ def points_too_distant_issues(
             if far / allowed > worst:
                 # a point at the root has no information on a scale
                 worst, ratio = far / allowed, far / bound if bound > 0 else 1.0
-                words = f"{said_as} is {far:.3g} m, but only {bound:.3g} m along the object"
+                words = f"{one} is measured {far:.3g} m from {two}, but the object allows at most {bound:.3g} m"
         if worst > 1:
-            cause, advice = "point_reach", "check the frame of the points, the camera's pose and their names"
+            cause, advice = "point_reach", "check frame and names of the points, and the camera's pose"
             if ratio > 5:
                 cause, advice = "point_scale", f"check the unit of positions ({ratio:.2g} times the possible distance)"
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
@@ -309,7 +309,7 @@ def cable_point_geometry_issues(cable: CableVertices, recording: Recording, grav
         typical = float(np.median(_lengths(at, edges) / _lengths(rest, edges)))
         found: list[Issue | None] = [_exchanged(at, rest, edges), _upside_down(cable, at, rest, gravity)]
         if abs(typical - 1) > _LENGTH_RTOL:
-            words = f"edges between points have {typical:.3g} times their undeformed length"
+            words = f"distances of neighbouring points are {typical:.3g} times those of the undeformed cable"
             depth = abs(math.log(typical)) / math.log(1 + _LENGTH_RTOL)
             found[0] = Issue("point_scale", words, "not_trusted", depth, f"divide positions by {typical:.3g}", "")
         for issue in found:
@@ -338,7 +338,7 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
     words = f"the edge {edges[worst][0]} to {edges[worst][1]} has {ratio[worst]:.3g} times its undeformed length"
     cause, advice = "point_reach", "check the names of the points"
     if least < 0.5 * off.sum():
-        words += f"; with {best[0]} and {best[1]} exchanged, {int(off.sum()) - least} more edges have the right length"
+        words += f". If {best[0]} and {best[1]} are exchanged, {int(off.sum()) - least} more edges are right"
         cause, advice = "point_swapped", f"exchange {best[0]} and {best[1]}"
     return Issue(cause, words, "not_trusted", float(abs(math.log(ratio[worst]))) / most, advice, "")
 

@@ -13,7 +13,7 @@ import scipy.special
 from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.sensors import CHANNEL_KINDS, SensorOptions
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, NOISE_ESTIMATE_DIFFERENCE_ORDER, quantization_step
@@ -77,8 +77,8 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         if evidence >= 1:
             start, stop = float(t[begin]), float(t[end])
             what = f"{channel} repeats one value for {stop - start:.3g} s"
-            what += f", but the recorded velocity gives a turn by {turned:.2g} rad" if turned > unseen else ""
-            advice = "check the sensor; use only the other times (Python: Recording.time_slice) or other channels"
+            what += f", although its velocity means a rotation by {turned:.2g} rad" if turned > unseen else ""
+            advice = "check the sensor, and cut out this time (Python: Recording.time_slice) or do not use the channel"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
@@ -144,13 +144,13 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
         size, wide = step / math.sqrt(12), float(np.ptp(values))
         # an angle that hardly moves always has few levels
         least = 5 * QUALITY_LIMITS.min_joint_motion if channel.startswith("position") else 0.0
-        few = step > wide / 16 and wide > least
+        few, unit = step > wide / 16 and wide > least, JOINT_CHANNEL_UNITS.get(channel.partition(".")[0], "m")
         setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
         if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
-            what = f"{channel} is quantised in steps of {step:.3g}, which give noise with the std {size:.2g}"
-            what += f"; the stated std is {stated:.2g}" if stated else ""
+            what = f"{channel} has steps of {step:.3g} {unit}, so rounding alone has a std of {size:.2g} {unit}"
+            what += f". The stated std is only {stated:.2g} {unit}" if stated else ""
             ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
-            advice, line = "set the std to that of the steps, or record with more digits", f"{setting}: {size:.2g}"
+            advice, line = "set the std to that of rounding, or record with more digits", f"{setting}: {size:.2g}"
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
@@ -158,7 +158,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
             # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            what = f"the noise of {channel} between samples has the std {seen:.2g}; the stated std is only {stated:.2g}"
+            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, but the stated std is {stated:.2g} {unit}"
             ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
             advice = "set the std to that of the actual noise"
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
@@ -200,9 +200,9 @@ def overstated_noise_std_issues(recording: Recording, options: SensorOptionsFunc
         line = f"{{{', '.join(f'{name}: {size:.2g}' for name, size in own.items())}}}"
         if len(set(own.values())) == 1 or not sensor.startswith("joints."):  # a group of points takes one number
             line = f"{max(own.values()):.2g}"
-        what = f"the noise of {channel} has the std {seen_of[channel]:.2g} or less; the stated std is {stated:.2g}"
-        what += f" (also too large for others: {len(low)} of {len(entries)} channels in all)" if len(low) > 1 else ""
-        ratio = stated / most[channel]
+        ratio, unit = stated / most[channel], JOINT_CHANNEL_UNITS.get(channel.partition(".")[0], "m")
+        what = f"the noise of {channel} has a std of at most {seen_of[channel]:.2g}, not {stated:.2g} {unit} as stated"
+        what += f" (too large for {len(low)} of {len(entries)} such channels)" if len(low) > 1 else ""
         advice = "set the std to that of the actual noise: a larger std makes every ± too wide and hides small gaps"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
@@ -225,7 +225,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             if alone and again and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
-                advice = "record within the sensor's range, or cut out these times; if the efforts are "
+                advice = "record within the sensor's range, or cut out these times. If the efforts are "
                 advice += "commands of a controller, set sensors.joints.effort.effort_sampling_kind: command"
                 yield Issue("saturated", what, "not_trusted", at.sum() / least, advice, "", group, channel, begin, end)
 

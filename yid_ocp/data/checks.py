@@ -67,9 +67,9 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
     left = sum(part.duration for part in kept)
     parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
     named = tuple(replace(one, name=f"{recording.name}{part}") for one, part in zip(kept, parts, strict=False))
-    said = f"{count_with_noun(len(kept), 'part')} of the data, {left:.3g} s, {'is' if len(kept) == 1 else 'are'} used"
+    said = f"{count_with_noun(len(kept), 'part')} of the data ({left:.3g} s) {'is' if len(kept) == 1 else 'are'} used"
     if not anywhere and len(kept) < len(edges):
-        said += "; a part counts only where it starts at rest"
+        said += " (a part must start at rest)"
     return _RecordingParts(named, tuple(_doubt(recording, t, int(gap), allowed, said) for gap in gaps))
 
 
@@ -100,12 +100,12 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         fastest = float(np.max(speed))
         at_once = np.max(way) < _MAX_CLOCK_JUMP_PERIODS * median_sample_period(t) * fastest
         jumped = fastest * length > _MIN_JUMP_ROTATION and bool(at_once)
-    what = f"for {length:.3g} s there are no samples of the data that move the model"
+    what = f"the data that move the model have no samples for {length:.3g} s"
     if jumped:
-        what = f"the clock jumps by {length - median_sample_period(t):.3g} s while the joints continue smoothly"
+        what = f"the clock jumps by {length - median_sample_period(t):.3g} s although the joints continue smoothly"
     cause, group = "clock_jump" if jumped else "gap", "joints" if joints is not None else ""
-    advice = "find out why samples are missing, or write the wanted part to a file of its own (Recording.time_slice)"
-    what, begin, end = f"{what}; {said}", float(t[gap]), float(t[gap + 1])
+    advice = "find out why samples are missing; to use another part, cut it out (Python: Recording.time_slice)"
+    what, begin, end = f"{what}. {said}", float(t[gap]), float(t[gap + 1])
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
@@ -135,11 +135,11 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         slowest = limits.max_point_period if isinstance(group, PointGroup) else limits.max_joint_period
         if step <= slowest:
             continue
-        what, advice = f"{group.name}/t has a sample every {step:.4g} s", "write times in seconds"
+        what, advice = f"{group.name}/t has only one sample every {step:.4g} s", "write times in seconds"
         for unit, size in _CLOCK_UNITS.items():
             if 2e-4 <= step * size <= 2 * slowest:
-                what += f"; if the times are {unit}, the rate is {1 / (step * size):.4g} Hz"
-                advice += f" (divide by {1 / size:.0e})"
+                what += f". If the times are in {unit}, the rate is {1 / (step * size):.4g} Hz"
+                advice += f" (divide them by {1 / size:g})"
                 break
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
 
@@ -148,7 +148,7 @@ def _few_samples(recording: Recording) -> Iterator[Issue]:
     for group in recording.joint_and_point_groups:
         count, least = len(group.t), QUALITY_LIMITS.min_samples
         if count < least:
-            what, advice = f"{group.name} has {count_with_noun(count, 'sample')}", "record some seconds of motion"
+            what, advice = f"{group.name} has only {count_with_noun(count, 'sample')}", "record some seconds of motion"
             yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 
@@ -165,15 +165,15 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             since = "one of two clocks counts from 1970: " if epoch else ""
             spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
             ratio = LIMIT_VIOLATION_RATIO_CAP if epoch else 1 + far / max(last - first, 1e-9)
-            what, advice = f"{since}joints were recorded {spans}", "write the times of all groups on one clock"
+            what, advice = f"{since}joints were recorded {spans}", "convert the times of all groups to one clock"
             yield Issue("clock_base", what, "refused", ratio, advice, "", group.name, "t")
             continue
         slack = max(QUALITY_LIMITS.max_clock_mismatch_fraction * (last - first), 5 * median_sample_period(group.t))
         late, over = begin - first, end - last
         shift = min(late, over) if late > 0 else max(late, over)
         if late * over > 0 and abs(shift) > slack:
-            what = f"begin and end of {group.name} minus those of the joints are {late:+.3g} s and {over:+.3g} s"
-            advice = f"shift the times of {group.name} to the joints' clock"
+            how = f"starts {abs(late):.3g} s and ends {abs(over):.3g} s {'later' if late > 0 else 'earlier'}"
+            what, advice = f"{group.name} {how} than the joints", "if the clocks differ, shift the times of the points"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
         elif (
             len(recording.points) == 1  # a note does not say which of several groups is late
@@ -184,7 +184,7 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
             setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0].lstrip('+-')}"
             again = f"import again with --clock-offset {option.rstrip(')')}, or set {setting}"
-            advice = f"unless the object swings behind, {again}, and a fit estimates the shift"
+            advice = f"{again}, so that a fit estimates the shift; if the object only swings behind the arm, do nothing"
             what = LATE_POINTS_WORDS + lag
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
 
@@ -203,7 +203,7 @@ def _dropped(recording: Recording) -> Iterator[Issue]:
     small = count[count < 50]  # longer ones are gaps
     missing = float(np.sum(small - 1) / np.sum(small))
     if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
-        what = f"{100 * missing:.2g} % of the joint samples at a rate of {1 / base:.4g} Hz are missing"
+        what = f"{100 * missing:.2g} % of the joint samples are missing (at the rate of {1 / base:.4g} Hz)"
         advice = "find the cause; torques are interpolated between the remaining samples"
         ratio = missing / QUALITY_LIMITS.max_missing_fraction
         yield Issue("dropped_samples", what, "warning", ratio, advice, "", "joints", "t")
@@ -254,10 +254,10 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     for j in wrong:
         size, cause = abs(ratio[j]), "angle_scale"
         evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
-        if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
-            cause, evidence = "angle_sign", LIMIT_VIOLATION_RATIO_CAP
         what = f"the angle of {names[j]} changes {ratio[j]:.3g} times as fast as its recorded velocity states"
-        advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}"
+        advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}, or correct the velocity"
+        if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
+            cause, evidence, advice = "angle_sign", LIMIT_VIOLATION_RATIO_CAP, f"reverse the sign of {names[j]}'s angle"
         yield Issue(cause, what, "not_trusted", evidence, advice, "", "joints", f"position.{names[j]}")
 
 
@@ -267,7 +267,7 @@ def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: A
     for i, j in combinations(off, 2):
         across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
         if min(across) > 0.9:
-            what = f"the angle of {names[i]} changes like the velocity of {names[j]}, and the reverse holds, too"
+            what = f"the angle of {names[i]} changes like the velocity of {names[j]}, and vice versa"
             evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two joints' angles"
             yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", f"position.{names[i]}")
 
@@ -286,7 +286,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         moved.append(size / max(QUALITY_LIMITS.min_point_travel, noise))
     if max(moved, default=2.0) < 1.0:
         what = f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise"
-        advice = "record a motion; at rest only parameters of statics (weights, stiffnesses) can be found"
+        advice = "record a motion: at rest, only weights and stiffnesses can be found"
         yield Issue("standstill", what, "warning", 1 / max(*moved, 1e-3), advice, "")
 
 

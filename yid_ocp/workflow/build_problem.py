@@ -277,7 +277,7 @@ def _once(
     others: list[Recording] = []
     for recording in estimate:
         if same := _duplicate(used, recording):
-            issues.append(replace(same[0], what=f"{same[0].what}; it counts once"))
+            issues.append(replace(same[0], what=f"{same[0].what}, so it counts once"))
         else:
             used.append(recording)
     for recording in held_out:
@@ -287,7 +287,7 @@ def _once(
             hint = f"leave out {recording.name} or {same[1].name}"
             raise DataError(what, where=where, allowed="every measurement in one list", hint=hint)
         if _duplicate(others, recording):
-            text = f"{recording.name} is held out twice; it counts once"
+            text = f"{recording.name} is held out twice, but counts once"
             issues.append(Issue("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
         else:
             others.append(recording)
