@@ -191,7 +191,7 @@ def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.
     for end, holder, others in (("mount", "mount", "hub"), ("finger", "hub", "finger, mount")):
         (bench / "wrist.urdf").write_text((bench / "wrist.urdf").read_text().replace("</robot>", fixed.format(end)))
         assert proposed(moved(SHORT)).model.object.mount.parent_frame == holder
-        assert f"held by: {holder} (frames there, for --holder: {others})" in capsys.readouterr().out
+        assert f"object held by: {holder} (frames there for --holder: {others})" in capsys.readouterr().out
 
 
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
@@ -227,7 +227,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
     assert "damping: {pitch: 0.4} N m s/rad, as the robot file states" in (told := capsys.readouterr().out)
-    assert told.count("diagnose cannot see joint_*, payload and effort_* of the arm: efforts are off") == 2
+    assert told.count("effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm") == 2
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:
@@ -248,7 +248,7 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
     made = moved(SHORT)
     commands = np.vstack([made.joints.position[6:], np.tile(made.joints.position[-1:], (6, 1))])
     run = proposed(replace(made, joints=replace(made.joints, position_command=commands)))
-    assert "mode: servo (commanded positions were recorded" in capsys.readouterr().out
+    assert "mode: servo (no efforts were recorded, but commanded positions" in capsys.readouterr().out
     assert (run.model.arms.mode, run.model.arms.servo.command_interpolation) == ("servo", "held")
     system = build_system(run)
     assert set(system.servos) == set(system.driven) == {"roll", "pitch"}
@@ -474,12 +474,12 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
 
 def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     proposed(moved(SHORT[:1]))
-    assert "joints has 1 sample" in capsys.readouterr().out
+    assert "joints has only 1 sample" in capsys.readouterr().out
 
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
-    assert "is it in the same frame?" in capsys.readouterr().out
+    assert "is its frame right?" in capsys.readouterr().out
     assert not run.sensors["points"].frame_by_recorded_name
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2

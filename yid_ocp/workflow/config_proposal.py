@@ -43,7 +43,7 @@ _MAX_BEYOND_LENGTH = 0.02  # of the object's length; no point can be farther fro
 _MAX_LATENESS = 0.25  # largest lateness of the points' clock, for which the holder must stand still [s]
 _MAX_STRAIGHT_DEVIATION = 0.01  # of the length; largest deviation of a straight segment's end distance from its length
 _STRAIGHTEST_FRACTION = 0.1  # fraction of the samples with the end farthest from the holder
-_SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
+_SEEN_NOISE, _STATED_NOISE = "estimated from differences of consecutive samples", "stated in the recording"
 _LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
 """Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
 
@@ -163,7 +163,7 @@ def propose_config_choices(
     for recording in recordings:
         start = min(group.t[0] for group in recording.joint_and_point_groups)
         if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
-            moving = f"{mover} of {recording.name} moves at the start, so the initial state is estimated"
+            moving = f"{mover} already moves at the start of {recording.name}"
     return ProposedConfigChoices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
@@ -270,13 +270,13 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
         what = "the recording has no measurement of the object"
         raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if is_servo:
-        return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
+        return "servo", "no efforts were recorded, but commanded positions, which the arm's servos follow"
     if joints.effort is None:
         return "prescribed", "no efforts were recorded, so the arm moves as measured"
     if not has_object:
         return "prescribed", "the arm moves as measured, and the model predicts the efforts that this motion requires"
     if closed:
-        return "driven", "efforts were recorded, and grasps close loops, which inexact measured angles would strain"
+        return "driven", "grasps form closed chains, in which errors of measured angles would cause false forces"
     if seen:
         return "prescribed", f"the object hangs on the arm and {seen} see the object, so the arm moves as measured"
     return "prescribed", "no sensor measures the object, so its parameters are estimated from the arm's efforts"
@@ -350,11 +350,11 @@ def _places(
             parts = _parts_when_straight(positions, poses, branches)
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
-            frame, reason, std = "", "its place is not known", 0.0
+            frame, reason, std = "", "its place on the model is not known", 0.0
             if point in frames or (colon and owner in names and part.endswith("%")):
-                frame, reason = point, "a frame of the model by its name"
+                frame, reason = point, "the model has a frame of this name"
             elif point in names:
-                frame, reason = f"w_{point}", "the end of the segment of its name"
+                frame, reason = f"w_{point}", "the end of the segment of this name"
             elif not standing:
                 straight = math.nan if parts is None else float(parts[i])
                 frame, reason = _near(poses, positions[:, i], straight, branches, holder)
@@ -404,18 +404,18 @@ def _near(
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return "", f"it is {part:.1f} times the length away from {holder}: is it in the same frame?"
+            return "", f"it is {part:.1f} times the object's length away from {holder}: is its frame right?"
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
         beyond = " (beyond the end: are length, frame and clocks right?)" if part > 1.05 else ""
-        return _along(branch.name, min(100, percent)), f"up to {part:.1%} of the length away from {holder}{beyond}"
+        return _along(branch.name, min(100, percent)), f"at most {part:.1%} of the length away from {holder}{beyond}"
     local = poses[0, :3, :3].T @ from_holder[0]
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
     name = min(apart, key=apart.__getitem__)
     if apart[name] > 0.5 * max(branch.length for branch in branches):
-        return "", f"{apart[name]:.2g} m away from all of the straight object: is it in the same frame?"
-    return name, f"{1e3 * apart[name]:.0f} mm from there when the object is straight"
+        return "", f"it is {apart[name]:.2g} m away from the straight object: is its frame right?"
+    return name, f"{1e3 * apart[name]:.0f} mm from this frame when the object is straight"
 
 
 def _along(name: str, percent: float) -> str:
@@ -426,12 +426,12 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     """Frames of wrist sensors and inertial units: the frame of the same name, else, for a wrist, the holder."""
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for key, group, channel in _mounted_channels(recording):
-        other = ("", "no moving link has that name: write frames: {NAME: FRAME} in place of use: false")
+        other = ("", "no link has this name: for use: true, set frame_by_recorded_name: {NAME: FRAME}")
         if channel.group == "wrist":
             other = (holder, "a guess: the sensor carries this link and its load; if not, set frame_by_recorded_name")
         own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
         found[key] = tuple(
-            _PointPlacement(name, name, "a link has that name") if moves else _PointPlacement(name, *other)
+            _PointPlacement(name, name, "a link has this name") if moves else _PointPlacement(name, *other)
             for name, moves in own.items()
         )
     return found
@@ -500,7 +500,7 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
         sizes += [noise_or_quantization_std(group.t[seen], column) for column in group.position[seen, i].T]
     if slow or not any(sizes):
         std = _CAMERA_STD if slow else _MARKER_STD
-        return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show it")
+        return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show the noise")
     return _GroupNoise(math.sqrt(math.fsum(x * x for x in sizes) / np.count_nonzero(sizes)), "m", _SEEN_NOISE)
 
 

@@ -186,7 +186,7 @@ def _summary_lines(
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
     lines = [
         f"joints: {abbreviated_names_text(proposal.joints, math.inf)}",
-        f"held by: {', '.join(held)}" + f" (frames there, for --holder: {', '.join(others)})" * bool(others),
+        f"object held by: {', '.join(held)}" + f" (frames there for --holder: {', '.join(others)})" * bool(others),
         f"model.arms.mode: {proposal.arm_mode} ({proposal.arm_mode_reason})",
         f"problem.initial_state: {proposal.initial_state} ({proposal.initial_state_reason})",
     ]
@@ -199,7 +199,7 @@ def _summary_lines(
         lines.append(f"diagnose will not try {', '.join(kinds)}, because no recording has {signals}")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
-    unseen = "diagnose cannot see joint_*, payload and effort_* of the arm: efforts are off (sensors.joints.effort.use)"
+    unseen = "set sensors.joints.effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm"
     lines += [*[unseen] * is_left_out, *picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
@@ -343,7 +343,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
                 biases = {joint: float(f"{std:.2g}") for joint, std in proposal.torque_bias_std.items()}
                 values = _number(next(iter(biases.values()))) if len(set(biases.values())) == 1 else _value(biases)
                 entries.append(f"bias_std: {values}")
-                said += "; bias_std of its constant error: a guess, 1 % of the effort limit"
+                said += "; bias_std (constant error): a guess, 1 % of the effort limit"
             if told_by_points:
                 entries = ["use: false", *entries]
                 said = "use: true looks for friction and payload of the arm; bias_std allows a constant error of each "
@@ -352,12 +352,12 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
         is_mounted = places and "." in group
         if places and not (proposal.has_object or is_mounted or any(place.frame for place in places)):
             entries = ["use: false", *entries]
-            said = "the places of its points are not known; frame_by_recorded_name: {POINT: FRAME} states them"
+            said = "places of its points are unknown; to use it, set frame_by_recorded_name: {POINT: FRAME}"
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
-            why = "torques with noise move the arms: set mode: prescribed to use it"
+            why = "not usable while noisy torques move the arms; to use it, set mode: prescribed"
             entries = ["use: false", *entries]
             said = why if proposal.arm_mode == "driven" else "its frame is not known"
         elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
             entries = ["use: false", *entries]
-            said = "an estimate from joint torques, less the loads that the driver knows: in place of efforts only"
+            said = "the driver's estimate from joint torques, without known loads: use it only in place of efforts"
         yield group, entries, said, places
