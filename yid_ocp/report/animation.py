@@ -305,7 +305,7 @@ def measured_motion_animation(
         return None
     if not has_straight_object:
         return AnimationData(title, t, (motion,))
-    unbent = replace(told, name="model on the recorded angles, nothing bent")
+    unbent = replace(told, name="undeformed model at the recorded angles")
     return AnimationData(title, t, (_model_motion(unbent, t, _with_recorded_angles(told, recording, t)), motion))
 
 

@@ -249,7 +249,7 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> _Figur
 
 def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> _Figure:
     """Plot (cost / lowest cost of the same method) - 1 against wall time. `costs`: (seconds, costs) by method."""
-    figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
+    figure = _styled_figure(340, "wall time [s]", "cost / lowest cost - 1")
     _set_axis(figure, "yaxis", type="log")
     least = {name: max(min(cost, default=0.0), 1e-300) for name, (_, cost) in costs.items()}
     excess = {name: (t, [max(c / least[name] - 1, 1e-9) for c in cost]) for name, (t, cost) in costs.items()}
@@ -264,7 +264,7 @@ def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: S
 
 def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> _Figure:
     """Plot profile likelihoods: rise of chi2 over parameter / estimate, by name. `level` is the rise at 95 %."""
-    figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items())
+    figure = _add_curves(_styled_figure(380, "value / estimate", "chi2 - smallest chi2"), curves.items())
     _add_line(figure, "y", level, color=_TEXT_COLOR, dash="dot")
     at = {"x": 1, "xref": "x domain", "xanchor": "right", "y": level, "yref": "y", "yanchor": "bottom"}
     figure["layout"]["annotations"].append({"text": "95 %", "showarrow": False, **at})

@@ -36,7 +36,7 @@ _Chapter = tuple[str, Sequence[str], _TitledFigures]
 """Title, sentences (empty ones are not shown), and figures with their titles."""
 
 
-@register_report_section("diagnosis", 5, "The gap and what makes it")
+@register_report_section("diagnosis", 5, "The gap and its causes")
 def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
     result = findings.result
     finding: DiagnosisResult | None = findings.section_data.get("finding")
@@ -78,7 +78,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
             errors = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
-            worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
+            worse = f"; that of {least} rises by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
         level = f"chi² per degree of freedom is {first:.3g} (1 = noise alone)"
@@ -114,13 +114,13 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
     without = ", without the effects that explain the gap" if finding.accepted_effects else ""
     sentences = [
-        f"Of the {_NOMINAL_LABEL}{without}: every coordinate was given an unknown force, every grasp an unknown offset "
-        "and every measured point an unknown bias, free to change in time; the fewest groups of them that explain the "
-        "residual were kept.",
-        f"By evidence the gap lies in {verdicts[smoothed.plant_or_sensor_origin]}: the log evidence rises by "
+        f"Analysis of the {_NOMINAL_LABEL}{without}: every coordinate has an unknown force, every grasp an unknown "
+        "offset and every measured point an unknown bias, which may change over time. The fewest groups of them that "
+        "explain the residual were kept.",
+        f"Most probably the gap lies in {verdicts[smoothed.plant_or_sensor_origin]}: the log evidence rises by "
         f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
-        f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
-        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap where it was fitted.",
+        f"alone, by {evidence['both']:.4g} with both (5: odds of 150 to 1). They explain "
+        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings.",
         f"A gap at {noticed} would have been detected." if noticed else "",
         f"A gap at {silent} would not have been detected by these motions and sensors." if silent else "",
         f"The residual gap lies in {', '.join(left)}." if finding.accepted_effects and left else "",
@@ -139,7 +139,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         sentences.append("No group of unknowns explains the residual better than chance, so there is no map.")
     if len(smoothed.smoothed_unknowns) > _MAX_MAPS:
         sentences.append(f"{len(smoothed.smoothed_unknowns) - _MAX_MAPS} more recordings are in trajectories.h5.")
-    return "Where it is, and when", sentences, maps
+    return "Where and when the gap arises", sentences, maps
 
 
 def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int, kept: list[int]) -> tuple[Any, str]:
@@ -159,7 +159,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     if np.any(np.isfinite(values)):
         j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
         sentence = (
-            f"Grey: not informed by the data. The most significant value is that of {names[k]}, {edges[j]:.2f} to "
+            f"Grey: not determined by the data. The most significant value is that of {names[k]}, {edges[j]:.2f} to "
             f"{edges[j + 1]:.2f} s, {said(j, k)}."
         )
     else:
@@ -231,23 +231,23 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     if not entries:
         return None
     absolute = "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
-    unit = "as a fraction of the excess over noise" if percent else absolute
-    promise = f"redicted decrease of the fitted misfit by each, to first order, {unit}."
+    unit = "as a fraction of the error beyond noise" if percent else absolute
+    promise = f"redicted decrease of the misfit on fitted motions by each effect (linear model), {unit}."
     refitted = ", ".join(own.effects[0].label for own in finding.single_effect_models)
-    why = ", because they show no gap beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
-    unmeasured = f"Refitted: {refitted}. Held-out motions do not measure what a refit closes{why}."
+    why = ", because they show no error beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
+    unmeasured = f"Refitted: {refitted}. Held-out motions do not show how much of the gap this closes{why}."
     sentences = [f"P{promise}", unmeasured if refitted else "No predicted decrease is large enough for a refit."]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
         best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
         sentences = [
-            "Left: refitted together with the stiffnesses, each alone, and tested on held-out motions, with the 95 % "
-            f"interval; 100 % closes the gap, less than zero predicts worse. Closed by {said}.",
+            "Left: part of the held-out gap that each effect alone closes, refitted with the parameters, with its 95 % "
+            f"interval. 100 %: no gap is left; below zero: predictions get worse. Values: {said}.",
             f"Right: p{promise}",
         ]
     # room for one word on a narrow screen
     axes = ("closed [%]", "promised [%]" if percent else "promised")
-    title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
+    title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect causes the gap"
     return title, sentences, [("", figures.gap_closure_and_screening_figure(entries, *axes))]
 
 
@@ -269,10 +269,10 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
         law.sentence,
         "Band: two standard deviations. Dotted lines: range that the recordings cover; beyond it the torque is held "
         "constant. Dashed: the nearest law of the library.",
-        "" if rival is None else f"Next best: {rival[1]} at {rival[0]}, which closes {100 * rival[2]:.3g} %.",
-        "law.csv holds the table; an effect {kind: law, location, depends_on, table} puts it into a model.",
+        "" if rival is None else f"Next best: {rival[1]} at {rival[0]}, closes {100 * rival[2]:.3g} % of the gap.",
+        "law.csv has this table. To use it in a model, add the effect {kind: law, location, depends_on, law_csv}.",
     ]
-    return "A law without a name", sentences, shown
+    return "A torque law for the gap", sentences, shown
 
 
 def _library_curves(table: TorqueLawTable, at: Array) -> dict[str, Array]:
@@ -308,11 +308,11 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     none = f"No two signatures are similar in both directions; by the smaller percentage the closest are {said[0][1]}."
     sentences = [
-        "Percentage of the row's signature that the column can reproduce, beyond the stiffnesses. These motions and "
-        "sensors cannot distinguish a pair with 100 %, for any residual.",
+        "Percentage of the row's signature that the column's effect can reproduce, together with the parameters. "
+        "At 100 %, these motions and sensors cannot distinguish the two effects.",
         f"Similar in both directions, with the smaller percentage: {listed}." if close else none,
     ]
-    return "What could be mistaken for what", sentences, [("", figures.confusability_matrix_figure(names, values))]
+    return "Which effects are confusable", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
 
 def _curves(
@@ -373,4 +373,4 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
         "deviations, cut at the edge of the figure.",
         f"{said}." if said else "No parameter changes by more than 10 %.",
     ]
-    return "What the stiffnesses had absorbed", sentences, shown
+    return "Parameters that imitated the effects", sentences, shown

@@ -88,7 +88,7 @@ def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
     return {"solution": solution, "finite": math.isfinite(solution.cost), "figure": figure}
 
 
-@register_report_section("inputs", 90, "What it was made from")
+@register_report_section("inputs", 90, "Inputs")
 def _provenance(findings: ReportData) -> Mapping[str, Any] | None:
     result = findings.result
     if "versions" not in result:
