@@ -98,9 +98,9 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(carried_out, repository, mon
 
     monkeypatch.setattr(solvers, "fit_problem", failing)
     done = carried_out("identifiability", repository / "configs" / "springs_series_ends.yaml", codes=(1,))
-    assert "failed: the rollout failed; there is no point to analyse" in done.out
+    assert "failed: the rollout failed; without estimates there is nothing to analyse" in done.out
     assert done.result["parameters"] == {}
-    assert "there is no point to analyse" in (done.folder / "report.html").read_text()
+    assert "without estimates there is nothing to analyse" in (done.folder / "report.html").read_text()
 
 
 @pytest.mark.parametrize("named", ["pendulum", "springs_torsion", "springs_series_joint"])

@@ -94,7 +94,7 @@ def test_a_solve_says_what_is_not_found():
         ("p_at_bound", "lower", "2", solved()), ("p", "upper", "9", solved(parameters=poor, fit=BAD))
     ):  # fmt: skip
         said = " ".join(" ".join(told("yid-solve/1", result)).split())
-        assert f"{name} ended at its {side} bound of {bound} N m/rad: nothing beyond was tried; widen " in said
+        assert f"{name} ended at its {side} bound of {bound} N m/rad, so values beyond it were not tried. " in said
         assert f"`parameters.{name}.bounds`" in said
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
     lost = solved(parameters={"a": parameter("not_identifiable") | {"std": None}, "b": parameter("identifiable")})
@@ -103,24 +103,24 @@ def test_a_solve_says_what_is_not_found():
     assert "±" not in "".join(lines[1:-4])
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
-    assert "the fit failed: do not use the values, which are the best that were reached; their ± is unknown" in lines
+    assert "the fit failed, so do not use the values: they are the best that were reached, without a known ±" in lines
 
 
 def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     worse = {"recording": "run", "channel": "w_T2", "rmse": 0.05, "unit": "m", "baseline": "stays", "guess": 0.02}
     said = solved(fit=BAD, parameters={"a": parameter("not_trusted")})
-    first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7; noise alone gives 1); "
-    first += "to find the cause, run `yid-ocp diagnose`"
+    first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7; noise alone gives 1). "
+    first += "To find the cause, run `yid-ocp diagnose`"
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    sure = "use these values only if no effect is missing; their ± (up to 10 %) has the model error: a = 2 ± 0.1"
+    sure = "use these values only if `yid-ocp diagnose` finds no effect (± includes the model error): a = 2 ± 0.1"
     assert lines[:2] == [first, f"{sure} N m/rad"]
     unsure = solved(fit=BAD, parameters={"a": parameter("not_trusted") | {"std": 0.21}})
-    assert "no value is known to within 10 %" in told("yid-solve/1", unsure)[1]
+    assert "none is known to within 10 %" in told("yid-solve/1", unsure)[1]
     assert "10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"data_trusted": False}})[1]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
     lines = told("yid-solve/1", said)
-    worse = "larger error than a guess without a model: w_T2 of run, 50 mm instead of 20 mm (stays)"
+    worse = "worse than a guess without a model (rms): w_T2 of run, 50 mm against 20 mm (stays)"
     assert (lines[0], worse in lines[2], "; 2 more in" in " ".join(lines[2:5])) == (first, True, True)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in lines[:6]
@@ -132,18 +132,18 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
 @pytest.mark.parametrize(
     ("error", "noise", "fit", "said"),
     [
-        (0.012, 0.010, GOOD, "; torque noise of the stated size accounts for 10 mm, so there is no gap. A guess "),
-        (0.012, 0.002, GOOD, "; noise accounts for 2 mm, so there is a gap: run `yid-ocp diagnose` before you"),
+        (0.012, 0.010, GOOD, ". Torque noise of the stated size gives 10 mm, so there is no gap. A guess "),
+        (0.012, 0.002, GOOD, ". Noise alone gives 2 mm, so there is a gap: run `yid-ocp diagnose` before you"),
         (0.003, 0.002, GOOD, None),
-        (0.003, 0.0027, GOOD, "; torque noise of the stated size accounts for 2.7 mm, so there is no gap. A guess "),
-        (0.003, 0.002, BAD, "; noise accounts for 2 mm. A guess without a model has 30 mm (every reading keeps"),
+        (0.003, 0.0027, GOOD, ". Torque noise of the stated size gives 2.7 mm, so there is no gap. A guess "),
+        (0.003, 0.002, BAD, ". Noise alone gives 2 mm. A guess without a model gives 30 mm (every reading keeps"),
     ],
 )
 def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
     own = "points.p"
     entry = {"recording": "r", "rmse": {own: error}, "baselines": {"stays": {own: 0.03}}, "expected": {own: noise}}
     known = {"residuals": {own: {"rmse": 0.0018, "unit": "m", "n": 9}}, "torque_offsets": {"r": {}}}
-    head = f"points: rms error {1e3 * error:.3g} mm on held-out recordings, 1.8 mm on fitted ones; "
+    head = f"points: the rms error is {1e3 * error:.3g} mm on held-out and 1.8 mm on fitted recordings. "
     text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:5]))
     assert (head in text) == (said is not None)
     assert said is None or said in text
@@ -162,9 +162,9 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
-    said = "these estimates change by more than their ± from the data"
-    at = lines.index(f"with twice the links {said}: p.a by -5.5 (± 0.073)")
-    assert lines[at + 1].startswith("with half the time step no estimate changes ")
+    said = "estimates change by more than their ± from the data (remedy: more links)"
+    at = lines.index(f"with twice the links, {said}: p.a by -5.5 (± 0.073)")
+    assert lines[at + 1].startswith("with half the time step, no estimate changes ")
     assert lines.index("it snaps") < at
     moved = {name: own | {"links": None} for name, own in moved.items()}
     assert not any("twice the links" in line for line in told("yid-solve/1", solved(discretisation=moved)))
@@ -191,7 +191,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
     assert lines[0].startswith("do not use values by single_shooting, late: they ignore noise of the inputs")
     assert "a is 9 ± 0.1 N m/rad by `solve`, but 7 by single_shooting" in lines
-    assert "late: no values, because the time was up before the first iteration" in lines
+    assert "late: no values, because the time limit ended before the first iteration" in lines
     assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "verdict"]
     assert "a          7                stopped  9 ± 0.1  found" in lines
     assert not any("does not explain" in line or "all methods agree" in line for line in lines)

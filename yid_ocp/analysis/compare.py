@@ -143,7 +143,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
         why = "it stopped in another local minimum"
     else:
         why = "its cost weights the measurements differently"
-    return [f"from {best.method} (in brackets) in {', '.join(values)}: {why}"] if values else []
+    return [f"from {best.method} (values in brackets) in {', '.join(values)}: {why}"] if values else []
 
 
 def _explanations(
@@ -172,15 +172,15 @@ def _descent_errors(
     verdicts = {name: VERDICT_TABLE_TEXTS[(known if name in hidden else own)[name].verdict] for name in known}
     within = f"within {100 * MAX_IDENTIFIABLE_RELATIVE_STD:.0f} % of the truth"
     if not wrong:
-        return f"{run.method} ended {within} everywhere"
+        return f"{run.method} ended {within} for all parameters"
     shown = {name: value_and_uncertainty_text(own[name].value, None, verdict=known[name].verdict) for name in wrong}
     places = ", ".join(f"{name} ({shown[name]} for {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
-    text = f"where {run.method} did not end {within}: {places}"
+    text = f"{run.method} did not end {within} for {places}"
     if wrong == hidden:
         return f"{text}; these are exactly the parameters that are not found"
     seen, lucky = [name for name in wrong if name not in hidden], [name for name in hidden if name not in wrong]
     if seen:
-        why = "it takes the recorded torques as true" if disturbed else "its cost weights the measurements differently"
+        why = "it ignores noise of the torques" if disturbed else "its cost weights the measurements differently"
         if run.solution.status != Status.CONVERGED:
             why = f"the method ended too early ({run.solution.status.value})"
         text += f"; the recordings determine {', '.join(seen)}, but {run.method} does not find it: {why}"

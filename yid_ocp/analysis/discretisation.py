@@ -354,7 +354,7 @@ def parameter_shifts_at_finer_discretisation(
             least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
             if not model_difference_only and excess - rest > least:
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise"
-                notes.append(f"{said}: first {_REFINED_SETTINGS[key]} and run `solve` again")
+                notes.append(f"{said}, so first {_REFINED_SETTINGS[key]} and run `solve` again")
     if kinds and not model_difference_only and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()
@@ -557,12 +557,12 @@ class AlternatingErrorGrowth:
     @property
     def stability_message(self) -> str:
         """A sentence that states whether the time step is stable, with a remedy if it is not."""
-        step = f"{self.recording_name}: the time step of {self.time_step:g} s is"
+        step, motion = f"the time step of {self.time_step:g} s is", f"the motion of {self.recording_name}"
         if self.keeps_errors_below_resolution:
-            return f"{step} stable along the motion"
+            return f"{step} stable along {motion}"
         grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % per step at {self.max_growth_time:.3g} s"
         remedy = f"set a shorter problem.time_step, such as {self.time_step / 2:g} s"
-        return f"{step} not stable: an error that changes its sign at every step {grows}; {remedy}"
+        return f"{step} not stable for {motion}: an error that alternates in sign {grows}; {remedy}"
 
 
 def _error_growth_along(

@@ -382,7 +382,7 @@ def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
-        what = parts[0].name if len(parts) == 1 else "this: " + _combination_words(parts)
+        what = "a common change of " * (len(parts) > 1) + _joined([part.name for part in parts])
         return f"{what} cannot be separated from {_hiding_nuisances(view, vector)}"
     form = _combination(view, *parts) if len(parts) == 2 else None
     if form is None:
@@ -433,14 +433,14 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
 def _combination_words(parts: Sequence[_Component]) -> str:
     """Return a sentence on the combined change of parameters along an unidentifiable direction."""
     if len(parts) == 1:
-        return f"{parts[0].name} is not observed"
+        return f"{parts[0].name} is observed by no sensor"
     largest, shown = max(abs(part.coefficient) for part in parts), parts
     if len(parts) > _MAX_LISTED_NAMES:
         shown = sorted(parts, key=lambda part: -abs(part.coefficient))[:_MAX_LISTED_NAMES]
     trade = " with ".join(f"{part.name} {10 * part.coefficient / largest:+.2g} %" for part in shown)
-    rest = " and the others to match" if len(shown) < len(parts) else ""
+    rest = " and matching changes of the others" if len(shown) < len(parts) else ""
     listed = _joined([part.name for part in parts])
-    return f"{listed} are determined only together: {trade}{rest} changes nothing that is measured"
+    return f"{listed} are determined only together: {trade}{rest} changes no measurement"
 
 
 def _joined(names: Sequence[str]) -> str:

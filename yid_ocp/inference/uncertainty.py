@@ -448,7 +448,7 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}; noise alone gives 1"
     if explains:
         return f"the model explains the recordings to within their noise ({size})"
-    return f"the model does not explain the recordings ({size}); to find the cause, run `yid-ocp diagnose`"
+    return f"the model does not explain the recordings ({size}). To find the cause, run `yid-ocp diagnose`"
 
 
 def value_and_uncertainty_text(

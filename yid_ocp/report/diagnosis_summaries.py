@@ -67,12 +67,12 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    yield "refitted candidates come first; closure alone: part of the held-out error beyond noise that this one removes"
+    yield "refitted candidates come first; closure alone: part of the held-out error beyond noise that each one removes"
     yield "the others are ordered by score (significance before a refit); p: probability of such a score by noise alone"
     yield f"{left} more candidates are in result.json" if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     yield f"effects that these recordings cannot show: {', '.join(result['unseen'])}" if result.get("unseen") else ""
     for signals, kinds in result.get("not_candidates", {}).items():
-        yield f"no candidates, because no recording has {signals}: {', '.join(kinds)}"
+        yield f"effects that were not tried, because no recording has {signals}: {', '.join(kinds)}"
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
@@ -125,13 +125,13 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from others
     yield replace(cases, is_page_only=True)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"{count} {'case' if count == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
+    said = [f"synthetic cases: {count} (random seed {result['seed']}, drawn for the purpose '{result['purpose']}')"]
     if right["of"]:
-        said.append(f"of {right['of']} gaps found, {right['count']} had the true kind and place as first answer")
+        said.append(f"true kind and place in the first answer: {right['count']} of {right['of']} cases with a gap")
     if result.get("not_judged"):
-        said.append(f"{result['not_judged']} not judged: these thresholds need fits that the diagnosis did not make")
+        said.append(f"not judged: {result['not_judged']} more cases, as changed thresholds need further fits")
     if alarms["of"]:
-        said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
+        said.append(f"false alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect")
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
@@ -251,7 +251,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         drifted, wrong = _drifted_and_distrusted(alike)
         changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
         said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
-        said += [f"Do not trust {', '.join(wrong)}: the other runs agree (far) better without it."] if wrong else []
+        said += [f"Do not trust {', '.join(wrong)}: without it the other runs agree much better."] if wrong else []
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
@@ -296,7 +296,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
-    yield "cost compares the methods with each other; chi2 per degree of freedom compares each with noise (1: noise)"
+    yield "cost compares the methods with each other, chi2 per degree of freedom each with noise (noise alone gives 1)"
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
@@ -318,7 +318,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
                 said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
                 yield f"{name} is {said} {e['unit']} by `solve`, but {', '.join(off)}"
     if stopped:
-        yield f"{', '.join(stopped)}: no values, because the time was up before the first iteration"
+        yield f"{', '.join(stopped)}: no values, because the time limit ended before the first iteration"
     if not fit["explains"]:
         yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
     elif not fit["data_trusted"]:
@@ -386,18 +386,18 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if not drifted and result["p_value"] >= result["level"]:
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
     elif not drifted:
-        yield f"All parameters together differ between the runs (p {p}), but no single one significantly."
+        yield f"All parameters together differ between the runs (p {p}), but no single parameter does significantly."
     for name in drifted:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
         yield f"{name} is not the same in all runs: {ends} (p {_relation(entry['p_value'])})."
     if wrong:
-        yield f"Do not trust {' and '.join(wrong)}: the other runs agree (far) better without it."
+        yield f"Do not trust {' and '.join(wrong)}: without it the other runs agree much better."
     elif drifted and len(runs) == 2:
         yield "Two runs that differ do not show which one is wrong; add a third run."
     elif drifted:
-        yield "No single run differs from the others."
+        yield "No single run explains this difference."
     if poor := [entry["name"] for entry in runs if not entry["explains"]]:
         text = f"The model did not explain the recordings of {', '.join(poor)}"
         yield f"{text}. The ± of such a run includes the model error, but may still be too small."
@@ -421,18 +421,18 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         differing += [name] if over is not None and abs(over) > _MAX_RUN_DIFFERENCE else []
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]
-    where = "held out" if judged[0]["held_out"] else "where they were fitted"
+    where = f"{'held-out' if judged[0]['held_out'] else 'fitted'} recordings"
     for group in dict.fromkeys(entry["channel"].rpartition(".")[0] for entry in judged):
         alike = [entry for entry in judged if entry["channel"].rpartition(".")[0] == group]
         sizes = zip(*((*entry["rmse"].values(), entry["difference"]) for entry in alike), strict=True)
         means = [statistics.fmean(size**2 for size in own) ** 0.5 for own in sizes]
         texts = [" ".join(value_text_and_display_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
-        text = f"{group}, {where}: error {texts[0]} by {first}, {texts[1]} by {second} (rms)"
+        text = f"{group}, {where}: rms error {texts[0]} of {first}, {texts[1]} of {second}"
         yield SummaryStatement(f"{text}; their predictions differ by {texts[2]}", "conclusion")
     none, names = f"no parameter differs by more than {_MAX_RUN_DIFFERENCE} std", abbreviated_names_text(differing)
-    text = f"different by more than {_MAX_RUN_DIFFERENCE} std: {names}"
+    text = f"parameters that differ by more than {_MAX_RUN_DIFFERENCE} std: {names}"
     yield SummaryStatement(text if differing else none, "verdict")
-    yield "a std is the larger one of both runs. Both have the same data, so this is no test of significance"
+    yield "std: the larger one of both runs. Both have the same data, so this is no test of significance"
     rows = [("recording", "channel", first, second, "difference", "unit")]
     for entry in result["channels"]:
         three = (*entry["rmse"].values(), entry["difference"])

@@ -74,7 +74,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     yield from discretisation_shift_sentences(result)
     if failed:
-        said = "the fit failed: do not use the values, which are the best that were reached; their ± is unknown"
+        said = "the fit failed, so do not use the values: they are the best that were reached, without a known ±"
         yield SummaryStatement(said, "verdict")
     else:
         texts = *_found_and_lost(free), unused_efforts_sentence(result)
@@ -120,18 +120,18 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))
         sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
-        guess = f". A guess without a model has {sizes[3]} ({_BASELINE_DESCRIPTIONS.get(best, best)})" if best else ""
-        text = f"{group}: rms error {sizes[0]} on held-out recordings, {sizes[1]} on fitted ones"
+        guess = f". A guess without a model gives {sizes[3]} ({_BASELINE_DESCRIPTIONS.get(best, best)})" if best else ""
+        text = f"{group}: the rms error is {sizes[0]} on held-out and {sizes[1]} on fitted recordings. "
         if noise is None or error is None or fitted is None:
             continue
         is_by_torques = bool(result.get("torque_offsets")) and noise**2 > (error**2 + fitted**2) / 2
         if not result["fit"]["explains"]:
-            yield f"{text}; noise accounts for {sizes[2]}{guess}"
+            yield f"{text}Noise alone gives {sizes[2]}{guess}"
         elif error > _MAX_NOISE_RATIO * noise:
             advice = "run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'"
-            yield f"{text}; noise accounts for {sizes[2]}, so there is a gap: {advice}{guess}"
+            yield f"{text}Noise alone gives {sizes[2]}, so there is a gap: {advice}{guess}"
         elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{text}; torque noise of the stated size accounts for {sizes[2]}, so there is no gap{guess}"
+            yield f"{text}Torque noise of the stated size gives {sizes[2]}, so there is no gap{guess}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -154,7 +154,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shared = [name for name in guessed[0] if all(name in each for each in guessed)]
         medians = {name: statistics.median(each[name] for each in guessed) for name in shared}
         errors.append((f"median of {len(own)}", channel, statistics.median(one[2] for one in own), None, medians))
-    rows: TableRows = [("held-out recording", "channel", "error (rms)", "by noise", "unit", "without a model")]
+    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "without a model")]
     for recording, channel, rmse, noise, guesses in errors:
         unit = channel_or_group_unit(units, channel)
         without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
@@ -162,11 +162,11 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
         rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
-    legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
+    legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
     yield from (f"held-out recording {name} could not be predicted: {why}" for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
-    yield f"in the column 'without a model': {legend}" if legend else ""
+    yield f"the column 'without a model' has errors of guesses, for comparison: {legend}" if legend else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -197,15 +197,15 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
                 what = f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}"
-                remedy = f"widen `parameters.{name}.bounds`, or fix it there if that is a physical limit"
-                yield f"{what}: nothing beyond was tried; {remedy}"
+                remedy = f"Widen `parameters.{name}.bounds`, or fix {name} there if the bound is a physical limit"
+                yield f"{what}, so values beyond it were not tried. {remedy}"
 
 
 @register_summary("yid-identifiability/1")
 def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
-        said = f"{result['status']}: {result['message']}; there is no point to analyse"
+        said = f"{result['status']}: {result['message']}; without estimates there is nothing to analyse"
         yield SummaryStatement(said, "verdict")
         return
     unsure = ("±", "± if start and grasps were unknown", "± if all else were known")
@@ -224,7 +224,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from hidden[:_MAX_DIRECTIONS]
     if len(hidden) > _MAX_DIRECTIONS:
-        yield f"and {len(hidden) - _MAX_DIRECTIONS} more directions, in result.json"
+        yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)"
     if not result["profiles"]:
         yield "for exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all"
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
@@ -243,7 +243,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    yield SummaryStatement(f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else "", "verdict")
+    yield SummaryStatement(f"found only with known start and grasps: {', '.join(lost)}" if lost else "", "verdict")
 
 
 @register_summary("yid-friction/1")
@@ -269,7 +269,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
-    text = f"use the law '{best}': it is the simplest whose held-out error is within one standard error of the least. "
+    text = f"use the law '{best}', the simplest one whose held-out error is within one standard error of the smallest. "
     text += f"Each kind of motion was held out in turn: {', '.join(result['kinds'])}"
     yield SummaryStatement(text, "conclusion")
     if not result["to_use"]:
@@ -292,23 +292,23 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if result["error"] is None or result["swing"] is None:
-        yield "the final motion of the search cannot be simulated to its end, so its result is unknown"
+        yield "do not use this motion: the model cannot simulate it to its end"
         return
     place = ", ".join(f"{x:.4g}" for x in result["place"])
     yield (
-        f"in {result['duration']:g} s '{result['point']}' goes to ({place}) m. By the model, it is at most "
-        f"{1e3 * result['error']:.3g} mm from there in the {result['settle']:g} s after that, and then no point of the "
-        f"object is faster than {1e3 * result['swing']:.3g} mm/s"
+        f"in {result['duration']:g} s the point '{result['point']}' moves to ({place}) m. In the model it stays within "
+        f"{1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s, and no point of the "
+        f"object is then faster than {1e3 * result['swing']:.3g} mm/s"
     )
     if result["off_path"] is not None:
         yield f"during the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints"
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
-        yield f"the uncertainty of the parameters adds ({std}) mm in x, y, z (one standard deviation)"
+        yield f"uncertain parameters make this position uncertain by ({std}) mm in x, y, z (one standard deviation)"
         if lost := result["from"]["uncertainty_unknown"]:
-            yield f"not included, because their uncertainty is unknown: {', '.join(lost)}"
+            yield f"parameters that this ignores, because their uncertainty is unknown: {', '.join(lost)}"
     elif result["from"]["run"] is None:
-        yield "the parameters are those of the configuration, so the uncertainty of the position is unknown"
+        yield "the uncertainty of the position is unknown; for it, set plan.parameter_run_folder to a `solve` run"
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -324,16 +324,16 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Effects")
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
-    others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
-    more = f"{best['value'] - best['first']:.3g} nat more than the random motion from which it came{others}"
-    yield f"start {result['best'] + 1} of {len(starts)} is the most informative: {more}"
+    others = f" ({len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat)" if len(gains) > 1 else ""
+    more = f"the search raised its information by {best['value'] - best['first']:.3g} nat{others}"
+    yield f"random start {result['best'] + 1} of {len(starts)} led to the most informative motion: {more}"
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     yield f"limits that the motion reaches: {'; '.join(reached)}" if reached else "the motion reaches no limit"
-    yield from (f"{n}: with any motion, no sensor observes it to first order; {w}" for n, w in result["unseen"].items())
+    yield from (f"{n}: no sensor observes it in any motion (to first order); {w}" for n, w in result["unseen"].items())
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"not determined by this motion: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
-        yield "the parameters are those of the configuration; with other true values the information differs"
+        yield "the information was computed with the parameters of the configuration; other true values change it"
 
 
 @register_summary("yid-check/1")
@@ -353,7 +353,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rest = entry.get("equilibrium")
         said = [] if rest is None else ["equilibrium found" if rest["found"] else f"no equilibrium: {rest['message']}"]
         gaps = [f"{name} {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
-        said += ["grasp gaps " + ", ".join(gaps)] if gaps else []
+        said += ["grasps are open by " + ", ".join(gaps)] if gaps else []
         rests.append(f"{entry['recording']}: {'; '.join(said)}" if said else "")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
     yield from rests
@@ -366,7 +366,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"frequencies: {convergence['message']}" if convergence["message"] else ""
     moved = discretisation_shift_sentences(result)
-    yield "at the initial values (`solve` tests its estimates again):" if moved else ""
+    yield "test of links and time steps at the initial values (`solve` repeats it at its estimates):" if moved else ""
     yield from moved
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
@@ -398,15 +398,15 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
-        "rows: equations of a step that contain the parameter; observed: rows that influence a sensor. [std]: change "
-        f"per unit of the parameter, of one sensor from equilibrium (in {seconds:.2g} s) and of all recorded readings"
+        "equations: those of a step that contain the parameter; observed: those that influence a sensor. [std]: change "
+        f"per unit of the parameter, in stds of noise: one reading from equilibrium ({seconds:.2g} s), all readings"
     )
-    yield SummaryTable([*_dependence_rows(result)], "Rows and sensors of the parameters", is_key_table=True)
+    yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"and {left} more free parameters, in result.json" if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "observed rows are not listed, because they are computed about an equilibrium only"
-    said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
+        yield "the column 'observed' is left out, because it can be computed only at an equilibrium"
+    said = f"linearised at {linear['at']}: the spectral radius of A is {linear['spectral_radius']:.6g}"
     yield SummaryStatement(said, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
@@ -440,7 +440,7 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Yield the rows that contain each free or named parameter, and the change of readings by one unit of it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
-    head = "parameter", "unit", "rows", "which", "observed", "best sensor", "read by"
+    head = "parameter", "unit", "equations", "which", "observed", "best sensor", "measured by"
     yield *head, "equilibrium [std]", "recordings [std]"
     for name in dict.fromkeys([*shown, *result["asked"]]):
         own = known[name]
@@ -497,7 +497,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Points", is_key_table=True)
     good = sum(not frame["reason"] for frame in result["frames"])
     spent = 1e3 * result["fit_seconds"]
-    said = result["refused"] or f"{good} of {len(result['frames'])} frames are used; a fit took {spent:.0f} ms"
+    said = result["refused"] or f"{good} of {len(result['frames'])} frames are used; the fit of one took {spent:.0f} ms"
     yield SummaryStatement(said, "verdict")
     yield from (f"{count_with_noun(n, 'frame')} left out: {reason}" for reason, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
@@ -530,4 +530,4 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows)
     if gate["fall"] is not None:
         held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
-        yield f"replayed in MuJoCo, the export lowers the error beyond noise on {held} by {100 * gate['fall']:.3g} %"
+        yield f"replay in MuJoCo of {held}: error beyond noise {100 * gate['fall']:.3g} % below that of `nominal`"

@@ -118,12 +118,12 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
             left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
             where = entry["where"] + f" and {left} more" * bool(left)
             rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}"))
-            configured = ". In the configuration:" if entry["setting"] else ""
-            advice += [f"{words}: {entry['what']}; {entry['advice']}{configured}", CodeBlock(entry["setting"])]
+            do = entry["advice"][:1].upper() + entry["advice"][1:] + ". In the configuration:" * bool(entry["setting"])
+            advice += [f"{words}: {entry['what']}. {do}", CodeBlock(entry["setting"])]
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
     if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
-        yield SummaryStatement(f"no value counts as found until corrected: {'; '.join(severe)}", "verdict")
+        yield SummaryStatement(f"no value counts as found until this is corrected: {'; '.join(severe)}", "verdict")
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -162,31 +162,32 @@ def misfit_summary_blocks(
                     known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "do not use the values: no value is known to within 10 %, if its ± includes the model error"
-            said = f"use these values only if no effect is missing; their ± (up to 10 %) has the model error: {shown}"
+            none = "do not use the values: with the model error in its ±, none is known to within 10 %"
+            said = f"use these values only if `yid-ocp diagnose` finds no effect (± includes the model error): {shown}"
             yield SummaryStatement(said if known else none, "conclusion")
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
-        texts.append(f"{entry['channel']} of {entry['recording']}, {' instead of '.join(sizes)} ({entry['baseline']})")
+        texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} ({entry['baseline']})")
     texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
-    yield SummaryStatement(f"larger error than a guess without a model: {'; '.join(texts)}" if texts else "", "verdict")
+    yield SummaryStatement(f"worse than a guess without a model (rms): {'; '.join(texts)}" if texts else "", "verdict")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
     said = []
-    tries = (("links", "twice the links"), ("time_step", "half the time step"), ("encoder_noise", "more encoder noise"))
-    for key, words in tries:
+    noise = ("encoder_noise", "more encoder noise", "a lower problem.path_cutoff")
+    step = ("time_step", "half the time step", "a shorter problem.time_step")
+    for key, words, remedy in (("links", "twice the links", "more links"), step, noise):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
         changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
-            text = f"with {words} these estimates change by more than their ± from the data: "
+            text = f"with {words}, estimates change by more than their ± from the data (remedy: {remedy}): "
             said.append(text + abbreviated_names_text(changes, _MAX_SHIFTS))
         elif tried:
-            said.append(f"with {words} no estimate changes by more than its ± from the data")
+            said.append(f"with {words}, no estimate changes by more than its ± from the data")
     return said
 
 

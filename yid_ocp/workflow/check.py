@@ -117,7 +117,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     if arm is not None:
         recorded = 1.0 / float(np.median(np.diff(arm.t)))
         if recorded < 0.5 * rate:
-            warnings.append(f"{episode.name}: joints were sampled at {recorded:.4g} Hz, the model has {rate:.4g} Hz")
+            warnings.append(f"{episode.name}: joints were sampled at {recorded:.4g} Hz, model steps at {rate:.4g} Hz")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
             said = "it is not stated if efforts are samples or commands; set sensors.joints.effort.effort_sampling_kind"
@@ -180,7 +180,7 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
     if growth is not None and not growth.keeps_errors_below_resolution:
         warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
-        warnings.append(f"the model cannot be rolled out with the initial parameters (too soft?): {at_x.message}")
+        warnings.append(f"the model cannot be simulated with the initial parameters (too soft?): {at_x.message}")
         return {}
     shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
@@ -213,8 +213,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         return {"links": [], "time_step": [], "message": own.message}
     if own.n_unstable_modes:
         remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
-        grow = f"{own.n_unstable_modes} modes grow from step to step about the first posture"
-        warnings.append(f"{grow}: take a shorter problem.time_step, {remedy}or more damping")
+        grow = f"{own.n_unstable_modes} vibration modes grow from step to step at the first posture"
+        warnings.append(f"{grow}: set a shorter problem.time_step, {remedy}or more damping")
     steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)
@@ -226,7 +226,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         values = {own: x * link_division_parameter_scale(run, own, 2) for own, x in known if own in other.parameters}
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         rows = [_row(count, own), _row(2 * count, finer)]
-        _warn(warnings, "the links go", "", rows)
+        _warn(warnings, "the number of links goes", "", rows)
     return {"links": rows, "time_step": steps, "message": ""}
 
 
