@@ -66,7 +66,7 @@ def test_damping_is_right_where_markers_are_late(tmp_path):
         EstimationProblem(step, sure[:2], tuple(truth), told, held_out=sure[2:])
     )
     assert [doubt.recording for doubt in doubts] == [sure[0].name, sure[2].name]
-    assert " ms late by a fit" in doubts[0].what
+    assert " ms late and corrects them" in doubts[0].what
     before, after = (
         fit_problem(own, GaussNewton()).goodness_of_fit.chi2_per_dof for own in (problem, problems["fitted"])
     )

@@ -222,7 +222,7 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
 @pytest.mark.parametrize(
     ("a", "b", "status", "said"),
     [
-        (10.9, 2.19, CONVERGED, ["steepest_descent ended within 10 % of the truth everywhere"]),
+        (10.9, 2.19, CONVERGED, ["steepest_descent ended within 10 % of the truth for all parameters"]),
         (10.0, 3.0, Status.STALLED, ["b (– for 2, cannot be found); these are exactly the parameters that are not"]),
         (8.9, 3.0, LIMIT, ["a (8.9 for 10, found), b (– for 2,", "find it: the method ended too early (it"]),
         (11.1, 2.0, CONVERGED, ["a, but steepest_descent does not find it: its cost", "b (cannot be found) ended"]),
@@ -273,7 +273,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
     assert found.disagreements["single_shooting"][0].startswith("from steepest_descent (in brackets) in a 7.5 (7)")
-    told = "a (7 for 10, in doubt); the recordings determine a, but steepest_descent does not find it: it takes the re"
+    told = "a (7 for 10, in doubt); the recordings determine a, but steepest_descent does not find it: it ignores noise"
     assert told in found.explanations[-1]
 
 
@@ -405,7 +405,7 @@ def test_a_single_recording_in_motion_bears_nothing_out(solved):
     safe = choose_fit_with_or_without_shape_memory(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
     assert safe.problem is solved.problems[0]
     assert (safe.problem.unknown_names, safe.solution.x.tolist()) == (("k",), [2.0])
-    assert "fewer than two recordings start in motion" in safe.message
+    assert "needs two recordings that start in motion" in safe.message
 
 
 @pytest.mark.parametrize(

@@ -373,8 +373,8 @@ def test_what_is_said(decades, stable):
     said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
     assert said.keeps_errors_below_resolution is stable
     told = "grows by 29 % per step at 0.35 s; set a shorter problem.time_step, such as 0.0025 s"
-    assert said.stability_message.startswith(f"run: the time step of 0.005 s is {'' if stable else 'not '}stable")
-    assert said.stability_message.endswith("along the motion" if stable else told)
+    assert said.stability_message.startswith(f"the time step of 0.005 s is {'' if stable else 'not '}stable")
+    assert said.stability_message.endswith("along the motion of run" if stable else told)
 
 
 def test_a_recording_is_judged_by_its_name(pendulum):
@@ -449,7 +449,7 @@ def test_a_search_that_converged_at_an_unstable_time_step_has_stalled(light, lig
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
-        assert judged.message.startswith("at the estimate light: the time step of 0.005 s is not stable")
+        assert judged.message.startswith("at the estimate the time step of 0.005 s is not stable for the motion")
         assert found.message in judged.message
     else:
         entry = found.parameters["cable.bend"]
@@ -507,7 +507,7 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     assert judged.status == after
     assert said["estimate"]["decades"] == estimate
     assert said["start"] == (None if before != Status.FAILED else dict(said["estimate"], decades=start))
-    named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
+    named = "at the estimate the" if estimate else "at the start the" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
     monkeypatch.setattr(discretisation, "alternating_error_growth_of_worst_recording", lambda problem, x: None)

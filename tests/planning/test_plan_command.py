@@ -86,7 +86,7 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
     }  # fmt: skip
     page = (outcome.folder / "report.html").read_text()
     assert '<section id="plan">' in page
-    assert "so the uncertainty of the position is unknown" in page
+    assert "the uncertainty of the position is unknown; for it, set" in page
     message = json.loads((outcome.folder / "trajectory.json").read_text())
     assert message["joint_names"] == ["shoulder"]
     planned = outcome.output.joint_positions[:, 0]
@@ -170,7 +170,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
         assert f"± {100 * known.std_planned:.2g} %" in words
     assert "most informative" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
-    assert "the parameters are those of the configuration" in words
+    assert "with the parameters of the configuration" in words
 
 
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):

@@ -143,7 +143,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
         why = "it stopped in another local minimum"
     else:
         why = "its cost weights the measurements differently"
-    return [f"from {best.method} (values in brackets) in {', '.join(values)}: {why}"] if values else []
+    return [f"from {best.method} (in brackets) in {', '.join(values)}: {why}"] if values else []
 
 
 def _explanations(
