@@ -466,7 +466,7 @@ def step_map_natural_frequencies(
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
-        held = "every coordinate is driven or prescribed: if they are fixed, nothing can swing"
+        held = "none, because every coordinate is driven or prescribed"
         return UndampedStepMapFrequencies(np.zeros(0), message=held)
     step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
     known = np.array([configuration[name] for name in still.prescribed])
