@@ -15,7 +15,7 @@ from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.discretisation import (
     AlternatingErrorGrowth,
     _fine_joints_by_coarse_joint,
-    _FinerDiscretisationProblem,
+    _FinerModel,
     _gauss_newton_step_in_finer_model,
     _half_step_error,
     alternating_error_growth_of_worst_recording,
@@ -50,7 +50,7 @@ def shifts(coarse, finer, factors=None, **more):
     """Of the coarse problem's parameters at its initial values."""
     x = coarse.initial_unknowns
     made = _gauss_newton_step_in_finer_model(
-        _FinerDiscretisationProblem(finer, factors or {}), coarse, x, coarse.evaluate(x), **more
+        _FinerModel(finer, factors or {}), coarse, x, coarse.evaluate(x), **more
     )
     return made if isinstance(made, str) else made[0]
 
@@ -119,7 +119,7 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     guesses = (SimpleNamespace(equilibrium_guess=guess) for guess in (np.array([0.2, -0.4]), None))
     at = replace(coarse.evaluate(coarse.initial_unknowns), episode_predictions=tuple(guesses))
     divided = _fine_joints_by_coarse_joint(coarse.system, fine.system)
-    refined = _FinerDiscretisationProblem(fine, {"a": 2.0, "c": 3.0}, divided)
+    refined = _FinerModel(fine, {"a": 2.0, "c": 3.0}, divided)
     _gauss_newton_step_in_finer_model(refined, coarse, coarse.initial_unknowns, at)
     [(x, (warm, none))] = asked
     point = dict(zip(fine.unknown_names, x, strict=True))
@@ -196,7 +196,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     fine = EstimationProblem(step, [recording], coarse.free, coarse.options, values)
     found = fit_problem(coarse, GaussNewton())
     finer = fit_problem(fine, GaussNewton(), initial_unknowns=found.x)
-    own, *_ = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
+    own, *_ = _gauss_newton_step_in_finer_model(_FinerModel(fine), coarse, found.x, found.evaluation)
     # without segments there are no links to divide
     told, notes = parameter_shifts_at_finer_discretisation(coarse, found.x, found.evaluation, ("links", "time_step"))
     assert notes == []
@@ -229,7 +229,7 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
     found, finer = (fit_problem(problem, GaussNewton()) for problem in (coarse, anew))
-    refined = _FinerDiscretisationProblem(fine)
+    refined = _FinerModel(fine)
     own, left, _ = _gauss_newton_step_in_finer_model(refined, found.problem, found.x, found.evaluation)
     std = np.array([found.std[name] for name in free])
     change = (finer.x - found.x) / std

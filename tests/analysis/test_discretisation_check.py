@@ -7,10 +7,8 @@ import pytest
 from made_cross import TRUTH, configuration, record
 
 import yid_ocp as yid
-from yid_ocp.analysis import discretisation
 from yid_ocp.config.reader import load_config
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
-from yid_ocp.solvers import GaussNewton
 from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.workflow.solve import run_solve
 
@@ -116,17 +114,6 @@ def test_a_cross_of_few_links_is_not_called_found(tmp_path):
             assert not (entry["verdict"] == "identifiable" and abs(error) > 0.1)
     assert largest[4] > 0.2
     assert largest[8] < 0.5 * largest[4]
-
-
-@pytest.mark.parametrize(("limit", "fits"), [(1e9, 0), (0.0, 1)])
-def test_a_large_change_by_more_links_is_fitted_before_it_counts(folder, monkeypatch, limit, fits):
-    monkeypatch.setattr(discretisation, "_MAX_LINEAR_CHANGE", limit)
-    problem, made = yid.load_problem(configuration(folder, 4, ["north"], 1.5)), []
-    found, search = yid.solve(problem), GaussNewton.minimize_cost
-    monkeypatch.setattr(GaussNewton, "minimize_cost", lambda *given: made.append(given) or search(*given))
-    given = problem, problem, found.x, found.evaluation, ()
-    assert discretisation.problem_data_corrected_for_few_links(*given, 1.0) is not None
-    assert len(made) == fits
 
 
 TIP = InjectedEffect("point_mass", "w_north", {"mass": 0.03})

@@ -49,7 +49,7 @@ _REFINED_SETTINGS = {"links": "double `links` of the segments in model.object", 
 
 
 @dataclass(frozen=True)
-class _FinerDiscretisationProblem:
+class _FinerModel:
     """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns.
 
     A coarse parameter times its entry in `parameter_factors` (default 1) describes the same object in the finer model.
@@ -63,31 +63,29 @@ class _FinerDiscretisationProblem:
     def _factor(self, name: str) -> float:
         return float(self.parameter_factors.get(name.split("[")[0], 1.0))
 
-    def _unknowns(self, names: Sequence[str], x: Array) -> Array:
-        """Return the fine unknowns for coarse unknowns `x`, within bounds. Divided links share their link's angle."""
-        made, at = self.problem.initial_unknowns.copy(), {name: i for i, name in enumerate(self.problem.unknown_names)}
-        for name, value in zip(names, x, strict=True):
+    def _slopes(self, names: Sequence[str]) -> Array:
+        """Derivatives of the fine unknowns by the named coarse ones. Divided links share their link's angle."""
+        at = {name: i for i, name in enumerate(self.problem.unknown_names)}
+        slopes = np.zeros((len(at), len(names)))
+        for i, name in enumerate(names):
             base, bracket, recording = name.partition("[")
             joint = base.rpartition(".")[2] if base.startswith(INITIAL_STATE_UNKNOWN_PREFIX) else ""
             parts = self.subdivided_joints.get(joint)
             if parts is None and name in at:
-                made[at[name]] = value * self._factor(name)
+                slopes[at[name], i] = self._factor(name)
             elif parts is not None and base.startswith(_START_ANGLE_PREFIX):
-                for part in parts:
-                    made[at[f"{_START_ANGLE_PREFIX}{part}{bracket}{recording}"]] = value / len(parts)
+                slopes[[at[f"{_START_ANGLE_PREFIX}{part}{bracket}{recording}"] for part in parts], i] = 1 / len(parts)
+        return slopes
+
+    def _unknowns(self, names: Sequence[str], x: Array) -> Array:
+        """Return the fine unknowns for coarse unknowns `x`, within bounds."""
+        slopes = self._slopes(names)
+        made = np.where(slopes.any(axis=1), slopes @ x, self.problem.initial_unknowns)
         return np.clip(made, *self.problem.bounds)
 
     def _coarse_unknowns(self, names: Sequence[str], x: Array, fine: Array) -> Array:
-        """Return `x` with the values that fine unknowns have in the coarse model, the reverse of `_unknowns`."""
-        made, at = x.copy(), {name: i for i, name in enumerate(self.problem.unknown_names)}
-        for i, name in enumerate(names):
-            start, bracket, recording = name.removeprefix(_START_ANGLE_PREFIX).partition("[")
-            parts = self.subdivided_joints.get(start, ()) if name.startswith(_START_ANGLE_PREFIX) else ()
-            if name in at:
-                made[i] = fine[at[name]] / self._factor(name)
-            elif parts:
-                made[i] = sum(fine[at[f"{_START_ANGLE_PREFIX}{part}{bracket}{recording}"]] for part in parts)
-        return made
+        """Return `x` with the values that fine unknowns have in the coarse model."""
+        return x + np.linalg.lstsq(slopes := self._slopes(names), fine - slopes @ x, rcond=None)[0]
 
     def _guess(self, coarse: System, q: Array) -> Array:
         tree = self.problem.system.mechanism
@@ -112,12 +110,7 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
 
 
 def _gauss_newton_step_in_finer_model(
-    refined: _FinerDiscretisationProblem,
-    coarse: EstimationProblem,
-    x: Array,
-    at_x: Evaluation,
-    *,
-    model_difference_only: bool = False,
+    refined: _FinerModel, coarse: EstimationProblem, x: Array, at_x: Evaluation, *, model_difference_only: bool = False
 ) -> tuple[dict[str, float], Array, Evaluation] | str:
     """Make one Gauss-Newton step in a finer model, from the coarse unknowns x (nx,).
 
@@ -159,7 +152,7 @@ def predicted_refit_residual_at_finer_step(
     `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without it,
     `fine` is fitted if the shorter step changes predictions by more than the residual, too much for one linear step.
     """
-    refined = _FinerDiscretisationProblem(fine)
+    refined = _FinerModel(fine)
     made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)
     if isinstance(made, str) or coarse.has_process_noise:
         return None if isinstance(made, str) else made[1]
@@ -178,12 +171,11 @@ def stds_with_time_step_and_encoder_errors(
 ) -> dict[str, float] | None:
     """Add the errors of the time step and of encoder noise to standard deviations of a fit `x` (nx,), as `solve` does.
 
-    `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. Returns None if the
-    motions cannot be predicted with the shorter step.
+    `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. None if `fine` fails.
     """
     # data may be corrected for the links
     fine = fine.with_episodes(list(map(_with_data_of, fine.episodes, coarse.episodes)), ())
-    made = _gauss_newton_step_in_finer_model(_FinerDiscretisationProblem(fine), coarse, x, at_x)
+    made = _gauss_newton_step_in_finer_model(_FinerModel(fine), coarse, x, at_x)
     if isinstance(made, str):
         return None
     shifts = made[0], _shifts_by_more_encoder_noise(coarse, x, at_x)
@@ -212,9 +204,8 @@ def problem_data_corrected_for_few_links(
     """Return `problem` with all data corrected for the error of too few links.
 
     The change of the predictions by dividing each link in two is subtracted. `fitted` is the problem with the `effects`
-    of a fit; `at_x` is its evaluation at the fit `x` (nx,), with Jacobian. If the change is large, the finer model is
-    refitted first. Returns None if a refit would not lower r'r by `min_chi2_decrease`, if links cannot be divided, if
-    torques have noise, or if the finer model fails.
+    of a fit; `at_x` is its evaluation at the fit `x` (nx,), with Jacobian. A large change is computed at parameters
+    refitted in the finer model. None if a refit would not lower r'r by `min_chi2_decrease`, or if this is impossible.
     """
     if problem.has_process_noise or not (problem.options.divided_links_model and problem.system.segment_layouts):
         return None
@@ -370,7 +361,7 @@ def _shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array, at_x: Ev
     rng, moves, system = np.random.default_rng(0), list[dict[str, float]](), problem.system
     has_encoders = system.prescribed and any(episode.recording.joints for episode in problem.episodes)
     for _ in range(_N_NOISE_DRAWS if has_encoders and system.unprescribed_coordinate_indices else 0):
-        noisy = _FinerDiscretisationProblem(problem.with_episodes(episodes_with_noisier_motion(problem, rng), ()))
+        noisy = _FinerModel(problem.with_episodes(episodes_with_noisier_motion(problem, rng), ()))
         made = _gauss_newton_step_in_finer_model(noisy, problem, x, at_x)
         moves += [] if isinstance(made, str) else [made[0]]
     shifts = {name: np.array([own[name] for own in moves]) for name in problem.shared_parameters if moves}
@@ -383,10 +374,10 @@ def _refined_problem(
     held_out: Sequence[Recording] = (),
     step: Step | None = None,
     effects: Sequence[EffectBase] = (),
-) -> _FinerDiscretisationProblem:
+) -> _FinerModel:
     options, fine = problem.options, problem.options.divided_links_model
     if what == "time_step" or fine is None:
-        return _FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
+        return _FinerModel(problem.with_time_step(problem.step.time_step / 2))
     recordings = [episode.recording for episode in problem.episodes]
     factors = fine.parameter_factors
     if step is None:
@@ -400,7 +391,7 @@ def _refined_problem(
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
     values = {name: known[name] * factors.get(name, 1.0) for name in step.system.parameters.names if name in known}
     made = EstimationProblem(step, recordings, problem.free, options, values, held_out)
-    return _FinerDiscretisationProblem(made, factors, _fine_joints_by_coarse_joint(problem.system, step.system))
+    return _FinerModel(made, factors, _fine_joints_by_coarse_joint(problem.system, step.system))
 
 
 def estimates_widened_by_discretisation_error(

@@ -16,13 +16,9 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_to_dict
+from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
-from yid_ocp.inference.uncertainty import (
-    EstimateChecksBeyondFit,
-    mark_free_estimates_not_trusted,
-    typical_parameter_magnitudes,
-)
 from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem
@@ -73,7 +69,7 @@ def solve(
     found = solvers.fit_problem(problem, solver, initial_unknowns, callback, limits)
     safe = choose_fit_with_or_without_shape_memory(problem, solver, found, limits)
     solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
-    checks = replace(solution.checks or EstimateChecksBeyondFit(), cable_memory_message=safe.message)
+    checks = replace(solution.checks or uncertainty.EstimateChecksBeyondFit(), cable_memory_message=safe.message)
     return replace(solution, checks=checks)
 
 
@@ -115,20 +111,22 @@ def _with_equilibrium_guesses(
 
 def add_discretisation_errors(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
-) -> tuple[Solution, EstimateChecksBeyondFit]:
+) -> tuple[Solution, uncertainty.EstimateChecksBeyondFit]:
     """Return the solution with standard deviations that include the discretisation error, and the shifts with notes."""
     if solution.evaluation is None:
-        return solution, EstimateChecksBeyondFit()
+        return solution, uncertainty.EstimateChecksBeyondFit()
     kinds = problem.options.checked_discretisations
     fit = solution.x, solution.evaluation
     shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(problem, *fit, kinds, progress)
-    sizes = typical_parameter_magnitudes(problem, solution.x)
+    sizes = uncertainty.typical_parameter_magnitudes(problem, solution.x)
     inflated = discretisation.estimates_widened_by_discretisation_error(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}
     uncounted = tuple(words for kind, words in UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
         uncounted = tuple(words for words in uncounted if words != UNCOUNTED_ERROR_TEXTS["links"])
-    checks = EstimateChecksBeyondFit(discretisation_shifts=shifts, notes=tuple(notes), uncounted_errors=uncounted)
+    checks = uncertainty.EstimateChecksBeyondFit(
+        discretisation_shifts=shifts, notes=tuple(notes), uncounted_errors=uncounted
+    )
     return replace(solution, parameters=inflated), checks
 
 
@@ -143,7 +141,7 @@ def _checked_solution_and_issues(
     found += _worse_than_baseline_issues(errors, units)
     if any(issue.severity != "warning" for issue in found):
         untrusted = replace(solution.goodness_of_fit, data_trusted=False)
-        marked = mark_free_estimates_not_trusted(solution.parameters)
+        marked = uncertainty.mark_free_estimates_not_trusted(solution.parameters)
         solution = replace(solution, goodness_of_fit=untrusted, parameters=marked)
     return solution, (*problem.options.data_issues, *found)
 

@@ -277,8 +277,7 @@ def _probabilities_and_outcomes(marks: Sequence[BlindCaseScore]) -> Array:
 def _log_odds_regression(marks: Sequence[BlindCaseScore]) -> dict[str, float]:
     """Return the line from stated log odds, that the cause is named, to log odds that agree with the outcomes.
 
-    These are `offset` + `slope` x the stated ones, by logistic regression. The priors 0 ± 1 of the offset and 1 ± 0.5
-    of the slope keep both finite if all answers are right.
+    These are `offset` + `slope` x the stated ones, by logistic regression. Priors 0 ± 1 and 1 ± 0.5 keep both finite.
     """
     probabilities, outcomes = _probabilities_and_outcomes(marks).T
     log_odds, sides = scipy.special.logit(probabilities), 2 * outcomes - 1

@@ -13,11 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import threadpoolctl
 
-from yid_ocp.analysis.discretisation import (
-    predicted_refit_residual_at_finer_step,
-    problem_data_corrected_for_few_links,
-    stds_with_time_step_and_encoder_errors,
-)
+from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.run_estimates import RunEstimates
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
@@ -174,8 +170,7 @@ def _examined(
 def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined | None:
     """The nominal model, examined again at half the time step or without the error of the links.
 
-    None if neither lowers r'r of a fit significantly, and by half of what a candidate would (`gap`), or if the data
-    lack the error of the links already.
+    None if neither lowers r'r of a fit significantly and by half of what a candidate would (`gap`), or after the links.
     """
     if seen.is_corrected_for_links:
         return None
@@ -262,7 +257,7 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
     search.progress.begin_stage("trying half the time step", 1.0, 12.0)
     fine = _at_finer_step(search, fit, events)
-    left = predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
+    left = discretisation.predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
     if left is None:
         return -math.inf
     # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
@@ -284,7 +279,7 @@ def _with_errors_of_step_and_encoders(
 ) -> tuple[RefittedModel, bool]:
     """The fit with standard deviations that contain these errors, and whether they could be computed."""
     found = fit.problem, fit.unknowns, fit.evaluation, fit.std
-    std = stds_with_time_step_and_encoder_errors(_at_finer_step(search, fit, events), *found)
+    std = discretisation.stds_with_time_step_and_encoder_errors(_at_finer_step(search, fit, events), *found)
     return (fit, False) if std is None else (replace(fit, std=std), True)
 
 
@@ -294,7 +289,7 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     search.progress.begin_stage("trying twice the links", 1.0, 11.0)
     own = search.problem.problem_with_nominal_and_effects_free(fit.effects)
     known = search.problem.problem, own, fit.unknowns, fit.evaluation
-    corrected = problem_data_corrected_for_few_links(*known, fit.effects, least)
+    corrected = discretisation.problem_data_corrected_for_few_links(*known, fit.effects, least)
     if corrected is None:
         return None
     problem = replace(search.problem, problem=corrected)

@@ -127,8 +127,7 @@ def _near_best_models(
     """Models that the recordings cannot distinguish from the best one, with their distance from it, 0 to 1.
 
     If the best one leaves only noise, the distance is a log odds in units of what decides. Otherwise it is the held-out
-    error in units of its standard error, and the simplest of the models comes first. There, models with implausible
-    parameters count only if no plausible one explains enough.
+    error in standard errors, the simplest first; implausible ones count only if no plausible one explains enough.
     """
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):

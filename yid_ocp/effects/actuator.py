@@ -242,8 +242,7 @@ class _EffortLag(_LateTorque):
 
     At a driven joint, the recorded torque is the command and the applied torque lags behind it. At a prescribed joint,
     the torque that the motion requires lags behind the recorded torque. A negative time constant, allowed only at
-    prescribed joints, reverses the roles: the recorded torque lags, as with a filtered sensor. Before the start of a
-    recording, both torques are constant at their initial values.
+    prescribed joints, means that the recorded torque lags, as with a filtered sensor. Before node 0 both are constant.
     """
 
     equation = "time_constant dz/dt = command - z"

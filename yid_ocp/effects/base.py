@@ -151,8 +151,7 @@ class EffectBase(Effect):
     ) -> dict[str, ReportedParameterValue]:
         """Convert the parameters to the form used in reports. For example, a compliance is reported as a stiffness.
 
-        Missing `values` are nominal, missing `stds` are NaN. A reported power of C, C^(-1/p), has the standard
-        deviation C^(-1/p) std(C)/(p C).
+        Missing `values` are nominal, missing `stds` NaN. The std of a reported C^(-1/p) is C^(-1/p) std(C)/(p C).
         """
         result = {}
         for definition, entry in zip(self.definitions, self.parameters, strict=True):

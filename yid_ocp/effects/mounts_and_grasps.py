@@ -134,8 +134,7 @@ class _GraspCompliance(_GraspChange):
     """Spring-damper instead of a rigid grasp: f = phi/C + damping dphi/dt with phi = gripper - object.
 
     A step solves phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, which is the rigid grasp at C = 0.
-    phi is evaluated at the end of the step, which numerically damps fast motions. Every row of the grasp has the same
-    C; in rows of orientation its unit is rad/(N m).
+    phi is evaluated at the end of the step, which damps fast motions. All rows have the same C.
     """
 
     equation = "phi + C damping dphi/dt = C force"
@@ -154,8 +153,7 @@ class _GraspCompliance(_GraspChange):
 class _GraspSlip(_GraspChange):
     """Slip of a grasp along a tube. The grasped point creeps in the direction in which the gripper pulls.
 
-    d(offset)/dt = slip_per_load x axial load, both along the object's z axis (`Grasp.axial_slip` has the opposite
-    sign). The offset is zero at the start of a recording.
+    d(offset)/dt = slip_per_load x axial load, both along the object's z axis (`Grasp.axial_slip`: the other sign).
     """
 
     equation = "d(offset)/dt = slip_per_load x axial load"

@@ -189,8 +189,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     """Covariance (nx, nx) of the sum of scores J' r over independent clusters of rows (J, r).
 
     A fit follows a cluster that alone determines a direction, so that the cluster's residual is too small. Its score is
-    therefore divided by (1 - h)^(1/2), where h is the cluster's part of the information (Bell, McCaffrey 2002). A
-    factor from Student's t accounts for few clusters.
+    therefore divided by (1 - h)^(1/2), where h is the cluster's part of the information (Bell, McCaffrey 2002).
     """
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T

@@ -130,8 +130,7 @@ class RolloutNewtonSummary:
 class SensitivityDirections:
     """The d quantities with respect to which a rollout is differentiated, the named parameters first.
 
-    The tangents are the derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path
-    (N + 1, nc, d) with respect to them.
+    The tangents are derivatives of initial state (nx, d), torque (N, nu, d) and prescribed path (N + 1, nc, d).
     """
 
     parameter_names: tuple[str, ...]
@@ -224,8 +223,7 @@ class StepResidualsAndJacobians:
 
     Each step has nt = n + nz + m equations: momentum balance (n), internal (nz) and constraint (m). `p1` is the
     momentum p_{k+1} (n) that follows from the other values. The Jacobians are with respect to the new values (q_{k+1},
-    z_{k+1}, lam_k), the old values (q_k, z_k), the torque and the chosen parameters. The Jacobian of the balance with
-    respect to p_k is the identity.
+    z_{k+1}, lam_k), the old values (q_k, z_k), the torque and the chosen parameters. That by p_k is the identity.
     """
 
     residual: Array

@@ -129,8 +129,7 @@ class ArcLengthChain:
 class Mechanism(ReprMixin):
     """A kinematic tree of joints with bodies, named frames and parameters. Parents precede children.
 
-    Placements and inertias depend on `parameters`. For a chain NAME of `link_chains`, the frame `NAME:40%` is the point
-    at 40 % of its arc length.
+    Placements and inertias depend on `parameters`. The frame `NAME:40%` is at 40 % of the arc length of a chain.
     """
 
     name: str

@@ -120,8 +120,7 @@ def read_urdf(
 
     Each movable joint has the parameter `JOINT.mass` [kg], which also scales the inertia of its bodies. Links without a
     movable joint before them are fixed to the world. Every link is a frame of the same name. Raises `ModelError` for a
-    missing or malformed file, MJCF without `mujoco`, an unknown joint, or a joint type that is not revolute,
-    continuous, prismatic or fixed.
+    missing or malformed file, MJCF without `mujoco`, an unknown joint, or one that neither turns nor slides.
 
     Parameters
     ----------

@@ -163,8 +163,7 @@ class FirstOrderLag:
         """Compute the lag's output at the nodes, with derivatives, for an input x (N, k) that is linear between nodes.
 
         The lag starts at node 1. The output is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1} or, for negative T, x -
-        T dx/dt by central differences. `slope` (N, k, d) is the derivative of x; its first columns are the parameters
-        of `time_constant_sensitivity`.
+        T dx/dt by central differences. `slope` (N, k, d) is dx, first by those of `time_constant_sensitivity`.
         """
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)

@@ -13,11 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
 from yid_ocp.display import abbreviated_names_text
-from yid_ocp.inference.uncertainty import (
-    MAX_IDENTIFIABLE_RELATIVE_STD,
-    goodness_of_fit_message,
-    value_and_uncertainty_text,
-)
+from yid_ocp.inference import uncertainty
 from yid_ocp.sensors.base import channel_specs_for_group_name
 
 if TYPE_CHECKING:
@@ -151,15 +147,17 @@ def misfit_summary_blocks(
     A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 % of the value.
     """
     if not fit["explains"]:
-        yield SummaryStatement(goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
+        yield SummaryStatement(uncertainty.goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
         doubted = {name: entry for name, entry in parameters.items() if entry["verdict"] == "not_trusted"}
         if doubted and fit["data_trusted"]:
             known = []
             for name, entry in doubted.items():
                 relative = entry.get("std_relative")
                 std = entry["std"] if "std" in entry else relative and relative * abs(entry["value"])
-                if std is not None and std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry["value"]):
-                    known.append(f"{name} = {value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}")
+                if std is not None and std <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry["value"]):
+                    known.append(
+                        f"{name} = {uncertainty.value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}"
+                    )
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
             none = "do not use the values: with the model error in its ±, none is known to within 10 %"

@@ -198,8 +198,7 @@ def write_diagnosis_hdf5(
 ) -> None:
     """Write held-out predictions, smoothed unknowns and event forces as `yid-diagnosis-trajectories/1` (HDF5).
 
-    `RECORDING/GROUP/`, for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
-    attributes `channels`, `unit`.
+    `RECORDING/GROUP/` of held-out recordings: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k), `channels`.
 
     `where/RECORDING/`, for every estimation recording with a gap to locate: `edges` (J + 1,) of the intervals with
     constant unknowns [s since the first node]; `mean` and `std` (J, nd) of the unknown forces, offsets and biases about

@@ -77,8 +77,7 @@ def _read_lerobot_episode(
     be radians, or if LeRobot never records this robot in radians. With degrees, a gripper is left out, because LeRobot
     records it in per cent of its range. `notes` lists images and other features. The other
     options are those of `JointPointAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
-    `DataError` if `pyarrow` is not installed, if the dataset is not understood or has no such episode, or if
-    `validated_recording` refuses the result.
+    `DataError` without `pyarrow`, for an unknown dataset or episode, or if `validated_recording` refuses the result.
     """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
