@@ -79,10 +79,14 @@ def failed_rollout_error(reason: str, where: str = "parameter values and initial
 _Error = TypeVar("_Error", bound=YidError)
 
 
-def missing_package_error(kind: type[_Error], what: str, extra: str) -> _Error:
-    """Create an error of `kind`: a package of the optional dependencies `extra` is missing. `what` is the message."""
-    where, hint = f"the Python environment {sys.prefix}", f"pip install '.[{extra}]' in the project's clone"
-    return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
+def missing_package_error(kind: type[_Error], what: str, extra: str, error: Exception) -> _Error:
+    """Create an error of `kind` for an `error` of an import: `what`, and how to install `extra` or a system library."""
+    where, allowed = f"the Python environment {sys.prefix}", f"yid_ocp with its extra `{extra}`"
+    if isinstance(error, ModuleNotFoundError):
+        return kind(what, where=where, allowed=allowed, hint=f"pip install '.[{extra}]' in the project's clone")
+    what, allowed = f"{what}, which is installed but cannot be loaded: {error}", "the system libraries that it needs"
+    hint = "if a library (.so) is missing, install it: libGL.so.1 is in libgl1 of Debian and Ubuntu, libgomp.so.1 in "
+    return kind(what, where=where, allowed=allowed, hint=f"{hint}libgomp1; else repeat pip install '.[{extra}]'")
 
 
 def import_optional(module: str, extra: str, what: str, kind: type[YidError] = DataError) -> ModuleType:
@@ -90,7 +94,7 @@ def import_optional(module: str, extra: str, what: str, kind: type[YidError] = D
     try:
         return import_module(module)
     except ImportError as error:
-        raise missing_package_error(kind, what, extra) from error
+        raise missing_package_error(kind, what, extra, error) from error
 
 
 class OutputError(YidError):

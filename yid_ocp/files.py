@@ -246,5 +246,7 @@ def _value(hint: Any, value: Any) -> Any:
 
 def os_error_reason(error: Exception) -> str:
     """Return the reason for an operating system or HDF5 error as text."""
+    if isinstance(error, NotADirectoryError):
+        return "a part of its path is a file, not a folder"
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error).strip("'\"")

@@ -412,9 +412,9 @@ def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path,
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"seed": 2}, "another ensemble"),
-        ({"code": "newer"}, "another ensemble"),
-        ({"slice": "2/3"}, "another ensemble"),
+        ({"seed": 2}, "different blind tests"),
+        ({"code": "newer"}, "different blind tests"),
+        ({"slice": "2/3"}, "different blind tests"),
         ({"slice": "1/2"}, "given twice"),
         ({"labels_sha256": "0"}, "do not match the hashes"),
     ],

@@ -224,7 +224,7 @@ def test_a_noise_level_that_is_zero_or_absent_is_refused(bench, short, std):
 
 def test_held_out_data_must_be_other_data_and_the_papers_weighting_cannot_be_diagnosed(bench, short):
     copy = replace(short, name="another_name")
-    with pytest.raises(YidError, match="both estimated on and held out"):
+    with pytest.raises(YidError, match="both for the estimate and as held-out"):
         diagnose(bench.problem([short]), FRICTION, [copy])
     options = ProblemOptions(weighting="paper", path_cutoff=np.inf, sensors={"joints.effort": SensorOptions(std=0.02)})
     with pytest.raises(YidError, match="whitened"):

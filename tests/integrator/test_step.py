@@ -262,7 +262,7 @@ def test_a_step_that_cannot_be_is_refused(refused_with, hinge, arguments, words)
         ({"p0": np.zeros((6, 1))}, ["p0", "(6, 1)", "(6,)"]),
         ({"u": np.zeros(3)}, ["u has shape (3,)", "(2,)"]),
         ({"theta": np.zeros(4)}, ["theta", "(4,)"]),
-        ({"prescribed": None}, ["1 coordinates are prescribed", "prescribed=(s0, s1)"]),
+        ({"prescribed": None}, ["1 coordinates of the model", "prescribed=(s0, s1)"]),
         ({"prescribed": ([0.3],)}, ["prescribed has 1 entries"]),
         ({"prescribed": ([0.3], [0.3, 0.1])}, ["prescribed has shape (2,)", "(1,)"]),
         ({"internal": [1.0]}, ["internal has shape (1,)", "(0,)"]),

@@ -334,7 +334,8 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
         leaves = f"after the fit, the error of {group} is {seen * usual:.2g} {unit} (rms, slow errors included)"
-        words = f"{leaves}, but the stated noise is {usual:.2g} {unit}"
+        times = f"{1 / max(seen, 1e-9):.2g} times smaller than the stated noise of {usual:.2g} {unit}"
+        words = f"{leaves}, {times} (up to {least:g} times is tolerated)"
         advice = "set the std to the actual noise: the stated std makes every ± too wide and hides small gaps"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         severity = 1 / (least * max(seen, 1e-9))

@@ -124,7 +124,7 @@ def _gauss_newton_step_in_finer_model(
     problem = _with_coarse_weights(refined.problem, coarse) if weighted else refined.problem
     own, other = problem.residual_rows, coarse.residual_rows
     if (model_difference_only and own != other) or (weighted and own.measurements != other.measurements):
-        return "the finer model does not use the same samples as the coarse one"
+        return "the finer model does not have the same samples and priors, so the two cannot be compared"
     evaluation = problem.evaluate(point, derivatives=not weighted, equilibrium_guesses=warm)
     residual, jacobian = evaluation.residual, evaluation.jacobian
     if not evaluation.ok:
@@ -338,7 +338,8 @@ def parameter_shifts_at_finer_discretisation(
         except YidError as error:
             own = error.what
         if isinstance(own, str):
-            notes.append(f"the effect of {words} on the estimates is unknown: {own}")
+            remedy = f"To check it, {_REFINED_SETTINGS[key]}, run `solve` again and compare the estimates"
+            notes.append(f"whether {words} would change the estimates is unknown: {own}. {remedy}")
         else:
             found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))

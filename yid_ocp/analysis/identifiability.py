@@ -382,8 +382,7 @@ def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
-        what = "a common change of " * (len(parts) > 1) + _joined([part.name for part in parts])
-        return f"{what} cannot be separated from {_hiding_nuisances(view, vector)}"
+        return f"the effect of {_change_words(parts)} is almost the same as that of {_hiding_nuisances(view, vector)}"
     form = _combination(view, *parts) if len(parts) == 2 else None
     if form is None:
         return _combination_words(parts)
@@ -394,12 +393,12 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
-    for words, prefix in (("the unknown initial state", "start."), ("the position of the grasp", _GRASP_OFFSET_PREFIX)):
+    for words, prefix in (("another initial state", "start."), ("another position of the grasp", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
         remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
         if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
             return words
-    return "the unknown initial state and the position of the grasp"
+    return "another initial state and position of the grasp"
 
 
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
@@ -422,12 +421,16 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
     own = float(std[view.names.index(parts[0].name)])
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
     how = "is determined" if spread <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD else "is determined only weakly"
-    what, changes = parts[0].name, [f"{part.coefficient / parts[0].coefficient:.2g}" for part in parts]
-    if len(parts) > 1:
-        ratio = " : ".join([*changes[:_MAX_LISTED_NAMES], "..."][: len(parts)])
-        what = f"a relative change of {_joined([part.name for part in parts])} in the ratio {ratio}"
     order = "" if len(parts) > 1 or math.isfinite(own) else " to first order"
-    return f"{what} {how} (± {uncertainty.percent_number_text(spread)} %{order})"
+    return f"{_change_words(parts)} {how} (± {uncertainty.percent_number_text(spread)} %{order})"
+
+
+def _change_words(parts: Sequence[_Component]) -> str:
+    if len(parts) == 1:
+        return parts[0].name
+    changes = [f"{part.coefficient / parts[0].coefficient:.2g}" for part in parts]
+    ratio = " : ".join([*changes[:_MAX_LISTED_NAMES], "..."][: len(parts)])
+    return f"a relative change of {_joined([part.name for part in parts])} in the ratio {ratio}"
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:

@@ -191,6 +191,7 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
     for j in np.flatnonzero(beyond > margin):
         name, unit = arm.joint_names[j], arm.joints[j].coordinate_unit
         words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g} {unit}"
+        words += f" ({margin:g} {unit} is tolerated)"
         advice = "check the joint's zero, unit and column, and whether the recording is of this robot"
         depth = float(beyond[j] / margin)
         yield Issue("angle_limits", words, "not_trusted", depth, advice, "", channel=f"position.{name}")

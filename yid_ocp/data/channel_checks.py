@@ -146,9 +146,10 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
         least = 5 * QUALITY_LIMITS.min_joint_motion if channel.startswith("position") else 0.0
         few, unit = step > wide / 16 and wide > least, JOINT_CHANNEL_UNITS.get(channel.partition(".")[0], "m")
         setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
+        tolerated = f" (up to {QUALITY_LIMITS.max_noise_ratio:g} times as much is tolerated)"
         if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
             what = f"{channel} has steps of {step:.3g} {unit}, so rounding alone has a std of {size:.2g} {unit}"
-            what += f". The stated std is only {stated:.2g} {unit}" if stated else ""
+            what += f". The stated std is only {stated:.2g} {unit}{tolerated}" if stated else ""
             ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
             advice, line = "set the std to that of rounding, or record with more digits", f"{setting}: {size:.2g}"
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
@@ -158,7 +159,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
             # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, but the stated std is {stated:.2g} {unit}"
+            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, the stated std is {stated:.2g} {unit}{tolerated}"
             ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
             advice = "set the std to that of the actual noise"
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)

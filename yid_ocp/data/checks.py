@@ -148,7 +148,8 @@ def _few_samples(recording: Recording) -> Iterator[Issue]:
     for group in recording.joint_and_point_groups:
         count, least = len(group.t), QUALITY_LIMITS.min_samples
         if count < least:
-            what, advice = f"{group.name} has only {count_with_noun(count, 'sample')}", "record some seconds of motion"
+            what = f"{group.name} has only {count_with_noun(count, 'sample')} (at least {least} are needed)"
+            advice = "check whether its data are complete, or record some seconds of motion"
             yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 
@@ -183,9 +184,9 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         ):
             lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
             setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0].lstrip('+-')}"
-            again = f"import again with --clock-offset {option.rstrip(')')}, or set {setting}"
-            advice = f"{again}, so that a fit estimates the shift; if the object only swings behind the arm, do nothing"
-            what = LATE_POINTS_WORDS + lag
+            late = "if points beside the gripper are as late as the others, the clock is late: import again with "
+            remedy = f"{late}--clock-offset {option.rstrip(')')}, or set {setting}, so that a fit estimates the shift"
+            what, advice = LATE_POINTS_WORDS + lag, f"{remedy}; if not, the object swings behind the arm: do nothing"
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
 
 

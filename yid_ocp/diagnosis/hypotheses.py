@@ -148,9 +148,9 @@ class AllCandidatesProblem:
         held = [*held_out] or [episode.recording for episode in problem.held_out]
         for recording in held:
             if any(_same(recording, other) for other in estimate):
-                what, allowed = "a recording is both estimated on and held out", "held-out recordings of other motions"
-                hint = "remove it from recordings.held_out; without held-out ones, blocks of recordings are held out"
-                raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
+                what = f"recording '{recording.name}' is used both for the estimate and as held-out recording"
+                hint = "hold out other recordings, or none: then blocks of time of the recordings are held out"
+                raise DataError(what, where="held_out", allowed="held-out recordings of other motions", hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.linalg
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference import null_test
@@ -120,7 +120,8 @@ def linearize_candidates(
         trial = trial.with_parameter_values({name: value for _, shape in chosen for name, value in shape.items()})
         evaluation = trial.evaluate(trial.pack_unknowns(values), equilibrium_guesses=warm)
         if not evaluation.ok:
-            raise failed_rollout_error(evaluation.message, "model with the candidate effects")
+            where = f"simulation with {join_effect_labels(base)} (all candidate effects are zero)"
+            raise failed_rollout_error(evaluation.message, where)
         warm = evaluation.equilibrium_guesses
         data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
         del evaluation  # its Jacobian is large

@@ -47,7 +47,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
     mostly = _listed("Record slow and fast motions, with pauses, in which ", place, " moves most.")
     texts = {
-        "insufficient_data": "Record longer and larger motions, with more points of the object in view.",
+        "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
         "unknown": mostly or "Record faster and larger motions of all joints.",
         "no_gap": "None is needed for motions like these. Other motions may still show a gap.",
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
@@ -117,8 +117,9 @@ def _gap(result: DiagnosisResult) -> str:
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
     p_text, detectable = _p_value_relation(p_value), f"would show {sum(seen)} of {len(seen)} effects"
     said = f"{tests[0].degrees_of_freedom:.0f} independent samples for {unknowns} unknowns, and {detectable}"
+    needed = "It needs more samples than unknowns, and at least one effect that they would show."
     texts = {
-        "insufficient_data": f"The recordings are insufficient for a diagnosis: they have {said}.",
+        "insufficient_data": f"The recordings are insufficient for a diagnosis: they have {said}. {needed}",
         "no_gap": "\n".join([f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)]),
     }
     if result.verdict in texts:
@@ -179,11 +180,12 @@ def _causes(result: DiagnosisResult) -> list[str]:
     causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
     own, goal = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
+    differ = "No cause is named, because estimates differ by more than 70 % of the effect and 2 standard deviations"
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
         "none": "None of the effects that were tried explains the error well enough, so no cause is named.",
         "little": f"{names} explain{s} {own:.3g} % of the error beyond noise on fitted motions ({goal:.3g} % needed).",
-        "stand_in": f"No cause is named, because estimates differ between recordings: {'; '.join(apart)}.",
+        "stand_in": f"{differ}: {'; '.join(apart)}. {names} may imitate another cause, or change between recordings.",
     }
     return [*text, reasons[result.unknown_reason], _several_places(result)]
 

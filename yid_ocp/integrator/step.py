@@ -153,8 +153,8 @@ class Step(ReprMixin):
         z0 = np.zeros(sizes["nz"]) if internal is None else check("internal", internal, (sizes["nz"],))
         start = np.concatenate([check("q0", q0, (sizes["n"],)), check("p0", p0, (sizes["n"],)), z0])
         if prescribed is None and sizes["nc"]:
-            what = f"{sizes['nc']} coordinates are prescribed, but `prescribed` is missing"
-            allowed = f"the pair (s0, s1), each of shape ({sizes['nc']},)"
+            what = f"the argument `prescribed` is missing, but {sizes['nc']} coordinates of the model are prescribed"
+            allowed = f"(s0, s1): their values at the start and at the end of the step, each of shape ({sizes['nc']},)"
             raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1)")
         ends = ((), ()) if prescribed is None else prescribed
         if len(ends) != 2:
@@ -230,8 +230,8 @@ def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[in
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)
     if array.shape != shape:
-        hint = "pass an array of the allowed shape"
-        raise ModelError(f"{name} has shape {array.shape}", where=name, allowed=f"shape {shape}", hint=hint)
+        what, hint = f"{name} has shape {array.shape} instead of {shape}", f"pass {name} with the allowed shape"
+        raise ModelError(what, where=name, allowed=f"shape {shape}", hint=hint)
     return array
 
 

@@ -131,7 +131,7 @@ class EpisodePredictor:
             rest = statics.solve(known, theta, first, episode.equilibrium_guess if guess is None else guess, names)
             if not rest.is_converged:
                 none = np.zeros((nx, len(names) + len(rows)))
-                return InitialStateWithSensitivity(rest.state, none, rest, f"{episode.name}: {rest.message}")
+                return InitialStateWithSensitivity(rest.state, none, rest, f"in '{episode.name}', {rest.message}")
             state = rest.state.copy()
             by_known = inputs.initial_known_coordinate_sensitivities(len(names))
             by_theta = rest.state_by_theta + rest.state_by_known_coordinates @ by_known
@@ -285,7 +285,7 @@ class EpisodePredictor:
         theta, feedback, directions = prepared.member.theta, prepared.member.feedback, prepared.member.directions
         driven = self.system.actuated_coordinate_indices
         if not rollout.status.is_converged:
-            return f"{episode.name}: {rollout.status.message}"
+            return f"in '{episode.name}', {rollout.status.message}"
         by_applied = None
         if directions is not None and rollout.state_sensitivity is not None and driven:
             by_applied = np.zeros((*rollout.torque.shape, directions.count))

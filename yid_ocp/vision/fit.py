@@ -161,8 +161,9 @@ class ShapeFitter:
         shape). Passes on points run from the best result. Raises `DataError` if the filtered `cloud` has no points.
         """
         if not len(cloud.points) or not len(cloud.skeleton_nodes):
-            what = f"the cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
-            raise DataError(what, where="cloud", allowed="one of them or more", hint="loosen track.options.filters")
+            what = f"the filtered cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
+            hint = "loosen the filters (track.options.filters), or check that the cloud shows the object"
+            raise DataError(what, where="cloud", allowed="one or more", hint=hint)
         free = list(self.free_joints)
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]

@@ -102,6 +102,10 @@ _MAX_BEND_ANGLE = 1.2  # of a joint in a good frame [rad]
 _MAX_DISTANCE_OVER_MEDIAN = 1.7  # of a frame's mean distance, over the median of good frames
 _MAX_GRASP_GAP_CHANGE = 0.008  # distance of an end from its gripper, beyond the usual, of a wrong stamp [m]
 _MAX_NOTES = 4  # notes in a hint
+_WRONG_CLOUD_ADVICE = (
+    "look at the pictures of a frame; tighten track.options.filters if the cloud has more than the object, loosen them "
+    "if a part is missing"
+)
 _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a normal variable, in stds
 
 
@@ -199,7 +203,7 @@ def _none_good(
         kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
     often = sorted(kinds.values(), key=len, reverse=True)[:3]
     listed = "; ".join(
-        f"{len(reasons)} of {len(frames)} because {reasons[0]}{' (one of them)' * (len(set(reasons)) > 1)}"
+        f"in {len(reasons)} of {len(frames)}{', for example' * (len(set(reasons)) > 1)}: {reasons[0]}"
         for reasons in often
     )
     most = next((reasons[0] for reasons in often), "")
@@ -208,10 +212,11 @@ def _none_good(
     of_cause = {
         "stamp is late": "set track.options.clock_offset_search.initial_stamp_minus_joint_time, or drop late frames",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
+        "from end to end": _hint(sizes, things, _WRONG_CLOUD_ADVICE),
         "crosses or touches itself": "record the object without crossings, or look whether the filters join its parts",
     }
     hint = next((own for words, own in of_cause.items() if words in most), _hint(sizes, things, hint))
-    what, allowed = f"{cause}no frame could be used: {listed}", "one usable frame or more"
+    what, allowed = f"{cause}no frame could be used; {listed}", "one usable frame or more"
     return DataError(what, where=source, allowed=allowed, hint=hint)
 
 

@@ -153,8 +153,7 @@ def import_open3d() -> ModuleType:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        what = f"vision needs Open3D, which cannot be loaded ({error})"
-        raise missing_package_error(DataError, what, "vision") from error
+        raise missing_package_error(DataError, "vision needs the package open3d", "vision", error) from error
     return open3d
 
 

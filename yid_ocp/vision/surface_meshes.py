@@ -370,7 +370,8 @@ def _mesh_of_file(file: Path, changed: int) -> TriangleMesh:
     try:
         return TriangleMesh._of(trimesh.load(check_input_file(file, _MAX_MESH_BYTES), force="mesh"))
     except Exception as error:  # trimesh's readers raise many kinds
-        what, hint = f"the mesh cannot be read: {error}", "export it again as STL or OBJ"
+        reason = f"{file.suffix} files are not supported" if isinstance(error, ImportError) else error
+        what, hint = f"the mesh cannot be read: {reason}", "export it again as STL or OBJ"
         raise ModelError(what, where=str(file), allowed="an STL, OBJ or DAE file", hint=hint) from error
 
 

@@ -115,8 +115,8 @@ class SingleFrameTracker:
         loose: tuple[str, ...] = ()
         anywhere = options.root_placement != "model"
         if anywhere and scene.robot_urdf is not None:
-            hint = "set track.options.root_placement to model, or model.robot to null"
-            what = f"root_placement is '{options.root_placement}', but the robot that holds the object gives its place"
+            hint = "set track.options.root_placement: model; to track the object without a robot, model.robot: null"
+            what = f"root_placement is '{options.root_placement}', but the robot determines the place of the root"
             raise ConfigError(what, where="track.options.root_placement", allowed="model", hint=hint)
         if anywhere:
             system, loose = add_free_root_joints(system, values)

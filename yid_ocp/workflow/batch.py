@@ -207,6 +207,6 @@ def _folder(path: Path) -> Path:
             raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another name with --out")
         (folder / _RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        what, hint = f"the folder cannot be created: {os_error_reason(error)}", "choose an --out in a writable folder"
+        what, hint = f"the folder cannot be created: {os_error_reason(error)}", "choose another --out"
         raise OutputError(what, where=str(folder), hint=hint) from error
     return folder

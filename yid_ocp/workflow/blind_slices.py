@@ -61,8 +61,8 @@ def score_joined_slices(
             what, hint = "labels or settings do not match the hashes in the file", "copy the original slice again"
             raise DataError(what, where=str(path), allowed="an unchanged slice.json", hint=hint)
         if found and part["ensemble_sha256"] != found[0]["ensemble_sha256"]:
-            what, hint = "the slice belongs to another ensemble than the first one", "join slices of one ensemble only"
-            allowed = f"ensemble_sha256: {found[0]['ensemble_sha256']}"
+            what = f"this slice and {files[0]} are of different blind tests: cases, settings or code differ"
+            allowed, hint = "slices of one blind test", "give the slices that were made with the same command and code"
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         if part["slice"] in [own["slice"] for own in found]:
             what, allowed = f"slice {part['slice']} is given twice", "every slice once"

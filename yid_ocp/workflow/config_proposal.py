@@ -352,7 +352,7 @@ def _places(
             owner, colon, part = point.partition(":")
             frame, reason, std = "", "its place on the model is not known", 0.0
             if point in frames or (colon and owner in names and part.endswith("%")):
-                frame, reason = point, "the model has a frame of this name"
+                frame, reason = point, "the frame of the same name"
             elif point in names:
                 frame, reason = f"w_{point}", "the end of the segment of this name"
             elif not standing:
