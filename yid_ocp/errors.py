@@ -17,7 +17,7 @@ class YidError(Exception):
     """
 
     _usual_allowed = "what docs/reference and docs/howto describe"
-    _usual_hint = "correct the value or file that `where` names"
+    _usual_hint = "change what `where` names so that it agrees with `allowed`"
 
     def __init__(self, what: str, *, where: str = "", allowed: str = "", hint: str = "") -> None:
         self.what, self.where, self.allowed, self.hint = what, where, allowed, hint
@@ -81,12 +81,11 @@ _Error = TypeVar("_Error", bound=YidError)
 
 def missing_package_error(kind: type[_Error], what: str, extra: str, error: Exception) -> _Error:
     """Create an error of `kind` for an `error` of an import: `what`, and how to install `extra` or a system library."""
-    where, allowed = f"the Python environment {sys.prefix}", f"yid_ocp with its extra `{extra}`"
-    if isinstance(error, ModuleNotFoundError):
-        return kind(what, where=where, allowed=allowed, hint=f"pip install '.[{extra}]' in the project's clone")
-    what, allowed = f"{what}, which is installed but cannot be loaded: {error}", "the system libraries that it needs"
-    hint = "if a library (.so) is missing, install it: libGL.so.1 is in libgl1 of Debian and Ubuntu, libgomp.so.1 in "
-    return kind(what, where=where, allowed=allowed, hint=f"{hint}libgomp1; else repeat pip install '.[{extra}]'")
+    where, hint = f"the Python environment {sys.prefix}", f"pip install '.[{extra}]' in the project's clone"
+    if not isinstance(error, ModuleNotFoundError):
+        what = f"{what}, which is installed but cannot be loaded: {error}"
+        hint = f"install the missing system library (libGL.so.1: apt install libgl1); if none is missing, {hint}"
+    return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
 
 
 def import_optional(module: str, extra: str, what: str, kind: type[YidError] = DataError) -> ModuleType:

@@ -49,9 +49,7 @@ def problem(rows, start, shared=None, **more):
 def shifts(coarse, finer, factors=None, **more):
     """Of the coarse problem's parameters at its initial values."""
     x = coarse.initial_unknowns
-    made = _gauss_newton_step_in_finer_model(
-        _FinerModel(finer, factors or {}), coarse, x, coarse.evaluate(x), **more
-    )
+    made = _gauss_newton_step_in_finer_model(_FinerModel(finer, factors or {}), coarse, x, coarse.evaluate(x), **more)
     return made if isinstance(made, str) else made[0]
 
 

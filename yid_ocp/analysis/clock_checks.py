@@ -325,19 +325,16 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     for group, parts in by_group.items():
         *squares, count = (sum(column) for column in zip(*parts, strict=True))
         free = count - len(problem.initial_unknowns)
-        if free < 0.5 * count:
-            continue
-        seen = math.sqrt(max(squares) / free)
+        seen = math.sqrt(max(squares) / free) if free >= 0.5 * count else math.inf
         if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
             continue
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
         leaves = f"after the fit, the error of {group} is {seen * usual:.2g} {unit} (rms, slow errors included)"
-        times = f"{1 / max(seen, 1e-9):.2g} times smaller than the stated noise of {usual:.2g} {unit}"
-        words = f"{leaves}, {times} (up to {least:g} times is tolerated)"
+        severity = 1 / (least * max(seen, 1e-9))
+        times = f"{least * severity:.2g} times smaller than stated ({usual:.2g} {unit}; {least:g} times is tolerated)"
         advice = "set the std to the actual noise: the stated std makes every ± too wide and hides small gaps"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
-        severity = 1 / (least * max(seen, 1e-9))
         where = group.partition(".")[0]
-        yield Issue("noise_overstated", words, "warning", severity, advice, "", where, setting=setting)
+        yield Issue("noise_overstated", f"{leaves}, {times}", "warning", severity, advice, "", where, setting=setting)

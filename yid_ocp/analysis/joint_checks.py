@@ -190,11 +190,9 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
         return
     for j in np.flatnonzero(beyond > margin):
         name, unit = arm.joint_names[j], arm.joints[j].coordinate_unit
-        words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g} {unit}"
-        words += f" ({margin:g} {unit} is tolerated)"
+        words = f"{name} is {beyond[j]:.3g} {unit} (tolerated: {margin:g}) beyond {low[j]:.3g} to {high[j]:.3g} {unit}"
         advice = "check the joint's zero, unit and column, and whether the recording is of this robot"
-        depth = float(beyond[j] / margin)
-        yield Issue("angle_limits", words, "not_trusted", depth, advice, "", channel=f"position.{name}")
+        yield Issue("angle_limits", words, "not_trusted", beyond[j] / margin, advice, "", channel=f"position.{name}")
 
 
 def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterator[Issue]:

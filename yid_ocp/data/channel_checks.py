@@ -159,7 +159,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
             # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, the stated std is {stated:.2g} {unit}{tolerated}"
+            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, stated is {stated:.2g} {unit}{tolerated}"
             ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
             advice = "set the std to that of the actual noise"
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)

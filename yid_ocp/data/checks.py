@@ -148,8 +148,7 @@ def _few_samples(recording: Recording) -> Iterator[Issue]:
     for group in recording.joint_and_point_groups:
         count, least = len(group.t), QUALITY_LIMITS.min_samples
         if count < least:
-            what = f"{group.name} has only {count_with_noun(count, 'sample')} (at least {least} are needed)"
-            advice = "check whether its data are complete, or record some seconds of motion"
+            what, advice = f"{group.name} has {count} of at least {least} samples", "check the file, or record more"
             yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 

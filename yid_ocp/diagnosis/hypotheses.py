@@ -146,11 +146,10 @@ class AllCandidatesProblem:
         joint = compile_step_like(problem.step, problem.step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
         held = [*held_out] or [episode.recording for episode in problem.held_out]
-        for recording in held:
-            if any(_same(recording, other) for other in estimate):
-                what = f"recording '{recording.name}' is used both for the estimate and as held-out recording"
-                hint = "hold out other recordings, or none: then blocks of time of the recordings are held out"
-                raise DataError(what, where="held_out", allowed="held-out recordings of other motions", hint=hint)
+        if repeated := [own.name for own in held if any(_same(own, other) for other in estimate)]:
+            what = f"recording '{repeated[0]}' is used both for the estimate and as held-out recording"
+            hint = "hold out other recordings, or none: then blocks of time of the recordings are held out"
+            raise DataError(what, where="held_out", allowed="held-out recordings of other motions", hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)

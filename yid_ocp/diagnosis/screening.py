@@ -120,8 +120,7 @@ def linearize_candidates(
         trial = trial.with_parameter_values({name: value for _, shape in chosen for name, value in shape.items()})
         evaluation = trial.evaluate(trial.pack_unknowns(values), equilibrium_guesses=warm)
         if not evaluation.ok:
-            where = f"simulation with {join_effect_labels(base)} (all candidate effects are zero)"
-            raise failed_rollout_error(evaluation.message, where)
+            raise failed_rollout_error(evaluation.message, f"simulation with {join_effect_labels(base)}")
         warm = evaluation.equilibrium_guesses
         data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
         del evaluation  # its Jacobian is large

@@ -14,7 +14,7 @@ from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import abbreviated_names_text
+from yid_ocp.display import abbreviated_names_text, p_value_relation_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
@@ -75,8 +75,9 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         (result.is_split_in_blocks, "Held-out motions are every second block of time: no recording could be held out."),
     )
     text += _applying(notes)
-    events = [f"{e.channel} at {e.start_time:.2f} s of '{e.recording}'" for e in result.events.disturbances]
-    text += [_listed("Brief disturbances (pushes, wrong samples) were excluded: ", events)]
+    kinds, events = {"force": "push of", "sample": "wrong samples of"}, result.events.disturbances
+    listed = [f"{kinds[e.kind]} {e.channel} at {e.start_time:.2f} s of '{e.recording}'" for e in events]
+    text += [_listed("Brief disturbances were excluded: ", listed, ". If you did not cause them, check these times.")]
     text += [*overspeed_truncation_messages(result.events), f"Next experiment: {result.next_experiment}"]
     return "\n".join(filter(None, text))
 
@@ -104,10 +105,6 @@ def _applying(notes: Iterable[tuple[bool, str]]) -> list[str]:
     return [text for applies, text in notes if applies]
 
 
-def _p_value_relation(p_value: float) -> str:
-    return f"= {p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
-
-
 def _gap(result: DiagnosisResult) -> str:
     """Sentence on whether there is a gap."""
     tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
@@ -115,21 +112,19 @@ def _gap(result: DiagnosisResult) -> str:
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
     p_value = min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    p_text, detectable = _p_value_relation(p_value), f"would show {sum(seen)} of {len(seen)} effects"
+    p_text, detectable = p_value_relation_text(p_value), f"would show {sum(seen)} of {len(seen)} effects"
     said = f"{tests[0].degrees_of_freedom:.0f} independent samples for {unknowns} unknowns, and {detectable}"
-    needed = "It needs more samples than unknowns, and at least one effect that they would show."
-    texts = {
-        "insufficient_data": f"The recordings are insufficient for a diagnosis: they have {said}. {needed}",
-        "no_gap": "\n".join([f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)]),
-    }
-    if result.verdict in texts:
-        return texts[result.verdict]
+    if result.verdict == "insufficient_data":
+        needed = "It needs more samples than unknowns, and at least one effect that they would show."
+        return f"The recordings are insufficient for a diagnosis: they have {said}. {needed}"
+    if result.verdict == "no_gap":
+        return "\n".join([f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)])
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
         return f"The nominal model has an error beyond noise (a gap){only}: {sizes} (p {p_text})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
-    small = f"But the error has the pattern of {best.effect.label} (p {_p_value_relation(p_value)})"
+    small = f"But the error has the pattern of {best.effect.label} (p {p_value_relation_text(p_value)})"
     return f"In total the error of the nominal model is within noise: {sizes}. {small}."
 
 
@@ -141,7 +136,7 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
     needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
     small = f"The error is significantly larger than noise, but too small to count as a gap. A gap needs {needs}."
-    seen = f"The error has the pattern of {''.join(best)} (noise alone: p {_p_value_relation(along)})"
+    seen = f"The error has the pattern of {''.join(best)} (noise alone: p {p_value_relation_text(along)})"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]

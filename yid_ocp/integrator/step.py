@@ -152,13 +152,10 @@ class Step(ReprMixin):
         sizes, check = self.sizes, float_array_with_checked_shape
         z0 = np.zeros(sizes["nz"]) if internal is None else check("internal", internal, (sizes["nz"],))
         start = np.concatenate([check("q0", q0, (sizes["n"],)), check("p0", p0, (sizes["n"],)), z0])
-        if prescribed is None and sizes["nc"]:
-            what = f"the argument `prescribed` is missing, but {sizes['nc']} coordinates of the model are prescribed"
-            allowed = f"(s0, s1): their values at the start and at the end of the step, each of shape ({sizes['nc']},)"
-            raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1)")
-        ends = ((), ()) if prescribed is None else prescribed
+        ends = prescribed if prescribed is not None else () if sizes["nc"] else ((), ())
         if len(ends) != 2:
-            what, allowed = f"prescribed has {len(ends)} entries", "the pair (s0, s1) of coordinates at both nodes"
+            what = f"the argument `prescribed` has {len(ends)} entries for {sizes['nc']} prescribed coordinates"
+            allowed = f"(s0, s1): their values at the start and at the end of the step, each of shape ({sizes['nc']},)"
             raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1)")
         path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in ends])
         start[list(self.system.prescribed_coordinate_indices)] = path[0]
@@ -230,8 +227,7 @@ def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[in
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)
     if array.shape != shape:
-        what, hint = f"{name} has shape {array.shape} instead of {shape}", f"pass {name} with the allowed shape"
-        raise ModelError(what, where=name, allowed=f"shape {shape}", hint=hint)
+        raise ModelError(f"{name} has shape {array.shape}, not {shape}", where=name, allowed=f"shape {shape}")
     return array
 
 

@@ -36,8 +36,9 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     values = np.atleast_1d(np.asarray(gains, float))
     if values.size not in (1, nu) and nu % max(values.size, 1):
         what = f"the settings have {values.size} gains for {nu} driven joints"
-        allowed = f"1 or {nu} gains, or one for each joint of one arm (equal gains for all arms)"
-        raise ModelError(what, where="problem.arm_proportional_gains", allowed=allowed)
+        allowed = f"1 gain, {nu} gains or, of several equal arms, one gain for each joint of an arm"
+        hint = f"set one gain for all joints, such as [{values[0]:g}], or {nu} gains"
+        raise ModelError(what, where="problem.arm_proportional_gains", allowed=allowed, hint=hint)
     values = np.resize(values, nu)
     if np.any(values < 0):
         what = f"a tracking gain is negative: {values.min():g} N m/rad"

@@ -131,18 +131,17 @@ def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluato
 
 
 def _place(options: PlanOptions, begin: Array) -> Array:
-    if (options.target_position is None) == (options.point_target_offset_from_start is None):
+    target = options.target_position
+    if (target is None) == (options.point_target_offset_from_start is None):
         keys = "plan.target_position", "plan.point_target_offset_from_start"
-        what, hint = "the target of the point is not given", f"set {keys[0]} or {keys[1]}"
-        if options.target_position is not None:
-            what, hint = "the target of the point is given twice", "set one of the two keys to null"
+        hint = f"set only {keys[0]}: [x, y, z] (in the world, m), or only {keys[1]}: [dx, dy, dz] (m)"
+        what = f"the target of the point '{options.point}' is {'not given' if target is None else 'given twice'}"
         raise ConfigError(what, where=", ".join(keys), allowed="one of the two keys", hint=hint)
     if options.goal == "path" and not options.point_waypoint_offsets_from_start:
-        what, where = "the path has no waypoints", "plan.point_waypoint_offsets_from_start"
-        hint = "list waypoints, such as [[0, 0, 0.1]]"
-        raise ConfigError(what, where=where, allowed="one or more offsets from the start [m]", hint=hint)
-    if options.target_position is not None:
-        return np.array(options.target_position, float)
+        what, hint = "the path has no waypoints", "list offsets from the start [m], such as [[0, 0, 0.1]]"
+        raise ConfigError(what, where="plan.point_waypoint_offsets_from_start", allowed="one or more", hint=hint)
+    if target is not None:
+        return np.array(target, float)
     return begin + np.array(options.point_target_offset_from_start, float)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text
+from yid_ocp.display import abbreviated_names_text, p_value_relation_text
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
@@ -111,11 +111,9 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 
 
 def _planning_command(section: Mapping[str, Any]) -> str:
-    words = ["yid-ocp", "plan", str(Path(section["parameter_run_folder"]) / "config.yaml")]
-    for key, value in section.items():
-        text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
-        words += ["--set", f"plan.{key}={text}"]
-    return shlex.join(words)
+    texts = {key: f"[{', '.join(value)}]" if isinstance(value, list) else value for key, value in section.items()}
+    settings = (word for key, text in texts.items() for word in ("--set", f"plan.{key}={text}"))
+    return shlex.join(["yid-ocp", "plan", str(Path(section["parameter_run_folder"]) / "config.yaml"), *settings])
 
 
 @register_summary("yid-blind/1")
@@ -382,7 +380,7 @@ def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list
 
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
-    p = _relation(result["p_value"])
+    p = p_value_relation_text(result["p_value"])
     if not drifted and result["p_value"] >= result["level"]:
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
     elif not drifted:
@@ -391,21 +389,15 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
-        yield f"{name} is not the same in all runs: {ends} (p {_relation(entry['p_value'])})."
+        yield f"{name} is not the same in all runs: {ends} (p {p_value_relation_text(entry['p_value'])})."
     if wrong:
         yield f"Do not trust {' and '.join(wrong)}: without it the other runs agree much better."
-    elif drifted and len(runs) == 2:
-        yield "Two runs that differ do not show which one is wrong; add a third run."
     elif drifted:
-        yield "No single run explains this difference."
+        two = "Two runs that differ do not show which one is wrong; add a third run."
+        yield two if len(runs) == 2 else "No single run explains this difference."
     if poor := [entry["name"] for entry in runs if not entry["explains"]]:
         text = f"The model did not explain the recordings of {', '.join(poor)}"
         yield f"{text}. The ± of such a run includes the model error, but may still be too small."
-
-
-def _relation(p_value: float) -> str:
-    text = p_value_text(p_value)
-    return text if text.startswith("<") else f"= {text}"
 
 
 @register_summary("yid-overlay/1")
@@ -427,11 +419,10 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         sizes = zip(*((*entry["rmse"].values(), entry["difference"]) for entry in alike), strict=True)
         means = [statistics.fmean(size**2 for size in own) ** 0.5 for own in sizes]
         texts = [" ".join(value_text_and_display_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
-        text = f"{group}, {where}: rms error {texts[0]} of {first}, {texts[1]} of {second}"
-        yield SummaryStatement(f"{text}; their predictions differ by {texts[2]}", "conclusion")
-    none, names = f"no parameter differs by more than {_MAX_RUN_DIFFERENCE} std", abbreviated_names_text(differing)
-    text = f"parameters that differ by more than {_MAX_RUN_DIFFERENCE} std: {names}"
-    yield SummaryStatement(text if differing else none, "verdict")
+        text = f"rms error of {group} on {where}: {texts[0]} ({first}), {texts[1]} ({second})"
+        yield SummaryStatement(f"{text}. The predictions of the runs differ by {texts[2]} (rms)", "conclusion")
+    names = abbreviated_names_text(differing) or "none"
+    yield SummaryStatement(f"parameters that differ by more than {_MAX_RUN_DIFFERENCE} std: {names}", "verdict")
     yield "std: the larger one of both runs. Both have the same data, so this is no test of significance"
     rows = [("recording", "channel", first, second, "difference", "unit")]
     for entry in result["channels"]:
@@ -442,6 +433,6 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
-    if entry is None or not entry["free"]:
-        return "" if entry is None else f"{entry['value']:.4g} (fixed)"
-    return value_and_uncertainty_text(entry["value"], entry["std"], verdict=entry["verdict"])
+    if entry is not None and entry["free"]:
+        return value_and_uncertainty_text(entry["value"], entry["std"], verdict=entry["verdict"])
+    return "" if entry is None else f"{entry['value']:.4g} (fixed)"

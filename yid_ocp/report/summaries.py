@@ -192,7 +192,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     if weak:
         yield f"only {VERDICT_TABLE_TEXTS['weak']}, so use the 95 % interval: {abbreviated_names_text(weak)}"
         if any(free[name]["interval"] is None for name in weak):
-            yield "`yid-ocp identifiability --intervals all` computes intervals of weak parameters more exactly"
+            yield "`yid-ocp identifiability FILE --intervals all` computes intervals of weak parameters more exactly"
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
@@ -223,8 +223,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from hidden[:_MAX_DIRECTIONS]
-    remedy = "to determine them, record other motions (`yid-ocp plan`) or fix a known parameter (`free: false`)"
-    yield remedy if hidden else ""
+    yield "to find them, record other motions (`yid-ocp plan`) or fix a known one (`free: false`)" if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)"
     if not result["profiles"]:
@@ -271,8 +270,9 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
-    text = f"use the law '{best}', the simplest one whose held-out error is within one standard error of the smallest. "
-    text += f"Each kind of motion was held out in turn: {', '.join(result['kinds'])}"
+    joints = abbreviated_names_text(result["joints"])
+    text = f"{joints}: use the law '{best}', the simplest one whose held-out error is within one standard error of the "
+    text += f"smallest. Each kind of motion was held out in turn: {', '.join(result['kinds'])}"
     yield SummaryStatement(text, "conclusion")
     if not result["to_use"]:
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")

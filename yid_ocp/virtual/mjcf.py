@@ -269,7 +269,7 @@ def mujoco_xml(
         Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
     """
     if not time_step > 0:
-        raise ConfigError(f"time_step = {time_step}", where="mujoco_xml: time_step", allowed="a number above 0 [s]")
+        raise ConfigError(f"time_step = {time_step} is not above 0", where="mujoco_xml", allowed="a number above 0 [s]")
     tree, weights = _weighed(system.mechanism_with_values(values))
     value = CasadiEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)

@@ -413,9 +413,10 @@ def replay_mismatch_by_channel(
     mujoco, model = import_mujoco(), mujoco_model_from_mjcf_text(text)
     moved = system.driven or system.prescribed
     joints = recording.joints
-    if joints is None or not moved or not set(moved) <= set(joints.names):
-        what, hint = "the recording lacks angles of driven or prescribed joints", "import these joints too"
-        allowed = f"the angles of {', '.join(moved) or 'one joint or more'}"
+    missing = set(moved).difference(() if joints is None else joints.names)
+    if joints is None or missing or not moved:
+        what = f"the recording has no angles of {', '.join(sorted(missing)) or 'a driven or prescribed joint'}"
+        allowed, hint = "angles of all driven and prescribed joints", "import a file with the missing angles again"
         raise ModelError(what, where=f"recording '{recording.name}': joints", allowed=allowed, hint=hint)
     columns = [joints.names.index(name) for name in moved]
     quantity, words = ("position_command", "commanded positions") if system.servos else ("effort", "efforts")

@@ -162,8 +162,7 @@ class ShapeFitter:
         """
         if not len(cloud.points) or not len(cloud.skeleton_nodes):
             what = f"the filtered cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
-            hint = "loosen the filters (track.options.filters), or check that the cloud shows the object"
-            raise DataError(what, where="cloud", allowed="one or more", hint=hint)
+            raise DataError(what, where="cloud", allowed="one or more", hint="loosen track.options.filters")
         free = list(self.free_joints)
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]

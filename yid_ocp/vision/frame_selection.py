@@ -102,10 +102,6 @@ _MAX_BEND_ANGLE = 1.2  # of a joint in a good frame [rad]
 _MAX_DISTANCE_OVER_MEDIAN = 1.7  # of a frame's mean distance, over the median of good frames
 _MAX_GRASP_GAP_CHANGE = 0.008  # distance of an end from its gripper, beyond the usual, of a wrong stamp [m]
 _MAX_NOTES = 4  # notes in a hint
-_WRONG_CLOUD_ADVICE = (
-    "look at the pictures of a frame; tighten track.options.filters if the cloud has more than the object, loosen them "
-    "if a part is missing"
-)
 _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a normal variable, in stds
 
 
@@ -141,7 +137,7 @@ def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport]) -> list[Frame
         reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
         if fit.mean_distance > _MAX_DISTANCE_OVER_MEDIAN * usual:
-            off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, {1e3 * usual:.1f} mm are usual"
+            off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, the median is {1e3 * usual:.1f} mm"
             reason = f"the shape fits worse than in other frames: {off}"
         elif apart > _MAX_GRASP_GAP_CHANGE:
             reason = f"{_END_ELSEWHERE}: {1e3 * apart:.0f} mm more than usual (a late stamp?)"
@@ -202,21 +198,18 @@ def _none_good(
     for frame in frames:
         kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
     often = sorted(kinds.values(), key=len, reverse=True)[:3]
-    listed = "; ".join(
-        f"in {len(reasons)} of {len(frames)}{', for example' * (len(set(reasons)) > 1)}: {reasons[0]}"
-        for reasons in often
-    )
+    counts = [f"in {len(own)} of {len(frames)}{', for example,' * (len(set(own)) > 1)} {own[0]}" for own in often]
     most = next((reasons[0] for reasons in often), "")
     cause = _because(sizes, most.startswith(_MISFIT_REASONS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
     of_cause = {
         "stamp is late": "set track.options.clock_offset_search.initial_stamp_minus_joint_time, or drop late frames",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
-        "from end to end": _hint(sizes, things, _WRONG_CLOUD_ADVICE),
+        "from end to end": _hint(sizes, things, "tighten track.options.filters, or loosen them if a part is missing"),
         "crosses or touches itself": "record the object without crossings, or look whether the filters join its parts",
     }
     hint = next((own for words, own in of_cause.items() if words in most), _hint(sizes, things, hint))
-    what, allowed = f"{cause}no frame could be used; {listed}", "one usable frame or more"
+    what, allowed = f"{cause}no frame could be used: {'; '.join(counts)}", "one usable frame or more"
     return DataError(what, where=source, allowed=allowed, hint=hint)
 
 

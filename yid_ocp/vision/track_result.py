@@ -143,7 +143,7 @@ def draw_frame_processing_stages(stages: SingleFrameStages, folder: str | os.Pat
     for number, picture in enumerate(pictures, start=1):
         written.append(path / f"{stem}_{number}_{picture.name}.png")
         frame = stages.raw_points if picture.name == "cloud" or not len(near) else near
-        ended = f"\n{report.drop_reason}" if number == len(pictures) and report.drop_reason else ""
+        ended = f"\nnot used: {report.drop_reason}" if number == len(pictures) and report.drop_reason else ""
         _write(written[-1], f"{report.name}: {picture.title}{ended}", frame, stages.camera_position, picture)
     return written
 
@@ -160,7 +160,7 @@ def _pictures(stages: SingleFrameStages) -> list[_Picture]:
         title = f"{count_with_noun(len(edges), 'edge')}, {parts}"
         made.append(_Picture("graph", title, [nodes], list(edges), _BLUE))
         if fit is not None:
-            title = f"fitted shape, {1e3 * fit.mean_distance:.1f} mm off on average"
+            title = f"fitted shape, {1e3 * fit.mean_distance:.1f} mm from the points on average"
             places = [faint, (fit.link_ends.reshape(-1, 3), _GREEN, 18.0), (fit.point_positions, _ORANGE, 40.0)]
             made.append(_Picture("fit", title, places, list(fit.link_ends), _GREEN))
     return made

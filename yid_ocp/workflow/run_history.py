@@ -69,8 +69,8 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
         effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
-        what = f"the key {error} is missing" if isinstance(error, KeyError) else f"a value is not valid ({error})"
-        hint = "repeat the `solve` or `diagnose` that made this folder"
+        fault = f"the key {error} is missing" if isinstance(error, KeyError) else f"a value is not valid ({error})"
+        what, hint = f"the result is damaged, or of another version: {fault}", "repeat the run that made this folder"
         raise DataError(what, where=str(file), allowed="keys and values of this version", hint=hint) from error
     if not names:
         what, hint = "the run determined no parameter", "give a run that estimated one with a standard deviation"

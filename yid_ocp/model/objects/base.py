@@ -79,8 +79,10 @@ class CableVertices:
         known = self.undeformed_positions
         require_known_names(self.vertex_names, known, "undeformed position of vertex", "cable", ModelError)
         if len(set(self.vertex_names)) != len(self.vertex_names):
-            what = f"vertex '{max(self.vertex_names, key=self.vertex_names.count)}' belongs to two branches"
-            raise ModelError(what, where="cable", allowed="every vertex in one branch", hint="list it in one branch")
+            twice = max(self.vertex_names, key=self.vertex_names.count)
+            branches = " and ".join(name for name, own in self.vertex_names_by_branch.items() if twice in own)
+            what, hint = f"vertex '{twice}' is listed twice: in {branches}", "remove it at one of the places"
+            raise ModelError(what, where="cable", allowed="every vertex in one branch", hint=hint)
 
     @property
     def vertex_names(self) -> tuple[str, ...]:

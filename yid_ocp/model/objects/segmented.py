@@ -113,7 +113,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
         return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
     if not numbers.get("branches"):
         allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
-        hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
+        hint = "for 4 equal branches (m, kg, m of each): --branches 4 --length 0.4 --mass 0.03 --radius 0.008"
         raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
     wanted = base.SIZE_AND_MASS_DESCRIPTIONS
     length, mass, radius = base.extract_required_object_numbers("each branch of a tree", numbers, wanted)
