@@ -190,7 +190,7 @@ def test_shapes_that_touch_themselves():
 
 
 def test_a_robot_says_where_the_root_is(rope):
-    with pytest.raises(ConfigError, match="robot that holds the object"):
+    with pytest.raises(ConfigError, match="the robot determines the place"):
         track_object(SceneDescription(rope, "package:baxter"), None, film([snake(0)], TABLE), OPTIONS)
 
 
