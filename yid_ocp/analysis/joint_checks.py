@@ -190,7 +190,8 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
         return
     for j in np.flatnonzero(beyond > margin):
         name, unit = arm.joint_names[j], arm.joints[j].coordinate_unit
-        words = f"{name} is {beyond[j]:.3g} {unit} (tolerated: {margin:g}) beyond {low[j]:.3g} to {high[j]:.3g} {unit}"
+        words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g} {unit}"
+        words += f" ({margin:g} {unit} is tolerated)"
         advice = "check the joint's zero, unit and column, and whether the recording is of this robot"
         yield Issue("angle_limits", words, "not_trusted", beyond[j] / margin, advice, "", channel=f"position.{name}")
 
