@@ -193,7 +193,7 @@ def _summary_lines(
     damping = _value(proposal.urdf_joint_damping)
     lines += [f"damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
-        lines += [f"sensors.{group}: recorded {a} is at {b} of the model ({c})" for a, b, c in _merged_places(places)]
+        lines += [f"sensors.{group}: recorded {a} at {b} of the model ({c})" for a, b, c in _merged_places(places)]
     picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
     for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
         lines.append(f"diagnose will not try {', '.join(kinds)}, because no recording has {signals}")
