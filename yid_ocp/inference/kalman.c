@@ -18,8 +18,7 @@ typedef struct {
     size_t row, column;
 } Matrix;
 
-/* C += sign A B of (m, k) and (k, n), each row of C `width` long; of a square one with `lower` at least what is not right
- * of its diagonal. The panel has room for k * COLUMNS numbers. */
+/* C += sign A B of (m, k) and (k, n), with `lower` at least its lower triangle. The panel has k * COLUMNS numbers. */
 static void add_product(double sign, Matrix a, Matrix b, int m, int k, int n, int lower, double *c, size_t width,
                         double *panel) {
     for (int first = 0; first < n; first += COLUMNS) {
@@ -65,8 +64,7 @@ typedef struct {
     double *whitening, *projected, *covariance;
 } Filter;
 
-/* The measurement by H (r, NA), P renewed: row by row, as each is whitened by those before it. By the diagonal of the
- * innovations' covariance alone where rounding shows. */
+/* The measurement by H (r, NA), P renewed row by row; by the covariance's diagonal alone where rounding shows. */
 static void measure(const double *H, int r, int na, double *whitening, double *projected, double *P, double *panel) {
     for (int alone = 0, good = 0; !good && alone < 2; alone++) {
         good = 1;
