@@ -103,8 +103,8 @@ def diagnose(
         search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
-        nominal = fit_nominal_model(problem, composed, known_fits.solution, known_fits.store, thresholds)
-        return _diagnosed(problem, _examined(search, nominal), earlier)
+        known = known_fits.solution, known_fits.store, thresholds
+        return _diagnosed(problem, _examined(search, fit_nominal_model(problem, composed, *known)), earlier)
 
 
 @dataclass(frozen=True)
@@ -388,15 +388,17 @@ def _excess_of(residual: Array) -> float:
 
 
 def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
-    search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
-    shifted = earlier.shifted_parameters_with_prior(nominal, limits)
-    evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
-    judged = judge(search, evidence)
-    # after the deadline a search that begins anew would find nothing
-    if time.perf_counter() < search.deadline:
+    anew: _Examined | None = seen
+    while anew:  # no recursion, which would keep what was found before
+        seen = anew
+        search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
+        shifted = earlier.shifted_parameters_with_prior(nominal, limits)
+        evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
+        judged = judge(search, evidence)
+        if not time.perf_counter() < search.deadline:  # a search that begins anew would find nothing
+            break
         anew, judged = _with_changed_parameters(seen, judged, earlier)
-        if anew := anew or _examined_anew(seen, judged):
-            return _diagnosed(problem, anew, earlier)
+        anew = anew or _examined_anew(seen, judged)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):

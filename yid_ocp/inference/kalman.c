@@ -56,8 +56,7 @@ static void add_row(double factor, const double *restrict source, int count, dou
 /* Sizes are steps, NS states, width of a move, NA states and parameters, and NK. Of each step the move (NS, width), which is
  * the state rows of the transition and, behind their NK columns, noise of the states; decay and new variance of the
  * parameters (NA - NS); and of its rows, from row_start on, the observation (rows, NA). Written are the inverse roots of the
- * innovations' covariances, one after another, and the projected covariances (rows, NA); the covariance (NA, NA) is given
- * and renewed. */
+ * innovations' covariances and the projected covariances (rows, NA); the covariance (NA, NA) is given and renewed. */
 typedef struct {
     const int *size, *row_start;
     const double *move, *decay, *variance, *observation;
@@ -159,8 +158,7 @@ int yid_kalman_steps(const Filter *f) {
 /* Columns of measurements along the steps. Forward, `rows` (rows, columns) are measured and become the normalized
  * innovations, `state` (NA, columns) is the mean, to which `push` (steps, NK - NS, columns), if any, is added beside the
  * parameters of a step and `shift` (steps, NA - NS) to the first column's parameters after it. Backward, `rows` are
- * innovations and become the smoothed noise, `state` is the costate. `seen` (steps, NA, columns), if any, takes the means
- * before the steps and the costates after them. */
+ * innovations and become the smoothed noise, `state` is the costate. `seen` (steps, NA, columns), if any, takes both. */
 typedef struct {
     const int *columns;
     double *rows, *state, *seen;
