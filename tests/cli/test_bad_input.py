@@ -56,7 +56,7 @@ def edited(file, old, new):
         ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write the number alone, in Hz")),
         ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "convert it from ms")),
         ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
-        ("path_cutoff: .inf", "time_step: '0.01'", ("time_step", "correct the value")),
+        ("path_cutoff: .inf", "time_step: '0.01'", ("time_step", "agrees with")),
         ("bounds: [0.0, 100.0]", "bounds: [-5.0, 100.0]", ("bounds", "from 0 to inf N m/rad")),
         ("bounds: [0.0, 100.0]", "bounds: [0.0, 0.5]", ("upper bound of 0.5 N", "0 to 0.5 N m/rad")),
         ("bounds: [0.0, 100.0]", "initial: 200, bounds: [0.0, 100.0]", ("upper bound of 100 N", "0 to 100 N m/rad")),

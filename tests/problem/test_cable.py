@@ -222,7 +222,7 @@ def test_edges_are_as_long_as_measured(cable):
         ((PARENT[:4], {}), "4 vertices"),
         ((PARENT, {"c": ("p6", "c1")}), "two or more vertices, the first of them one of "),
         ((PARENT, {"c": ("p3", "c9")}), "no undeformed position of vertex 'c9'"),
-        ((PARENT, {"c": ("p3", "c1"), "d": ("p4", "c1")}), "two branches"),
+        ((PARENT, {"c": ("p3", "c1"), "d": ("p4", "c1")}), "listed twice"),
     ],
 )
 def test_a_cable_that_does_not_fit_together_is_refused(arguments, text):

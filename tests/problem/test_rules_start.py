@@ -226,7 +226,7 @@ def test_a_start_at_rest_that_does_not_exist_is_said(step):
     theta = problem.system.parameters.vector() * 1.0
     theta[problem.system.parameters.index("elbow.rest")] = 1e8
     start = problem.predictor.initial_state_and_derivative(problem.episodes[0], theta)
-    assert start.failure_message.startswith("run_4: no equilibrium")
+    assert start.failure_message.startswith("in 'run_4', no equilibrium")
     assert start.state_sensitivity.shape == (4, 1)
     assert not start.equilibrium.is_converged
 
