@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.analysis.discretisation import min_gap_by_grasp_at_robot_posture, step_map_natural_frequencies
+from yid_ocp.analysis.discretisation import min_gap_by_grasp_at_robot_posture
 from yid_ocp.analysis.step_diagnostics import (
     equations_and_sensors_per_parameter,
     step_complexity_summary,
     step_equation_jacobians_at_state,
+    step_map_natural_frequencies,
 )
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording

@@ -124,10 +124,8 @@ def add_discretisation_errors(
     uncounted = tuple(words for kind, words in UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
         uncounted = tuple(words for words in uncounted if words != UNCOUNTED_ERROR_TEXTS["links"])
-    checks = uncertainty.EstimateChecksBeyondFit(
-        discretisation_shifts=shifts, notes=tuple(notes), uncounted_errors=uncounted
-    )
-    return replace(solution, parameters=inflated), checks
+    checks = uncertainty.EstimateChecksBeyondFit(discretisation_shifts=shifts, notes=tuple(notes))
+    return replace(solution, parameters=inflated), replace(checks, uncounted_errors=uncounted)
 
 
 def _checked_solution_and_issues(

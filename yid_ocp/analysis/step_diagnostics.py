@@ -1,8 +1,9 @@
-"""Diagnostics of a compiled step: number of operations, sparsity patterns, and parameters that sensors observe."""
+"""Diagnostics of a step: number of operations, sparsity patterns, observed parameters, and natural frequencies."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -13,8 +14,11 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
+from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
+from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import StepResidualsAndJacobians
+from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import sensor_function_with_jacobians
 
@@ -291,3 +295,63 @@ def _inverse_sparsity(mask: BoolArray) -> BoolArray:
 def _times(a: BoolArray, b: BoolArray) -> BoolArray:
     product: BoolArray = (a.astype(np.float32) @ b.astype(np.float32)) > 0
     return product
+
+
+_DAMPING_PARAMETERS = ("damping", "twist_damping")
+
+
+@dataclass(frozen=True)
+class UndampedStepMapFrequencies:
+    """The natural frequencies of a system near an equilibrium, as the integrator reproduces them with a fixed robot.
+
+    `n_unstable_modes` counts the modes that grow from step to step although damping is included: the equilibrium is
+    unstable, or the time step is too long for the tension of the object.
+    """
+
+    frequencies_hz: Array  # without damping, ascending, shape (k,)
+    n_unstable_modes: int = 0
+    message: str = ""  # reason if there are no frequencies
+
+
+def step_map_natural_frequencies(
+    system: System,
+    configuration: Mapping[str, float],
+    theta: Array,
+    time_step: float,
+    force_split: ForceSplit = "symmetric",
+    constraint_force_at: ConstraintForcePlacement = "midpoint",
+    guess: Array | None = None,
+) -> UndampedStepMapFrequencies:
+    """Compute the natural frequencies that the integrator reproduces near an equilibrium of a system.
+
+    The frequencies follow from the eigenvalues of the linearised step without damping. The driven and prescribed
+    coordinates are fixed at `configuration` [rad or m]. The search for the equilibrium starts at `guess` (n,).
+    `force_split` and `constraint_force_at` are as in `compile_step`: the midpoint rule lowers a frequency f to
+    atan(pi f h)/(pi h), with the time step h, and the force split affects only the growth of modes.
+    """
+    still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
+    if not still.unprescribed_coordinate_indices:
+        held = "none, because every coordinate is driven or prescribed"
+        return UndampedStepMapFrequencies(np.zeros(0), message=held)
+    step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
+    known = np.array([configuration[name] for name in still.prescribed])
+    rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
+    if not rest.is_converged:
+        return UndampedStepMapFrequencies(np.zeros(0), message=rest.message)
+    damps = [name.rpartition(".")[2] in _DAMPING_PARAMETERS for name in system.parameters.names]
+    undamped = np.where(damps, 0.0, theta)
+    angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
+    turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
+    growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
+    return UndampedStepMapFrequencies(turning / (2 * math.pi * time_step), growing)
+
+
+def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:
+    """Return the eigenvalues of the state's Jacobian A at an equilibrium, without those of the constraints."""
+    n = step.system.n_coordinates
+    q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
+    a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
+    free = np.array(step.system.unprescribed_coordinate_indices)
+    rows = np.concatenate([free, n + free])
+    values: Array = np.linalg.eigvals(a[np.ix_(rows, rows)])
+    return values[np.abs(values) > 0.2]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis import discretisation
+from yid_ocp.analysis import discretisation, step_diagnostics
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, SensorChannelGroup
@@ -207,7 +207,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         posture = dict(zip(names, map(float, first.initial_known_coordinates), strict=True)) if names else {}
         theta = problem.predictor.theta_with_episode_values(first, theta)
         guess = None if first.fixed_initial_state is None else first.fixed_initial_state.state[: system.n_coordinates]
-    frequencies = discretisation.step_map_natural_frequencies
+    frequencies = step_diagnostics.step_map_natural_frequencies
     own = frequencies(system, posture, theta, h, *rule, guess)
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
@@ -230,7 +230,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     return {"links": rows, "time_step": steps, "message": ""}
 
 
-def _row(value: float, found: discretisation.UndampedStepMapFrequencies) -> dict[str, Any]:
+def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> dict[str, Any]:
     hertz = found.frequencies_hz[:_N_MODES].tolist()
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 
