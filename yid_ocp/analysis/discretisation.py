@@ -114,7 +114,8 @@ def _gauss_newton_step_in_finer_model(
 
     Returns the shift of each shared free parameter, the linearised residual after the step and the fine evaluation, or
     a message if the step fails. `at_x` is the coarse evaluation at `x`. With `model_difference_only`, for points that
-    are no estimate, coarse predictions replace the data. With process noise, Jacobian and priors are coarse.
+    are no estimate, coarse predictions replace the data. With process noise, or the same links and samples, Jacobian
+    and priors are coarse.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -123,11 +124,12 @@ def _gauss_newton_step_in_finer_model(
     own, other = problem.residual_rows, coarse.residual_rows
     if (model_difference_only and own != other) or (weighted and own.measurements != other.measurements):
         return "the finer model does not have the same samples and priors, so the two cannot be compared"
-    evaluation = problem.evaluate(point, derivatives=not weighted, equilibrium_guesses=warm)
+    is_alike = weighted or (not refined.subdivided_joints and own.measurements == other.measurements)
+    evaluation = problem.evaluate(point, derivatives=not is_alike, equilibrium_guesses=warm)
     residual, jacobian = evaluation.residual, evaluation.jacobian
     if not evaluation.ok:
         return evaluation.message
-    if weighted:
+    if is_alike:
         problem, point, jacobian = coarse, x, at_x.jacobian
         residual = np.concatenate([residual[other.data], at_x.residual[other.data.stop :]])
     if model_difference_only:
@@ -137,7 +139,7 @@ def _gauss_newton_step_in_finer_model(
     low, high = ((bound - point) / scale for bound in problem.bounds)
     step = scale * bounded_levenberg_marquardt_step(jacobian * scale, residual, 0.0, low, high)
     moved = dict(zip(problem.unknown_names, map(float, step), strict=True))
-    factors = {name: 1.0 if weighted else refined._factor(name) for name in problem.shared_parameters}
+    factors = {name: 1.0 if is_alike else refined._factor(name) for name in problem.shared_parameters}
     return {name: moved[name] / factor for name, factor in factors.items()}, residual + jacobian @ step, evaluation
 
 
