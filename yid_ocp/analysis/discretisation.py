@@ -13,13 +13,13 @@ import scipy.optimize
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.effects import EffectBase, make_effect
+from yid_ocp.effects import EffectBase
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.null_test import episodes_with_noisier_motion
 from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation, ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import problem_with_whitening_at
-from yid_ocp.integrator.step import Step, compile_step_like, simulate, step_with_time_step
+from yid_ocp.integrator.step import Step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK
@@ -381,16 +381,14 @@ def _refined_problem(
     recordings = [episode.recording for episode in problem.episodes]
     factors = fine.parameter_factors
     if step is None:
-        step = step_with_time_step(fine.build_step(problem.step.is_compiled), problem.step.time_step)
-        own = [make_effect(effect.kind, effect.location, step.system) for effect in effects]
-        step = compile_step_like(step, step.system.with_effects(own)) if own else step
+        step = step_with_time_step(fine.build_step(problem.step.is_compiled, effects), problem.step.time_step)
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     joint = options.multivariate_prior.with_parameters_scaled_by(factors)
     options = replace(options, prior_stds=priors, multivariate_prior=joint)
     # also the centre of priors
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
     values = {name: known[name] * factors.get(name, 1.0) for name in step.system.parameters.names if name in known}
-    made = EstimationProblem(step, recordings, problem.free, options, values, held_out)
+    made = EstimationProblem(step, recordings, problem.free, options, values, held_out, like=problem)
     return _FinerModel(made, factors, _fine_joints_by_coarse_joint(problem.system, step.system))
 
 

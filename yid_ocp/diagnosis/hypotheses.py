@@ -152,7 +152,7 @@ class AllCandidatesProblem:
             raise DataError(what, where="held_out", allowed="held-out recordings of other motions", hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
-        made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
+        made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra, problem)
 
         def functions(key: tuple[tuple[str, ...], float]) -> ModelFunctions:
             labels, time_step = key

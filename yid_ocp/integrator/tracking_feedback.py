@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
+import scipy.linalg.lapack
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
@@ -82,7 +83,9 @@ def lqr_tracking_feedback(
     for k in reversed(range(steps)):
         a, b, stage = by_state[k], by_torque[k], stages[k]
         cost = stage if cost is None else cost
-        gain[k] = np.linalg.solve(weight_u + b.T @ cost @ b, b.T @ cost @ a)
+        pushed = b.T @ cost
+        _, gain[k], failed = scipy.linalg.lapack.dposv(weight_u + pushed @ b, pushed @ a)
+        gain[k] = np.nan if failed else gain[k]
         closed = a - b @ gain[k]
         cost = stage + closed.T @ cost @ closed + gain[k].T @ weight_u @ gain[k]
         cost = 0.5 * (cost + cost.T)

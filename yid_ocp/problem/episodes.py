@@ -205,12 +205,18 @@ class Episode:
 
 
 def prepare_episode(
-    functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array, free: Sequence[str]
+    functions: ModelFunctions,
+    recording: Recording,
+    options: ProblemOptions,
+    theta: Array,
+    free: Sequence[str],
+    like: Episode | None = None,
 ) -> Episode:
     """Prepare a recording for prediction: place its inputs and measurements on the nodes of a time grid.
 
     The nominal parameters `theta` are used to convert encoder noise to effort and to compute the tracking filter's
-    gains. Raises `DataError` if the recording does not fit the model, is too short, or has no noise level.
+    gains; those of `like`, an episode with the same arms, are taken if its motion and torques are the same. Raises
+    `DataError` if the recording does not fit the model, is too short, or has no noise level.
     """
     step, system = functions.step, functions.step.system
     efforts = options.sensors.get(joint_sensors.JOINT_EFFORT_SENSOR_KEY, SensorOptions())
@@ -247,6 +253,13 @@ def prepare_episode(
         errors = _recorded_input_errors(recording, system, grid, options.sensors, samples)
     inputs = (recording, grid, torque, path, np.concatenate([arm[0], path[0]]), arm)
     episode = Episode(*inputs, samples, load, smooth, None, known_parameters, errors, start)
+    if like is not None and like.grid == grid:
+        pairs = (like.torque, torque), (like.smoothed_driven_angles, smooth), (like.measured_driven_angles, arm)
+        if all(np.array_equal(*pair) for pair in pairs):
+            arms = np.array(system.actuated_coordinate_indices, np.int32)
+            index, loop = np.concatenate([arms, system.n_coordinates + arms]), like.tracking_feedback
+            loop = loop and replace(loop, state_indices=index[: len(loop.state_indices)])
+            return replace(episode, tracking_feedback=loop)
     return _tracked(episode, functions, options, theta)
 
 

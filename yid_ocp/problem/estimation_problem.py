@@ -77,6 +77,8 @@ class EstimationProblem(ReprMixin):
         Recordings not used by the fit, only predicted by `predict_held_out`.
     may_free : sequence of str, optional
         Further parameters that `with_free_parameters_without_recompiling` can free.
+    like : EstimationProblem, optional
+        A problem of the same arms, at the same values. What it knows of the same recordings is not computed again.
 
     Attributes
     ----------
@@ -115,6 +117,7 @@ class EstimationProblem(ReprMixin):
         values: Mapping[str, float] | None = None,
         held_out: Sequence[Recording] = (),
         may_free: Sequence[str] = (),
+        like: EstimationProblem | None = None,
     ) -> None:
         options = options or ProblemOptions()
         if not options.path_cutoff:
@@ -127,11 +130,22 @@ class EstimationProblem(ReprMixin):
         names = (*free, *(name for name in may_free if name not in free))
         functions = ModelFunctions(step, names, options.initial_state_fit_parameters)
         check_initial_values_and_bounds(step.system, free, theta)
-        prepare = partial(prepare_episode, functions, options=options, theta=theta, free=free)
-        episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
+        known = {} if like is None else {own.name: own for own in (*like.episodes, *like.held_out)}
+        episodes, others = (
+            tuple(prepare_episode(functions, own, options, theta, free, known.get(own.name)) for own in group)
+            for group in (recordings, held_out)
+        )
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
-        finish = partial(episode_with_equilibrium_guess, self.predictor, theta=theta)
+
+        def finish(episode: Episode) -> Episode:
+            own, system, same = known.get(episode.name), self.system, like and like.system
+            if not (same and own) or own.equilibrium_guess is None or same.segment_layouts != system.segment_layouts:
+                return episode_with_equilibrium_guess(self.predictor, episode, theta)
+            guess = np.zeros(system.n_coordinates)  # joints of neutral effects are at rest
+            guess[[system.mechanism.joint_index(name) for name in same.mechanism.joint_names]] = own.equilibrium_guess
+            return replace(episode, equilibrium_guess=guess)
+
         ready, other = (tuple(map(finish, group)) for group in (fitted, others))
         check_unique_recording_names([episode.name for episode in ready])
         check_no_known_value_of_free_parameters((*ready, *other), free)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import Issue
+from yid_ocp.effects.base import EffectBase
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.objects.base import CableVertices, ClampPosePointNames
 from yid_ocp.options import OptionInfo
@@ -58,7 +59,7 @@ class ExcessResidualCriteria:
 class DividedLinksModel:
     """A model of the object with each link divided in two. `parameter_factors` on parameters keep the stiffness."""
 
-    build_step: Callable[[bool], Step]  # function of whether the step is compiled
+    build_step: Callable[[bool, Sequence[EffectBase]], Step]  # of whether it is compiled, and of further effects
     parameter_factors: Mapping[str, float]
 
 

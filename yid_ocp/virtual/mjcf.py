@@ -75,7 +75,9 @@ class CasadiEvaluator:
 
     def __call__(self, expression: ca.SX) -> Array:
         """Values of an expression that depends on parameters only."""
-        return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
+        is_constant = expression.is_constant()  # no function then, which costs far more than its value
+        made = expression if is_constant else ca.Function("value", [self._symbols], [expression])(self._theta)
+        return np.array(ca.densify(ca.DM(made))).ravel(order="F")
 
     def is_effect_neutral(self, effect: Effect) -> bool:
         """Whether an effect changes nothing, because all its amplitudes have their neutral values."""

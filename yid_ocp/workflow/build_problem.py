@@ -24,6 +24,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, Issue, typical_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
 from yid_ocp.data.recording import Recording
+from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model import System
@@ -111,9 +112,11 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
     )
 
 
-def _divided_links_step(run: RunSettings, is_compiled: bool) -> Step:
+def _divided_links_step(run: RunSettings, is_compiled: bool, effects: Sequence[EffectBase]) -> Step:
     settings = replace(run, problem=replace(run.problem, use_compiler=is_compiled))
-    return build_step(settings, build_system(run, link_division=2))
+    system = build_system(run, link_division=2)
+    own = [make_effect(effect.kind, effect.location, system) for effect in effects]
+    return build_step(settings, system.with_effects(own) if own else system)
 
 
 def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> None:

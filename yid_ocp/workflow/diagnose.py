@@ -18,7 +18,7 @@ from yid_ocp import files
 from yid_ocp.analysis.estimation import UNCOUNTED_ERROR_TEXTS
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
-from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
@@ -69,8 +69,8 @@ def run_diagnose(
 ) -> CommandOutcome[DiagnosisResult]:
     """Run a diagnosis and write the run folder. Finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
-        folder.record_run_start(run, "diagnose", _flags(run))
-        made_from = folder.input_hashes, config_yaml_with_defaults(run), software_and_plugin_versions()
+        settings_yaml = folder.record_run_start(run, "diagnose", _flags(run))
+        made_from = folder.input_hashes, settings_yaml, software_and_plugin_versions()
         refits = _SingleJsonFileRefitStore(folder, *made_from)
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step", ahead=24.5)

@@ -46,9 +46,12 @@ class RunFolder:
     _command_line: str = ""
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
-    def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
-        """Write config.yaml, hash the input files, and log the start of a command. Errors: `input_files_by_name`."""
-        write_text(self.path / "config.yaml", config_yaml_with_defaults(run))
+    def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> str:
+        """Write config.yaml, hash the input files, and log the start of a command. Errors: `input_files_by_name`.
+
+        Returns the text of config.yaml.
+        """
+        write_text(self.path / "config.yaml", text := config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
         said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.config_file]
@@ -56,6 +59,7 @@ class RunFolder:
             near = os.path.relpath(self.final_path)
             said = [str((self.final_path if near.startswith("..") else Path(near)) / "config.yaml")]
         self.log_command_start([command, *said, *flags])
+        return text
 
     def log_command_start(self, words: Sequence[str]) -> None:
         """Log the start of a command and its inputs. The command line `yid-ocp` with `words` reproduces its result."""
