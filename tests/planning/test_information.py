@@ -277,7 +277,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_
         ({"parameters_to_identify": FREE, "effects_to_discriminate": ("joint_viscous@elbow",)}, ("one of the two",)),
         (
             {"effects_to_discriminate": ("joint_viscous@elbow",)},
-            ("effects to discriminate has 1 effects", "plan.effects_to_discriminate", "two effects or more"),
+            ("two effects are needed, but the list has 1", "plan.effects_to_discriminate", "two effects or more"),
         ),
         ({"effects_to_discriminate": ("joint_viscous", "joint_coulomb@elbow")}, ("has no location", "KIND@LOCATION")),
         ({"effects_to_discriminate": ("joint_viscus@elbow", PAIR[0])}, ("no effect 'joint_viscus'", "joint_viscous")),

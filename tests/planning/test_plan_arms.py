@@ -103,7 +103,7 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
 
 
 def test_an_arm_that_holds_nothing_cannot_move_the_object(repository, tmp_path):
-    with pytest.raises(ConfigError, match=r"(?s)no arm moves 'w_T3'.*model\.grasp"):
+    with pytest.raises(ConfigError, match=r"(?s)no joint moves the point 'w_T3'.*model\.grasp"):
         planned(repository, tmp_path, "plan_place", "model.object.links=1", "model.grasp={}")
 
 

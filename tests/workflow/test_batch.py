@@ -175,7 +175,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
     judged = blind.rescore_blind(folder, tmp_path / "judged").result
     told = ("verdict", "answer", "confusable", "right", "location_first")
     assert [[own[key] for key in told] for own in judged["marks"]] == [[own[key] for key in told] for own in marks]
-    with pytest.raises(OutputError, match=r"other cases \(2 cases, seed 3, for report\): other purpose"):
+    with pytest.raises(OutputError, match=r"another blind test \(2 cases, seed 3, for report\).*in: purpose"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor(), purpose="calibration")
     (folder / "sealed" / "labels.json").write_bytes(text.replace(b"case_001", b"case_002"))
     with pytest.raises(DataError, match="do not match the hashes"):
@@ -188,7 +188,7 @@ def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, printed, m
         run_blind([prescribed], tmp_path / "proof", 2, 3, workers=InlineExecutor())
     with pytest.raises(ConfigError, match="two configurations have the name pendulum"):
         run_blind([driven, driven], tmp_path / "proof", 2, 3, workers=InlineExecutor())
-    with pytest.raises(ConfigError, match="seed = -1"):
+    with pytest.raises(ConfigError, match="seed is -1, but must be at least 0"):
         run_blind([driven], tmp_path / "proof", 2, -1, workers=InlineExecutor())
     assert not (tmp_path / "proof").exists()
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks._CONNECT_TIMEOUT", 0.5)

@@ -87,7 +87,7 @@ SHORT = np.arange(0, 2, 1 / RATE)
 
 def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
-    assert "recorded m1 at cable:50% of the model" in capsys.readouterr().out
+    assert "the model predicts m1 at cable:50%" in capsys.readouterr().out
     run = load_config("run.yaml")
     assert (run.model.arms.mode, run.model.arms.joints) == ("prescribed", ("roll", "pitch"))
     assert (run.problem.time_step, run.problem.initial_state) == (pytest.approx(0.008), "equilibrium")
@@ -134,7 +134,7 @@ def test_the_first_lines_of_the_readme_run_as_printed(bench: Path, repository: P
 def test_a_page_shows_what_was_guessed_before_the_fit(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Arm, unbent object and markers in motion, markers under the names of their frames, so that lines join the two."""
     assert init(*CABLE) == 0
-    assert "picture of the guesses: run.html" in capsys.readouterr().out
+    assert "please check these choices in the picture run.html" in capsys.readouterr().out
     page = Path("run.html").read_text()
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
     model, measured = scene["scenes"][0]["motions"]
@@ -191,7 +191,7 @@ def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.
     for end, holder, others in (("mount", "mount", "hub"), ("finger", "hub", "finger, mount")):
         (bench / "wrist.urdf").write_text((bench / "wrist.urdf").read_text().replace("</robot>", fixed.format(end)))
         assert proposed(moved(SHORT)).model.object.mount.parent_frame == holder
-        assert f"object held by: {holder} (frames there for --holder: {others})" in capsys.readouterr().out
+        assert f"object held by: {holder} (other frames for --holder: {others})" in capsys.readouterr().out
 
 
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
@@ -428,18 +428,18 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "equal branches without a mass": (("--object", "tree", "--branches", "4", *ONE[:2]), "needs a mass", "--mass"),
     "branch of two numbers": (("--object", "tree", "--branch", "a=1,2"), "does not describe a branch", "NAME=LENGTH"),
     "branch of no size": (("--object", "tree", "--branch", "a=1,0,1"), "not above 0", "--branch"),
-    "branches of a cable": ((*CABLE, "--branch", "a=1,1,1"), "a cable has no branches", "--object tree"),
+    "branches of a cable": ((*CABLE, "--branch", "a=1,1,1"), "the object 'cable' has no branches", "--object tree"),
     "branch on nothing": (("--object", "tree", "--branch", "a@b=1,1,1"), "grows on 'b', which", "--branch"),
     "branches of one name": ((*TREE, "--branch", "a=1,1,1"), "two branches are called 'a'", "--branch"),
-    "negative length": ((*CABLE, "--length", "-1"), "the length is -1", "--length"),
+    "negative length": ((*CABLE, "--length", "-1"), "length is -1, not above 0", "--length 0.1"),
     "grams": ((*CABLE, "--mass", "50"), "'cable' has the density 2e+06 kg/m^3", "--mass"),
-    "too many links": ((*CABLE, "--links", "99"), "99 links", "--links"),
+    "too many links": ((*CABLE, "--links", "99"), "--links is 99", "--links"),
     "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
-    "other number": (("--object", "tapered_rod", "--number", "tip_radus=1"), "is not an additional", "'tip_radius'?"),
-    "number alone": (("--object", "tapered_rod", "--number", "tip_radius"), "not an additional", "tip_radius=NUMBER\n"),
+    "other number": (("--object", "tapered_rod", "--number", "tip_radus=1"), "not a NAME=NUMBER of", "'tip_radius'?"),
+    "number alone": (("--object", "tapered_rod", "--number", "tip_radius"), "not a NAME=NUMBER of", "tip_radius=0.1\n"),
     "grasp of no point": ((*CABLE, "--grasp", "hub"), "is not FRAME=POINT", "FRAME=POINT"),
-    "import flags of a recording": ((*CABLE, "--units", "deg"), "is a recording already", "import the original"),
+    "import flags of a recording": ((*CABLE, "--units", "deg"), "is a recording already", "give the original file"),
 }  # fmt: skip
 
 
@@ -462,10 +462,10 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     assert "the robot has no joint that can move" in refusal("one.h5", robot="package:quadrotor_base")
     (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))
     told = refusal("bag.csv")
-    assert re.search("(?s)none of the recorded joints is in the URDF: shoulder.*--joints shoulder=roll", told)
+    assert re.search("(?s)none of the recorded joints is a joint of the robot: shoulder.*--joints shoulder=roll", told)
     (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
     write_recording(moved(SHORT), bench / "one.h5")
-    assert "the recording lacks joint 'pitch', which one has" in refusal("one.h5", "bag.csv")
+    assert "the recording lacks the joint 'pitch', which one has" in refusal("one.h5", "bag.csv")
     assert not (bench / "bag.h5").exists()
     (bench / "run.yaml").write_text("kept: true\n")
     assert "already exists" in refusal("one.h5")

@@ -106,7 +106,8 @@ def plan_informative_motion(
     begins = [_smooth(experiment, search.shrink_coefficients_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
         what, allowed = "none of the random initial motions keeps the limits", "limits within which the arms can move"
-        raise ConfigError(what, where="plan.limits", allowed=allowed, hint="widen plan.limits, or plan.duration")
+        hint = "raise plan.limits.max_acceleration, velocity_fraction or effort_fraction, or plan.duration"
+        raise ConfigError(what, where="plan.limits", allowed=allowed, hint=hint)
     unseen = _unseen(experiment, [rows for _, rows in begins])
     _check_seen(chosen, rivals, unseen, experiment)
     found = []
@@ -129,13 +130,13 @@ def _chosen(
         return (), _effects(problem, effects, sizes)
     wanted = problem.free if sought is None else sought
     if not wanted:
-        what, hint = f"{where} is empty", "list the parameters, or set parameters.NAME.free: true"
+        what, hint = f"{where} is empty", "list free parameters, or remove the key: then all free ones are used"
         raise ConfigError(what, where=where, allowed=", ".join(problem.free) or "free parameters", hint=hint)
     for name in wanted:
         require_known_names([name], problem.system.parameters.names, "parameter", where, ConfigError)
         if name not in problem.free:
             hint, allowed = f"set parameters.{name}.free: true", ", ".join(problem.free)
-            raise ConfigError(f"'{name}' is not a free parameter", where=where, allowed=allowed, hint=hint)
+            raise ConfigError(f"the parameter '{name}' is not free", where=where, allowed=allowed, hint=hint)
     return wanted, ()
 
 
@@ -144,8 +145,8 @@ def _effects(
 ) -> tuple[EffectBase, ...]:
     where = "plan.effects_to_discriminate"
     if len(set(labels)) < 2:
-        what, hint = f"the list of effects to discriminate has {len(set(labels))} effects", "list two effects or more"
-        raise ConfigError(what, where=where, allowed="two effects or more, each KIND@LOCATION", hint=hint)
+        what, hint = f"two effects are needed, but the list has {len(set(labels))}", "list the effects to compare"
+        raise ConfigError(what, where=where, allowed="two effects or more, such as joint_coulomb@JOINT", hint=hint)
     there = {f"{effect.kind}@{effect.location}" for effect in problem.system.effects}
     found = []
     for label in dict.fromkeys(labels):
@@ -188,9 +189,10 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
     for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
         if not low <= 0.0 <= high:
-            what = f"joint {name} starts {max(low, -high):.3g} rad or m beyond its position limit"
+            unit = next(joint.coordinate_unit for joint in mover.step.system.mechanism.joints if joint.name == name)
+            what = f"joint {name} starts {max(low, -high):.3g} {unit} beyond its position limit"
             allowed = "start positions within the position limits of the joints"
-            hint = "set plan.start_joint_positions within the limits"
+            hint = f"set plan.start_joint_positions.{name} to a position within its limits"
             raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
     values, _ = limits.constraints_and_jacobian(mover.simulate_path(still), still)
     if broken := limits.worst_value_and_bound_by_violated_limit(values):
@@ -282,14 +284,14 @@ def _plan(
     best = int(np.argmax([one.configured_criterion for one in judged]))
     chosen = judged[best]
     if not np.isfinite(chosen.configured_criterion):
-        what, hint = "no planned motion can be simulated by its torques", "lower plan.limits.max_acceleration"
+        what, hint = "the model cannot follow any planned motion by its torques", "lower plan.limits.max_acceleration"
         raise SolverError(what, where="plan", allowed="a motion that the model follows with its torques", hint=hint)
     w, message = chosen.w, "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
         way = "lower plan.limits, or set another plan.start_joint_positions"
-        message = f"the search could not improve the best of its random initial motions; {way}"
+        message = f"the search could not improve the best of its random initial motions, which is the result; {way}"
     elif not chosen.is_converged:
-        message = f"the search was stopped after {chosen.n_iterations} rounds; raise plan.max_iterations"
+        message = f"the search ended after {chosen.n_iterations} rounds, before it converged; raise plan.max_iterations"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(

@@ -321,9 +321,11 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
     chosen = np.array([float(posture[name]) for name in system.prescribed])
     for name, value, low, high in zip(system.prescribed, chosen, *_position_limits(system), strict=True):
         if not low - 1e-9 <= value <= high + 1e-9:
+            unit = system.mechanism.joints[system.mechanism.joint_index(name)].coordinate_unit
             over = low - value if value < low else value - high
-            what = f"joint {name} starts at {value:.4g}, which is {over:.3g} beyond its limit (rad or m)"
-            raise ConfigError(what, where=f"{where}.{name}", allowed=f"{low:.4g} to {high:.4g} rad or m")
+            what = f"joint {name} starts at {value:.4g} {unit}, which is {over:.3g} beyond its limit"
+            allowed, hint = f"{low:.4g} to {high:.4g} {unit}", f"set {where}.{name} to a position within its limits"
+            raise ConfigError(what, where=f"{where}.{name}", allowed=allowed, hint=hint)
     return chosen
 
 
@@ -377,7 +379,7 @@ def solve_equilibrium_at_point_target(
         return where[0, :3], by_q[0, :3] @ rest.state_by_known_coordinates[:n]
 
     if np.abs(point_and_slope(start)[1]).max(initial=0.0) < _MIN_POINT_MOBILITY:
-        what, allowed = f"no arm moves '{point.names[0]}'", "a frame of a moving link or of a grasped object"
+        what, allowed = f"no joint moves the point '{point.names[0]}'", "a frame of a moving link or a grasped object"
         raise ConfigError(what, where="plan.point", allowed=allowed, hint="set model.grasp, or choose another point")
     guess = [start.state[:n]]
 

@@ -78,7 +78,7 @@ def plan_motion_to_target(
     check_option_bounds(options, "plan")
     system = step.system
     if system.driven or not system.prescribed:
-        what, hint = "the model has no arm with prescribed joints", "set model.robot, and model.arms.mode: prescribed"
+        what, hint = "the model has no arm with prescribed joints", "set model.robot and model.arms.mode: prescribed"
         what = f"joint '{system.driven[0]}' is driven, not prescribed" if system.driven else what
         raise ConfigError(what, where="plan", allowed="a robot whose arm joints are all prescribed", hint=hint)
     known = ParameterCovarianceBeforePlan() if known is None else known
@@ -114,7 +114,7 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
         return start_joint_positions_as_array(system, options.start_joint_positions)
     if not system.grasps:
         what, where = "the start positions of the joints are not given", "plan.start_joint_positions"
-        hint = f"set {where}, or set model.grasp, from which start positions follow"
+        hint = f"set {where}: {{JOINT: POSITION}}, or set model.grasp, from which start positions follow"
         raise ConfigError(what, where=where, allowed="a start position of every joint that moves", hint=hint)
     angles = grasping_joint_angles(system, dict(zip(system.parameters.names, map(float, theta), strict=True)))
     return start_joint_positions_as_array(system, {name: angles[name] for name in angles if name in system.prescribed})
@@ -122,7 +122,7 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
 
 def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
     if options.point is None:
-        allowed, hint = unknown_name_error_arguments("", system.point_frames)["allowed"], "set plan.point"
+        allowed, hint = unknown_name_error_arguments("", system.point_frames)["allowed"], "set plan.point: FRAME"
         raise ConfigError("plan.point is missing", where="plan.point", allowed=allowed, hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
@@ -134,12 +134,13 @@ def _place(options: PlanOptions, begin: Array) -> Array:
     target = options.target_position
     if (target is None) == (options.point_target_offset_from_start is None):
         keys = "plan.target_position", "plan.point_target_offset_from_start"
-        hint = f"set only {keys[0]}: [x, y, z] (in the world, m), or only {keys[1]}: [dx, dy, dz] (m)"
+        hint = f"set only {keys[0]}: [x, y, z] (m in the world), or only {keys[1]}: [dx, dy, dz] (m)"
         what = f"the target of the point '{options.point}' is {'not given' if target is None else 'given twice'}"
-        raise ConfigError(what, where=", ".join(keys), allowed="one of the two keys", hint=hint)
+        raise ConfigError(what, where=", ".join(keys), allowed="exactly one of the two keys", hint=hint)
     if options.goal == "path" and not options.point_waypoint_offsets_from_start:
-        what, hint = "the path has no waypoints", "list offsets from the start [m], such as [[0, 0, 0.1]]"
-        raise ConfigError(what, where="plan.point_waypoint_offsets_from_start", allowed="one or more", hint=hint)
+        what, hint = "plan.goal is path, but the path has no waypoints", "list them, such as [[0, 0, 0.1]]"
+        where, allowed = "plan.point_waypoint_offsets_from_start", "one or more offsets from the start [m]"
+        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if target is not None:
         return np.array(target, float)
     return begin + np.array(options.point_target_offset_from_start, float)
@@ -149,11 +150,11 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
     """Raise `ConfigError` without a valid box, or if the target `place` or a start position in `at` is outside it."""
     if options.box is None:
         what, hint = "plan.goal is box, but plan.box is not set", "set plan.box, or plan.goal: place"
-        raise ConfigError(what, where="plan.box", allowed="the lowest and the highest corner [m]", hint=hint)
+        raise ConfigError(what, where="plan.box", allowed="[[x, y, z], [x, y, z]], lowest and highest [m]", hint=hint)
     low, high = np.array(options.box)
     if np.any(low >= high):
         worst = int(np.argmin(high - low))
-        what = f"the box is empty along {'xyz'[worst]}: it goes from {low[worst]:.4g} up to {high[worst]:.4g} m"
+        what = f"the box is empty, because its {'xyz'[worst]} goes from {low[worst]:.4g} m up to {high[worst]:.4g} m"
         raise ConfigError(what, where="plan.box", allowed="the lowest corner first", hint="exchange the two numbers")
     places = [(name, x, "starts") for name, x in zip(inside.names, at, strict=True)]
     if options.point in inside.names:
@@ -211,7 +212,7 @@ def _scenarios(
     if not len(known.parameter_names):
         what, where = "the uncertainty of the parameters is not known", "plan.minimize_parameter_sensitivity"
         allowed = "false; or true with the run folder of a `solve` under plan.parameter_run_folder"
-        raise ConfigError(what, where=where, allowed=allowed, hint="set plan.parameter_run_folder")
+        raise ConfigError(what, where=where, allowed=allowed, hint="set plan.parameter_run_folder, or set this false")
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
     slope = _point_slopes(rows, rows.quasi_static_coefficients, known)
@@ -255,7 +256,7 @@ def _outcome(
     broken = rows.worst_value_and_bound_by_violated_limit(rows.constraints_and_jacobian(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
-        message += f"; {name} exceeds its limit: {what} reaches {value:.4g}, the limit is {bound:.4g}"
+        message += f"; {name} exceeds its limit: its {what} reaches {value:.4g}, but the limit is {bound:.4g}"
     if not np.all(np.isfinite(rollout.state)):
         message += "; the simulation failed before the end of the motion"
     if broken:

@@ -71,8 +71,8 @@ class SplineMotionExperiment:
                 said, hint = "a plan cannot move clamps that follow recorded points", "let a robot hold the object"
             raise ConfigError(said, where="plan", allowed="robot arms that move, without clamps", hint=hint)
         if system.servos:
-            what = "motions cannot be planned for servos, whose commands differ from their motion"
-            hint = "set model.arms.mode: prescribed for the plan"
+            what = "motions of servos cannot be planned, because their commands differ from their motion"
+            hint = "set model.arms.mode: prescribed for the plan, in which the arms move as planned"
             raise ConfigError(what, where="model.arms.mode", allowed="driven, prescribed", hint=hint)
         moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
         step = problem.step if not system.driven else compile_step_like(problem.step, moved)

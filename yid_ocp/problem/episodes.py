@@ -223,8 +223,8 @@ def prepare_episode(
     recording = recording.with_effort_sampling_kind(efforts.effort_sampling_kind)
     grid = rollout_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
-        what = "the arms of the model are driven, but the recording has no joints"
-        where, hint = f"recording '{recording.name}'", "import the joints too, or set model.arms.mode: prescribed"
+        what = "the arms of the model are driven by torques, but the recording has no joints"
+        where, hint = f"recording '{recording.name}'", "import it together with a file that has its joints"
         raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
     low_pass, clamps = ZeroPhaseLowPassFilter(options.path_cutoff), options.clamp_pose_point_names
     path = prescribed_coordinates_at_nodes(recording, system, grid, low_pass, clamps)
@@ -354,8 +354,8 @@ def _samples(
     samples = tuple(measurements_located_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
         what, where = "no sensor of the model has a measurement in the recording", f"recording '{recording.name}'"
-        allowed = "points on frames of the model, or channels of its joints"
-        raise DataError(what, where=where, allowed=allowed, hint="check `sensors` and the names of the recorded points")
+        hint = "set use: true for a group under `sensors`, or frame_by_recorded_name: {POINT: FRAME} for its points"
+        raise DataError(what, where=where, allowed="points on the model's frames, or channels of its joints", hint=hint)
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
 
 

@@ -124,7 +124,7 @@ class EstimationProblem(ReprMixin):
             options = replace(options, path_cutoff=select_path_cutoff([*recordings, *held_out], step.system.prescribed))
         check_free_parameter_names(step.system, free, options)
         if not recordings:
-            what, hint = "there is no recording to estimate from", "add a recording under recordings.estimate"
+            what, hint = "there is no recording to estimate from", "pass recordings, or list one in recordings.estimate"
             raise DataError(what, where="recordings.estimate", allowed="one recording or more", hint=hint)
         theta = step.system.parameters.vector(values)
         names = (*free, *(name for name in may_free if name not in free))
@@ -391,8 +391,8 @@ def checked_unknowns(problem: EstimationProblem, values: ArrayLike, where: str) 
     """Return an unknown vector (nx,). Raises `ConfigError` for another number of values, or one beyond its bounds."""
     x, names, known = np.array(values, float).ravel(), problem.unknown_names, problem.system.parameters
     if len(x) != len(names):
-        what, hint = f"{len(x)} values for {len(names)} unknowns", "use problem.pack_unknowns({NAME: VALUE, ...})"
-        raise ConfigError(what, where=where, allowed=f"values of {abbreviated_names_text(names)}", hint=hint)
+        what, hint = f"{len(x)} values are given for {len(names)} unknowns", "use problem.pack_unknowns({NAME: VALUE})"
+        raise ConfigError(what, where=where, allowed=f"a value of each of {abbreviated_names_text(names)}", hint=hint)
     for name, value, lower, upper in zip(names, x.tolist(), *problem.bounds, strict=True):
         shared = name.partition("[")[0]
         Parameter(name, value, known[shared].unit if shared in known else "1", lower, upper)  # checks its bounds

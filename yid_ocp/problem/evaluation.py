@@ -337,8 +337,8 @@ def check_free_parameter_names(system: System, free: Sequence[str], options: Pro
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)
     if twice := [name for name in free if list(free).count(name) > 1]:
-        what, hint = f"the free parameter '{twice[0]}' is listed twice", "delete one of the two"
-        raise ConfigError(what, where="free parameters", allowed="every name once", hint=hint)
+        what, hint = f"the free parameter '{twice[0]}' is listed twice", "delete one of the two entries of free"
+        raise ConfigError(what, where="list of free parameters", allowed="every name once", hint=hint)
     for name in (*options.local_parameters, *options.prior_stds):
         if name not in free:
             noun, where = "value per recording" if name in options.local_parameters else "prior", f"parameters.{name}"
@@ -349,7 +349,7 @@ def check_free_parameter_names(system: System, free: Sequence[str], options: Pro
 def check_unique_recording_names(names: Sequence[str]) -> None:
     """Check that no two estimation recordings have the same name. Raises `ConfigError`."""
     if twice := [name for name in names if names.count(name) > 1]:
-        what, hint = f"two recordings are called '{twice[0]}'", "rename one of the two files"
+        what, hint = f"two recordings are called '{twice[0]}'", "rename one of the two, or leave one out"
         raise ConfigError(what, where="recordings.estimate", allowed="every name once", hint=hint)
 
 
@@ -358,7 +358,7 @@ def check_no_known_value_of_free_parameters(episodes: Iterable[Episode], free: S
     for episode in episodes:
         known = {*episode.known_parameters, *getattr(episode.fixed_initial_state, "fitted_parameters", ())}
         if found := [name for name in free if name in known]:
-            what = f"{found[0]} is free, but this recording has a known value of it"
+            what = f"the parameter '{found[0]}' is free, but the recording has a known value of it"
             allowed, hint = "a parameter is either free or known, not both", f"set parameters.{found[0]}.free: false"
             raise ConfigError(what, where=f"recording '{episode.name}'", allowed=allowed, hint=hint)
 
@@ -370,7 +370,7 @@ def check_initial_values_and_bounds(system: System, free: Sequence[str], theta: 
         replace(entry, value=float(value))  # it checks its bounds
         if not entry.lower < entry.upper:
             what, hint = f"the bounds of {name} are equal: {entry.lower:g}", f"set parameters.{name}.free: false"
-            raise ConfigError(what, where=f"parameters.{name}.bounds", allowed="lower below upper", hint=hint)
+            raise ConfigError(what, where=f"parameters.{name}.bounds", allowed="[lower, upper], not equal", hint=hint)
 
 
 def _soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:

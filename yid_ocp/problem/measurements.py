@@ -54,12 +54,12 @@ def rollout_time_grid(recording: Recording, time_step: float, duration: float | 
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
     if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):
-        what = f"{span:.3g} s of data with {len(t)} samples are {steps:.3g} time steps of {time_step:g} s"
+        what = f"{span:.3g} s of data with {len(t)} samples are {steps:.3g} time steps of {time_step:g} s, too many"
         allowed = f"at most {_MAX_STEPS} time steps, and {_MAX_STEPS_PER_SAMPLE} per sample"
-        hint = "check that times are in seconds and the clock does not jump, or cut the recording"
+        hint = "check that times are in seconds and the clock does not jump, or set problem.duration to use less"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if steps < 2:
-        what = f"{span:.3g} s of data are shorter than two time steps"
+        what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"
         hint, allowed = "set a smaller problem.time_step, or record longer", f"at least {2 * time_step:g} s of data"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     return TimeGrid(float(t[0]), time_step, steps)
@@ -232,9 +232,9 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
     """Locate a sensor's samples between rollout nodes. Raises `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
-        what, allowed = "a noise standard deviation is zero or missing", "a standard deviation above 0"
-        place, hint = f"recording '{where}': {data.sensor.group_name}", f"set sensors.{data.sensor.group_name}.std"
-        raise DataError(what, where=place, allowed=allowed, hint=hint)
+        group, allowed = data.sensor.group_name, f"a number above 0 [{data.sensor.unit}]"
+        what, hint = f"a noise standard deviation of {group} is zero or missing", f"set sensors.{group}.std: NUMBER"
+        raise DataError(what, where=f"recording '{where}': {group}", allowed=allowed, hint=hint)
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
     node, fraction = grid.preceding_node_and_fraction(data.t)
     std = np.where(seen, data.std, np.nan)

@@ -61,21 +61,21 @@ def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Arr
             return group.position[:, [group.names.index(point) for point in points]]
     where = f"recording '{recording.name}'"
     require_known_names(points, recording.point_names, "point", where, DataError)
-    what, hint = f"no point group contains all of {', '.join(points)}", "put the points of one object in one group"
-    raise DataError(what, where=where, allowed="points of one group", hint=hint)
+    what = f"the points {', '.join(points)} are in different groups, but one group must have all of them"
+    raise DataError(what, where=where, allowed="points of one group", hint="import these points as one group")
 
 
 def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
     """Measured positions (len(points), 3) [m] in the second frame, from which predictions without a model start."""
     at, where = recorded_point_positions(recording, points), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
-        what, allowed = f"there are {len(at)} frames of the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
-        raise DataError(what, where=where, allowed=allowed, hint="remove it from the list in `recordings`")
+        what, allowed = f"only {len(at)} frames have the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
+        raise DataError(what, where=where, allowed=allowed, hint=f"remove {recording.name} from `recordings`")
     start = np.asarray(at[_GIVEN_FRAMES - 1])
     if not np.all(np.isfinite(start)):
         hidden = points[int(np.argmin(np.isfinite(start).all(axis=1)))]
         what, allowed = f"point '{hidden}' is not seen in frame {_GIVEN_FRAMES}", "a frame with all points of the cable"
-        hint = "cut the recording so that it begins when all points are seen, or omit the point"
+        hint = f"cut the recording so that it begins when all points are seen, or leave '{hidden}' out"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return start
 

@@ -132,7 +132,7 @@ def servo_gain_parameters_by_recording(system: System, recordings: Sequence[Reco
         found[recording.name] = {wanted[name]: float(gains[column]) for name, column in columns.items()}
     if found and silent:
         what = "the recording has no proportional gain of its servos, but others have it"
-        hint = "write the attribute in all recordings, or remove it from all and set parameters `*.servo_gain_factor`"
+        hint = "write the attribute in all recordings, or remove it from all and set parameters.*.servo_gain_factor"
         where = f"recording '{silent[0]}': joints, attribute proportional_gain"
         raise DataError(what, where=where, allowed="the gain in all recordings, or in none", hint=hint)
     return found
@@ -162,7 +162,7 @@ def _courses(
         ]
     if joints.effort is None:
         what, allowed = "joint efforts drive the model, but the recording has none", "the effort of every driven joint"
-        hint = "import the efforts, or set model.arms.mode: prescribed"
+        hint = "import a file with efforts, or set model.arms.mode: prescribed"
         raise DataError(what, where=f"recording '{where}': joints/effort", allowed=allowed, hint=hint)
     effort = joints.effort[:, recorded_joint_column_indices(joints, driven, where)]
     if joints.effort_sampling_kind_or_default == "sample":
@@ -212,7 +212,7 @@ def smoothed_efforts_at_nodes(
     joints = recording.joints
     if joints is None or joints.effort is None:
         what = "the effects series_elasticity and backlash need joint efforts, but the recording has none"
-        where, hint = f"recording '{recording.name}': joints/effort", "record them, or remove both from model.effects"
+        where, hint = f"recording '{recording.name}': joints/effort", "import efforts, or remove these model.effects"
         raise DataError(what, where=where, allowed="the effort of every joint", hint=hint)
     effort = low_pass(joints.t, joints.effort[:, recorded_joint_column_indices(joints, names, recording.name)])
     # the mean of an interval belongs to its centre
@@ -275,7 +275,7 @@ def prescribed_coordinates_at_nodes(
     if remaining := tuple(name for name in system.prescribed if name not in course):
         if recording.joints is None:
             what = f"joint '{remaining[0]}' is prescribed, but the recording has no joints"
-            allowed, hint = "a recording with the group `joints`", "import the joints too, or give another recording"
+            allowed, hint = "a recording with the group `joints`", "import it together with a file that has its joints"
             raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
         sampled = smoothed_joint_angles_at_nodes(recording.joints, remaining, grid, recording.name, low_pass)
         course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
@@ -289,7 +289,7 @@ def _clamp_course(
     direction = _smoothed_point_path(recording, clamp.z_axis_point_name, grid, low_pass) - origin
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if np.any(length < 1e-6):
-        what = f"points '{clamp.origin_point_name}' and '{clamp.z_axis_point_name}' coincide"
+        what = f"points '{clamp.origin_point_name}' and '{clamp.z_axis_point_name}' of a clamp coincide in a frame"
         allowed, hint = "two points at least 1e-6 m apart", "choose other points for this clamp under model.object"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     d = direction / length
@@ -309,6 +309,6 @@ def _smoothed_point_path(recording: Recording, point: str, grid: TimeGrid, low_p
     seen = group.position[:, group.names.index(point)]
     good = np.all(np.isfinite(seen), axis=1)
     if good.sum() < 4:
-        what, hint = f"point '{point}' is seen in {good.sum()} frames", "choose a point that is seen more often"
+        what, hint = f"point '{point}' is seen in {good.sum()} frames, too few", "choose another point for this clamp"
         raise DataError(what, where=f"recording '{recording.name}'", allowed="4 frames or more", hint=hint)
     return _smoothed_at_nodes(group.t[good], seen[good], grid, low_pass)

@@ -20,14 +20,14 @@ from yid_ocp.analysis.run_estimates import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_question
-from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_strict_json
+from yid_ocp.files import file_sha256, to_json_types, write_strict_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.run_folder import current_local_time_text
+from yid_ocp.workflow.run_folder import current_local_time_text, folder_error
 from yid_ocp.workflow.run_history import read_estimates, require_runs_of_one_model, run_drift_and_outliers_to_dict
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve
@@ -73,10 +73,10 @@ def batch_runs_from_configs(
         if not path.is_file():
             near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
             hint, what = nearest_name_question(path.name, near) or "correct the path", "there is no such configuration"
-            raise ConfigError(what, where=str(path), allowed="an existing YAML file", hint=hint)
+            raise ConfigError(what, where=str(path), allowed="the path of an existing YAML file", hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
-            what, allowed = "the configuration is given twice", "every configuration once"
-            raise ConfigError(what, where=str(path), allowed=allowed, hint="remove one of the two arguments")
+            what, allowed = f"the configuration {path.name} is given twice", "every configuration once"
+            raise ConfigError(what, where=str(path), allowed=allowed, hint="leave one of the two out")
     entries = [(path.stem, path, tuple(overrides)) for path in paths]
     if recordings is not None:
         files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
@@ -126,7 +126,7 @@ def run_batch(
                 file_sha256(path)
         except YidError as error:
             results[member.name] = TaskResult(member.name, error=f"{type(error).__name__}: {error}")
-            log.warning("%s cannot start: %s", member.name, error.what)
+            log.warning("the run %s is left out, because it cannot start: %s", member.name, error.what)
             continue
         own = {"name": member.name, "config": member.config_file, "settings": list(member.overrides)}
         more = {"inputs": inputs, "command": command, "folder": str(folder / _RUNS_FOLDER)}
@@ -204,9 +204,8 @@ def _folder(path: Path) -> Path:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / _TASKS_FOLDER).is_dir():
             allowed = "a new name, an empty folder, or the folder of a batch to complete"
             what = "the folder has files, but not those of a batch"
-            raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another name with --out")
+            raise OutputError(what, where=str(folder), allowed=allowed, hint="choose another folder with --out")
         (folder / _RUNS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        what, hint = f"the folder cannot be created: {os_error_reason(error)}", "choose another --out"
-        raise OutputError(what, where=str(folder), hint=hint) from error
+        raise folder_error(error, folder, "the folder of the batch cannot be created") from error
     return folder

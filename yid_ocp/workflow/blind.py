@@ -70,8 +70,8 @@ def _slice_numbers(text: str) -> tuple[int, int]:
     """Return K and N of the text `K/N`. Raises `ConfigError` for any other text."""
     own, _, of = text.partition("/")
     if not (own.isdigit() and of.isdigit() and 1 <= int(own) <= int(of)):
-        hint = "write for example --slice 1/4"
-        raise ConfigError(f"'{text}' is not a slice", where="--slice", allowed="K/N, with K from 1 to N", hint=hint)
+        what, hint = f"--slice is '{text}', but must be K/N, the K-th of N parts", "write for example --slice 1/4"
+        raise ConfigError(what, where="--slice", allowed="two whole numbers K/N, with K from 1 to N", hint=hint)
     return int(own), int(of)
 
 
@@ -97,17 +97,17 @@ def run_blind(
     (`yid-blind-slice/1`: labels, answers, hashes, for `score_joined_slices`), `result.json` (`yid-blind/1`), `table.md`
     and pictures. A calibration ensemble has `thresholds.json`. Raises `OutputError` for a folder of another ensemble.
     """
-    if count < 1:
-        raise ConfigError(f"an ensemble cannot have {count} cases", where="--cases", allowed="a whole number from 1")
-    if seed < 0:
-        raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
+    for what, number, where, least in (("number of cases", count, "--cases", 1), ("seed", seed, "--seed", 0)):
+        if number < least:
+            what, allowed = f"the {what} is {number}, but must be at least {least}", f"a whole number from {least}"
+            raise ConfigError(what, where=where, allowed=allowed, hint=f"leave {where} out, or give a larger number")
     for entry in runs:
         _require_compatible(entry)
     names = [entry.name for entry in runs]
     for i, name in enumerate(names):
         if name in names[:i]:
             what, where = f"two configurations have the name {name}", str(runs[i].config_file)
-            raise ConfigError(what, where=where, allowed="different file names", hint="rename one of the files")
+            raise ConfigError(what, where=where, allowed="different file names", hint="rename one of the two files")
     proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers, part)
     try:
         commitment, cases = proof.commit()
@@ -118,7 +118,7 @@ def run_blind(
         progress.begin_stage("scoring")
         best = proof.best_closures(cases, labels, answers)
     except KeyboardInterrupt:
-        log.warning("finished cases are in %s; the same command resumes with the others", proof.folder)
+        log.warning("the finished cases are kept in %s; the same command continues with the others", proof.folder)
         raise
     flags = ["--cases", count, "--seed", seed]
     flags += ["--calibration"] if purpose == blind.BLIND_ENSEMBLE_PURPOSES[1] else []
@@ -173,8 +173,8 @@ class _Proof:
             holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
             hint = "choose another --out, or the same configurations, --cases, --seed, --slice and --calibration"
             differing = ", ".join(key for key in asked if said[key] != asked[key])
-            what = f"the folder holds other cases ({holds}), which differ in: {differing}"
-            allowed = "a new folder, or one with the same cases to complete"
+            what = f"the folder has the cases of another blind test ({holds}), which differs in: {differing}"
+            allowed = "a new folder, or the folder of the same blind test, to complete it"
             raise OutputError(what, where=str(self.folder), allowed=allowed, hint=hint)
         tasks = []
         for entry in read_input_json(self.folder / "cases" / "cases.json"):
@@ -199,8 +199,8 @@ class _Proof:
         whole = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         plan = [entry for entry in whole if entry.number % of == own - 1]
         if not plan:
-            what, allowed = f"slice {own}/{of} of {self.count} cases is empty", f"at most {self.count} slices"
-            raise ConfigError(what, where="--slice", allowed=allowed, hint="use fewer slices, or more --cases")
+            what, allowed = f"part {own}/{of} of {self.count} cases has no case", f"K/N with N up to {self.count}"
+            raise ConfigError(what, where="--slice", allowed=allowed, hint="use fewer parts (N), or more --cases")
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
         self.progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
         told = {name: {"experiment": vars(experiments[name])} for name in used}
@@ -412,7 +412,7 @@ class _BlindExperiment:
         first = read_recordings_of_role(run, count=1)
         if not first:
             what, allowed = "no recording gives the initial joint angles of the arms", "one recording or more"
-            raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="add a recording")
+            raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="list a recording of the arms")
         system = build_system(self.simulation_settings())
         vision = not varied.is_without_object and any(group.camera_pose is not None for group in first[0].points)
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
@@ -426,7 +426,7 @@ class _BlindExperiment:
                 continue  # the motion throws the object about; draw another
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
-        hint = "give the object more damping, or start the arms where it hangs in equilibrium"
+        hint = "set a larger model.damping, or give a recording that begins where the object hangs in equilibrium"
         what = f"MuJoCo could simulate none of {blind.MAX_DRAWS_PER_CASE} random motions"
         where, allowed = f"{self.config_file.name}, {varied.description}", "one motion that MuJoCo can simulate"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
@@ -457,10 +457,11 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
 
 
 def _require_compatible(run: RunSettings) -> None:
-    if run.diagnosis.noise_fraction_of_stated_std < 1 or any(entry.std is not None for entry in run.sensors.values()):
-        what = "a blind test has a noise of its own, so its settings must not state noise levels"
-        allowed = "neither sensors.*.std nor diagnosis.noise_fraction_of_stated_std"
-        hint = "remove them, for example in a copy of the file"
+    stated = [f"sensors.{name}.std" for name, entry in run.sensors.items() if entry.std is not None]
+    stated += ["diagnosis.noise_fraction_of_stated_std"] * (run.diagnosis.noise_fraction_of_stated_std < 1)
+    if stated:
+        what = f"a blind test adds noise of its own, but the settings state noise: {', '.join(stated)}"
+        allowed, hint = "settings without these keys", "remove these keys, for example in a copy of the file"
         raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:

@@ -24,6 +24,7 @@ from yid_ocp.workflow.command_runner import CommandOutcome
 from yid_ocp.workflow.run_folder import current_local_time_text
 
 _SLICE_FORMAT = "yid-blind-slice/1"
+_COMMON_KEYS = ("cases", "seed", "purpose", "configs", "code", "code_of_cases")  # the same in all slices of an ensemble
 
 
 def write_slice_results(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -36,7 +37,7 @@ def write_slice_results(found: Mapping[str, Any], folder: Path) -> dict[str, Any
 
 def _ensemble_sha256(part: Mapping[str, Any]) -> str:
     """Return a hash of what all slices of one ensemble share: cases, seed, settings, sources, number of slices."""
-    common = [part[key] for key in ("cases", "seed", "purpose", "configs", "code", "code_of_cases")]
+    common = [part[key] for key in _COMMON_KEYS]
     text = json.dumps([*common, str(part["slice"]).partition("/")[2]], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -54,19 +55,20 @@ def score_joined_slices(
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
         part = read_input_json(path)
         if part.get("format") != _SLICE_FORMAT:
-            what, hint = "the file is no slice of a blind test", "give a folder of `yid-ocp blind`, or its slice.json"
-            raise DataError(what, where=str(path), allowed=f"the format {_SLICE_FORMAT}", hint=hint)
+            what, hint = "the file is no part of a blind test", "give a folder of `yid-ocp blind`, or its slice.json"
+            raise DataError(what, where=str(path), allowed=f"a file of the format {_SLICE_FORMAT}", hint=hint)
         _, digest = blind.labels_json_and_sha256(_labels(part))
         if digest != part["labels_sha256"] or _ensemble_sha256(part) != part["ensemble_sha256"]:
-            what, hint = "labels or settings do not match the hashes in the file", "copy the original slice again"
-            raise DataError(what, where=str(path), allowed="an unchanged slice.json", hint=hint)
+            what, hint = "the labels or settings do not match the hashes in the file", "copy the original file again"
+            raise DataError(what, where=str(path), allowed="slice.json as `yid-ocp blind` wrote it", hint=hint)
         if found and part["ensemble_sha256"] != found[0]["ensemble_sha256"]:
-            what = f"this slice and {files[0]} are of different blind tests: cases, settings or code differ"
-            allowed, hint = "slices of one blind test", "give the slices that were made with the same command and code"
+            differing = [key for key in _COMMON_KEYS if part[key] != found[0][key]] or ["the number of parts"]
+            what = f"{file} and {files[0]} are parts of different blind tests; what differs: {', '.join(differing)}"
+            allowed, hint = "parts of one blind test", "join parts of one command, which differ in --slice only"
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         if part["slice"] in [own["slice"] for own in found]:
-            what, allowed = f"slice {part['slice']} is given twice", "every slice once"
-            raise DataError(what, where=str(path), allowed=allowed, hint="leave one of them out")
+            what, allowed = f"part {part['slice']} of the blind test is given twice", "every part once"
+            raise DataError(what, where=str(path), allowed=allowed, hint=f"leave {file} out")
         found.append(part)
     folder, first = make_folder(out), found[0]
     for name in ("configs", "sealed", "answers", "best"):

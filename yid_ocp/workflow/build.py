@@ -75,10 +75,10 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     mode = "driven" if are_arm_states_estimated(run) else arms.mode
     check_names_in_setting(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
     moved = tuple(name for name in joints if name not in arms.passive_joints)
-    for key, given in (("joints", arms.joints), ("passive", arms.passive_joints), ("locked", arms.locked_joints)):
-        if given and robot is None:
+    for key in ("joints", "passive_joints", "locked_joints"):
+        if getattr(arms, key) and robot is None:
             hint = "set model.robot to a URDF file, or remove model.arms"
-            what, allowed = "model.arms names joints, but the model has no robot", "joints of a robot"
+            what, allowed = f"model.arms.{key} names joints, but the model has no robot", "joints of a robot"
             raise run.config_error(what, "model", "arms", key, allowed=allowed, hint=hint)
     if robot is None and not objects:
         what, allowed = "the model has neither a robot nor an object", "a robot, an object or both"
@@ -163,7 +163,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
         if has_object and _OBJECT_DAMPING_KEY not in said:
             allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
             what = "model.damping lists dampings of joints, but not that of the object"
-            hint = f"set model.damping.{_OBJECT_DAMPING_KEY}"
+            hint = f"set model.damping.{_OBJECT_DAMPING_KEY}, for example to {_DEFAULT_JOINT_DAMPING:g} N m s/rad"
             raise run.config_error(what, "model", "damping", allowed=allowed, hint=hint)
         of_object = said.get(_OBJECT_DAMPING_KEY, _DEFAULT_JOINT_DAMPING)
         damping = {name: said.get(name, of_file.get(name, _DEFAULT_JOINT_DAMPING)) for name in joints}
@@ -183,8 +183,8 @@ def _clamped_system(run: RunSettings, cable: CableVertices) -> System:
             raise run.config_error(what, "model", key, allowed=allowed, hint=f"remove model.{key}")
     recordings = read_recordings_of_role(run)
     if not recordings:
-        what = f"the lengths of a {kind} are computed from recordings, but none is listed"
-        raise run.config_error(what, "recordings", "estimate", allowed="one or more", hint="add a recording")
+        what, hint = f"no recording is listed, from which the lengths of a {kind} are computed", "list its recordings"
+        raise run.config_error(what, "recordings", "estimate", allowed="one recording or more", hint=hint)
     with add_setting_location_to_errors(run, "model", "object"):
         lengths = typical_point_pair_distances(cable.edge_vertex_names, recordings)
         return run.model.object.build_system_with_clamps(lengths, run.model.gravity)
@@ -214,9 +214,10 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             value = entry.value if given.initial is None else factor * given.initial
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
-                what = f"bounds {lower:g} to {upper:g} {entry.unit}: {'reversed' if lower > upper else 'too wide'}"
+                fault, hint = ("reversed", "exchange the numbers") if lower > upper else ("too wide", "narrow them")
+                what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are {fault}"
                 allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
-                raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
+                raise run.config_error(what, "parameters", key, "bounds", allowed=allowed, hint=hint)
             with add_setting_location_to_errors(run, "parameters", key, "initial"):
                 entry = replace(entry, value=value, lower=lower, upper=upper)
         entries.append(entry)
@@ -226,7 +227,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
 def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
     if said.kind != "law":
         if said.law_csv is not None or said.depends_on is not None:
-            what, where = "`law_csv` and `depends_on` belong to kind: law", f"{said.kind}@{said.location}"
+            what, where = "only an effect of kind: law has `law_csv` and `depends_on`", f"{said.kind}@{said.location}"
             allowed, hint = f"kind: {said.kind} with `location` and `values`", "remove both keys, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         made = make_effect(said.kind, said.location, system, dict(said.values))
@@ -234,7 +235,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
     if said.law_csv is None or said.depends_on is None or said.values:
         fault = "has `values`" if said.values else "has no `law_csv`" if said.law_csv is None else "has no `depends_on`"
         where, allowed = f"law@{said.location}", "law_csv: FILE.csv and depends_on: QUANTITY, without `values`"
-        raise ConfigError(f"the law {fault}", where=where, allowed=allowed, hint="write exactly these two keys")
+        raise ConfigError(f"the law {fault}", where=where, allowed=allowed, hint="write these two keys and no `values`")
     return torque_law_from_tables(said.location, system, read_torque_law_tables(Path(said.law_csv), said.depends_on))
 
 
@@ -391,7 +392,7 @@ def _with_extra_frames(
         elif said.use_recorded_straight_position:
             what = f"'{name}' has `use_recorded_straight_position`, but its parent is not a frame of the object"
             allowed = "a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%"
-            raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame")
+            raise run.config_error(what, *where, allowed=allowed, hint=f"set model.frames.{name}.parent_frame to one")
         else:
             tree = Mechanism("world", (), {}) if carrier is None else carrier
             if parent is not None and not tree.has_frame(parent):

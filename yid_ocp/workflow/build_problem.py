@@ -125,7 +125,7 @@ def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> No
     for i, name in enumerate(tree.joint_names):
         of_arm = i in driven or name in run.model.arms.passive_joints
         if not of_arm and driven.intersection(tree.ancestor_joint_indices(i)):
-            what = f"{name} of the object is mounted on a driven arm; the tracking filter needs the arm's own momentum"
+            what = f"{name} of the object is mounted on a driven arm, whose tracking filter needs its own momentum"
             hint = "set problem.arm_tracking_feedback: proportional, or model.arms.mode: prescribed; or use model.grasp"
             allowed = "a driven arm that holds its object by a grasp"
             raise run.config_error(what, "model", "object", "mount", allowed=allowed, hint=hint)
@@ -145,14 +145,14 @@ def build_problem(
     free = free_parameter_names(run, system.parameters)
     if not free:
         choice = unknown_name_error_arguments("", system.parameters.names, "set parameters.NAME.free: true")
-        raise run.config_error("no parameter is free", "parameters", **choice)
+        raise run.config_error("no parameter is free, so there is nothing to estimate", "parameters", **choice)
     if same := sorted(set(run.recordings.estimate) & set(run.recordings.held_out)):
         what, hint = f"{same[0]} is listed for estimation and as held out", "remove it from one of the two lists"
         raise run.config_error(what, "recordings", "held_out", allowed="every recording in one list", hint=hint)
     estimate, held_out = read_recordings_of_role(run), read_recordings_of_role(run, "held_out")
     if not estimate:
         what, allowed = "no recording is listed for estimation", "one recording or more"
-        raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="list a recording")
+        raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint="set estimate: [RECORDING.h5]")
     _check_sensors(run, [*estimate, *held_out])
     estimate, held_out, issues = _check_recordings(run, system, free, estimate, held_out)
     said = replace(make_problem_options(run, system, [*estimate, *held_out, *reference_recordings]), data_issues=issues)
@@ -290,7 +290,7 @@ def _once(
             hint = f"leave out {recording.name} or {same[1].name}"
             raise DataError(what, where=where, allowed="every measurement in one list", hint=hint)
         if _duplicate(others, recording):
-            text = f"{recording.name} is held out twice, but counts once"
+            text = f"{recording.name} is listed twice as held-out recording, but counts once, so results are as usual"
             issues.append(Issue("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
         else:
             others.append(recording)

@@ -95,7 +95,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
-            warnings.append(f"{path.name} is not compared, because Pinocchio cannot read it: {error}")
+            warnings.append(f"{path.name} is not compared, because Pinocchio cannot read it: {error} (no run needs it)")
     warnings += [entry.words for entry in found.values() if not entry.agrees_within_rounding]
     return {n: {**asdict(e), "agrees": e.agrees_within_rounding, "words": e.words} for n, e in found.items()}
 
@@ -117,11 +117,13 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     if arm is not None:
         recorded = 1.0 / float(np.median(np.diff(arm.t)))
         if recorded < 0.5 * rate:
-            warnings.append(f"{episode.name}: joints were sampled at {recorded:.4g} Hz, model steps at {rate:.4g} Hz")
+            said = f"{recorded:.4g} Hz, below half the rate of the model's steps ({rate:.4g} Hz). Motion in between is "
+            warnings.append(f"'{episode.name}' has joint samples at {said}interpolated: if possible, sample faster")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
-            said = "it is not stated if efforts are samples or commands; set sensors.joints.effort.effort_sampling_kind"
-            warnings.append(f"{episode.name}: {said} (now taken as {arm.effort_sampling_kind_or_default}s)")
+            said = f"are samples or commands, so they are taken as {arm.effort_sampling_kind_or_default}s. If this is "
+            said += "wrong, set sensors.joints.effort.effort_sampling_kind"
+            warnings.append(f"'{episode.name}' does not state whether efforts {said}")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None
@@ -129,7 +131,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         rest = problem.model_functions.equilibrium_solver.solve(episode.initial_known_coordinates, theta, torque)
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
-            warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
+            warnings.append(f"for '{episode.name}' with the initial parameters, {rest.message}")
     entry["grasp_gaps"] = min_grasp_gaps_at_start(problem, episode)
     return entry
 
@@ -180,7 +182,8 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
     if growth is not None and not growth.keeps_errors_below_resolution:
         warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
-        warnings.append(f"the model cannot be simulated with the initial parameters (too soft?): {at_x.message}")
+        said = "the model cannot be simulated with the initial parameters, so `solve` may fail. Set larger stiffnesses "
+        warnings.append(f"{said}(parameters.NAME.initial) or a smaller problem.time_step. The reason: {at_x.message}")
         return {}
     shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
@@ -198,7 +201,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     h = run.problem.time_step_or_10_ms if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
-        message = "joint positions are unknown: the configuration names no recording"
+        message = "not computed, because joint positions are unknown without a recording"
         return {"links": [], "time_step": [], "message": message}
     theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
     rule = (run.problem.force_split, run.problem.constraint_force_at)
@@ -213,8 +216,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         return {"links": [], "time_step": [], "message": own.message}
     if own.n_unstable_modes:
         remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
-        grow = f"{own.n_unstable_modes} vibration modes grow from step to step at the first posture"
-        warnings.append(f"{grow}: set a shorter problem.time_step, {remedy}or more damping")
+        grow = f"{own.n_unstable_modes} vibration modes grow from step to step at the first posture, so the simulation "
+        warnings.append(f"{grow}is unstable: set a shorter problem.time_step, {remedy}or a larger model.damping")
     steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)
@@ -241,5 +244,6 @@ def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]])
     for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
             change = f"from {coarse['value']:g} to {fine['value']:g}{unit}"
-            moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter)"
+            percents = f"{100 * abs(a - b) / b:.2g} % of the latter, {100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
+            moved = f"{a:.3g} Hz to {b:.3g} Hz ({percents})"
             warnings.append(f"natural frequency {i + 1} changes from {moved} when {what} {change}")

@@ -21,11 +21,12 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
     """Run and compare all methods, and write the run folder. Successful if any method converged."""
     solvers, experiment = list(run.compare.methods.values()), run.compare.reference_paper_experiment_name
     if not solvers:
-        what, allowed = "there is no method to compare", ", ".join(SOLVERS)
+        what, allowed = "compare.methods lists no method", ", ".join(SOLVERS)
         raise run.config_error(what, "compare", "methods", allowed=allowed, hint="add a method, or leave the key out")
     if experiment is not None and experiment not in PAPER_ESTIMATES:
         what = f"Caldwell et al. (2014) have no experiment '{experiment}'"
-        raise run.config_error(what, "compare", "reference_paper_experiment_name", allowed=", ".join(PAPER_ESTIMATES))
+        allowed, hint = ", ".join(PAPER_ESTIMATES), "use an allowed name, or leave the key out"
+        raise run.config_error(what, "compare", "reference_paper_experiment_name", allowed=allowed, hint=hint)
     with atomic_run_folder(run, out, "compare") as folder:
         folder.record_run_start(run, "compare")
         progress.begin_stage("building the model and its compiled step")

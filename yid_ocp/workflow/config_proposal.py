@@ -156,7 +156,7 @@ def propose_config_choices(
     joints = tuple(tree.joint_names[j] for j in sorted(needed)) if branches else tree.joint_names
     for other in recordings:
         for name in (name for name in joints if name not in other.joint_names):
-            what, hint = f"the recording lacks joint '{name}', which {first.name} has", "leave this file out"
+            what, hint = f"the recording lacks the joint '{name}', which {first.name} has", "leave this recording out"
             raise ConfigError(what, where=other.name, allowed=f"the joints {', '.join(joints)}", hint=hint)
     mode, why = _mode(first, recorded, bool(held), has_object=bool(branches))
     moving = ""
@@ -193,13 +193,14 @@ def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Rec
     """Joints of the URDF that the first recording has. Raises `ConfigError` if it has none or a recording no joints."""
     for other in (recording for recording in recordings if recording.joints is None):
         hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
-        what, allowed = "the recording has no joints", "a recording with joint states of the robot"
-        raise ConfigError(what, where=other.name, allowed=allowed, hint=hint)
+        what, allowed = f"recording '{other.name}' has no joint angles", "a recording with joint states of the robot"
+        raise ConfigError(what, where=f"recording '{other.name}'", allowed=allowed, hint=hint)
     if not whole.joint_names:
-        raise ConfigError("the robot has no joint that can move", where=robot, allowed="a robot with movable joints")
+        what, hint = "the robot has no joint that can move", "give the URDF or MJCF file of the whole robot"
+        raise ConfigError(what, where=robot, allowed="revolute, continuous or prismatic joints", hint=hint)
     recorded = recordings[0].joint_names
     if not (known := [name for name in whole.joint_names if name in recorded]):
-        what = f"none of the recorded joints is in the URDF: {', '.join(recorded)}"
+        what = f"none of the recorded joints is a joint of the robot: {', '.join(recorded)}"
         hint = f"rename them at the import: --joints {recorded[0]}={whole.joint_names[0]},..."
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     return known
@@ -262,10 +263,10 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if not has_object and not is_servo and joints.effort is None and not wrists:
         what = "the recording has no measurement of the forces that move the arm"
         allowed = "efforts of its joints, commanded positions that differ from the measured ones, or a wrist sensor"
-        hint = "import them too (see `yid-ocp import FILE --preview`), or add --object and its dimensions"
+        hint = "import efforts too (`yid-ocp import FILE --preview` lists signals), or add --object and its dimensions"
         raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if joints.effort is None and not seen and has_object:
-        hint = "import points too (see `yid-ocp import FILE --preview`)"
+        hint = "import points too; `yid-ocp import FILE --preview` lists the signals of a file"
         allowed = "points on the object, or efforts of the joints that move it"
         what = "the recording has no measurement of the object"
         raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
@@ -352,7 +353,7 @@ def _places(
             owner, colon, part = point.partition(":")
             frame, reason, std = "", "its place on the model is not known", 0.0
             if point in frames or (colon and owner in names and part.endswith("%")):
-                frame, reason = point, "the frame of the same name"
+                frame, reason = point, "found by name"
             elif point in names:
                 frame, reason = f"w_{point}", "the end of the segment of this name"
             elif not standing:
@@ -431,7 +432,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
             other = (holder, "a guess: the sensor carries this link and its load; if not, set frame_by_recorded_name")
         own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
         found[key] = tuple(
-            _PointPlacement(name, name, "a link has this name") if moves else _PointPlacement(name, *other)
+            _PointPlacement(name, name, "found by name") if moves else _PointPlacement(name, *other)
             for name, moves in own.items()
         )
     return found

@@ -102,7 +102,7 @@ def run_diagnose(
             )
         except KeyboardInterrupt:
             if len(refits):
-                log.warning("%d finished refits are in %s; the same command reuses them", len(refits), refits.file)
+                log.warning("%d finished refits are kept in %s; the same command reuses them", len(refits), refits.file)
             raise
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
@@ -209,7 +209,7 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
     for group, field in sorted(_noise_levels(problem)):
         level = getattr(sensors[group], field) if group in sensors else None
         if level is None:
-            what = f"diagnosis.noise_fraction_of_stated_std needs the {field} of '{group}', which is not set"
+            what = f"diagnosis.noise_fraction_of_stated_std needs sensors.{group}.{field}, which is not set"
             where, hint = ("diagnosis", "noise_fraction_of_stated_std"), f"set sensors.{group}.{field}"
             raise run.config_error(what, *where, allowed="all noise levels under `sensors`, or 1", hint=hint)
         by_name = isinstance(level, Mapping)
@@ -335,7 +335,7 @@ class _SingleJsonFileRefitStore(RefitStore):
                 files.write_strict_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
-                    log.warning("finished refits cannot be stored and would be lost by an interruption (%s)", error)
+                    log.warning("finished refits cannot be stored, so an interruption would lose them (%s)", error)
                 self._warned = True
 
     def delete_file(self) -> None:
@@ -352,8 +352,8 @@ class _SingleJsonFileRefitStore(RefitStore):
             held = files.read_input_json(self.file)
             if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
                 return {name: files.dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
-            reason = "the refits are of other inputs, settings or another version"
+            reason = "they are of other inputs, other settings or another version"
         except (DataError, ValueError, LookupError, TypeError, AttributeError):
             reason = "the file cannot be read"
-        log.warning("all effects are fitted again, without stored refits in %s: %s", self.file, reason)
+        log.warning("all effects are fitted again; the refits in %s are not used, because %s", self.file, reason)
         return {}

@@ -70,7 +70,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         print_result(arguments, manifest, lambda: summary_terminal_lines(summarize_export(manifest)), out, out)
         return EXIT_DONE
     if source.is_dir() and form == "csv":
-        allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording, or the run's signals as mcap"
+        allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording (.h5), or write --format mcap"
         raise ConfigError("a run folder cannot be written as CSV", where="--format csv", allowed=allowed, hint=hint)
     if not source.is_dir() and form not in (None, "csv", _MCAP):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
@@ -96,7 +96,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 
 
 def _shift_notes(begin: str, shift: float) -> list[str]:
-    return [f"{begin}{shift:g} s were added to all times, as stamps cannot be negative"] if shift else []
+    return [f"{begin}{shift:g} s were added to all times, because MCAP has no negative times"] if shift else []
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,9 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         parameters = {str(name): dict(entry) for name, entry in result.get("model", result)["parameters"].items()}
         values = {name: float(entry["value"]) for name, entry in parameters.items()}
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        where = str(folder / "result.json")
-        allowed, hint = "a result of `solve` or `diagnose` of this version", "repeat the command that made the folder"
-        raise DataError("the result has no parameters", where=where, allowed=allowed, hint=hint) from error
+        where, allowed = str(folder / "result.json"), "a result of `solve` or `diagnose` of this version"
+        what = "the result has no valid parameter values: another version wrote it, or it is damaged"
+        raise DataError(what, where=where, allowed=allowed, hint=run_history.repeat_hint(result)) from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
     whole = run_history.settings_with_added_effects(nominal, run_history.group_parameter_values_by_effect_label(values))
@@ -151,10 +151,10 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this.
     """
     if form not in _MODEL_FORMATS:
-        why = "write --format mjcf; UsdPhysics has no cables yet, nor springs of joints that turn about three axes"
-        hint, allowed = why if form == "usd" else "", ", ".join(_MODEL_FORMATS)
-        where = "--format, or the ending of --out"
-        raise ConfigError(f"there is no format '{form}'", where=where, allowed=allowed, hint=hint)
+        why = "; UsdPhysics has no cables yet, nor springs of joints that turn about three axes" * (form == "usd")
+        allowed, where = ", ".join(_MODEL_FORMATS), "--format, or the ending of --out"
+        what, hint = f"there is no format '{form}' of a model", f"write --format mjcf{why}"
+        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     calibrated = _read_calibrated_model(folder)
     if out.exists() and any(map(out.samefile, input_files_by_name(calibrated.nominal_settings).values())):
         what, hint = "the file to write is an input of the run", "choose another --out"
@@ -328,8 +328,8 @@ def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     with open_hdf5_after_read_check(source) as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:
-            allowed, hint = ", ".join(_PREDICTION_TOPICS), "run `solve` or `diagnose` again with this version"
-            raise DataError(f"the trajectories have the format '{form}'", where=str(source), allowed=allowed, hint=hint)
+            what, hint = f"this version reads no trajectories of the format '{form}'", "run `solve` or `diagnose` again"
+            raise DataError(what, where=str(source), allowed=", ".join(_PREDICTION_TOPICS), hint=hint)
         for name, signals in _recordings(file, form).items():
             files.append(Path(out) / f"{name}.mcap")
             notes += _shift_notes(f"{files[-1].name}: ", export_mcap(signals, files[-1]))

@@ -40,14 +40,14 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         problems = [estimating_on_all(build_problem(settings)) for settings in by_law.values()]
         kinds = friction_law_comparison.recording_names_by_name_stem(problems[0])
         if len(kinds) < 2:
-            allowed = "two recordings or more in which the motors are on"
-            hint = "list more under recordings.estimate or recordings.held_out"
-            what = "a law is tested on recordings that are not fitted, but fewer than two can be used"
+            allowed = "two recordings or more; with servos, recordings in which the motors are on"
+            hint = "list another motion under recordings.estimate or recordings.held_out"
+            what = f"each motion is held out in turn, which needs two recordings, but only {len(kinds)} can be used"
             raise DataError(what, where=run.setting_location("recordings"), allowed=allowed, hint=hint)
         rubbing = friction_joint_names(next(iter(by_law.values())), problems[0].system)
         compared = [own.sensor for episode in problems[0].episodes for own in episode.measurements]
         if {*rubbing} <= {*problems[0].system.prescribed} and not any(sensor.effort_joints for sensor in compared):
-            what = "friction shows only in joint torques, and the configuration does not use them"
+            what = "the joints follow their measured angles, so friction shows only in torques, which are not used"
             where, hint = run.setting_location("sensors"), "set sensors.joints.effort.use: true"
             allowed = "recorded torques that the fit compares with the model"
             raise DataError(what, where=where, allowed=allowed, hint=hint)
@@ -64,8 +64,8 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds, parts))
             solved[law] = (settings, problem, solution)
         if not fits:
-            what, hint = "no friction law could be fitted", "correct the issues that `yid-ocp check` lists"
-            where = run.setting_location("recordings")
+            what = f"none of the {len(by_law)} friction laws could be fitted, the last one because: {solution.message}"
+            hint, where = "correct the issues that `yid-ocp check` lists", run.setting_location("recordings")
             raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
         best = friction_law_comparison.simplest_fit_within_one_std_error(fits, kinds)
         settings, problem, fitted = solved[best.law]

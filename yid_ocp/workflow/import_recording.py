@@ -17,7 +17,7 @@ from yid_ocp.data.merge import merge_recordings
 from yid_ocp.data.readers import base, preview_file, read_any, reader_option_names_for_file
 from yid_ocp.data.readers.csv import column_pattern
 from yid_ocp.display import Progress
-from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.options import class_options_by_key, mapping_value_type
 from yid_ocp.report.terminal import importable_file_contents_lines, recording_summary_lines
@@ -45,7 +45,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     if arguments.preview:
         return _preview(arguments, asked)
     if arguments.out is None:
-        allowed, hint = "--out RECORDING.h5, or --preview", "add --out RECORDING.h5"
+        allowed, hint = "--out NAME.h5, or --preview", f"add --out {Path(files[0]).stem}.h5"
         raise ConfigError("the option --out is missing", where="--out", allowed=allowed, hint=hint)
     if not has_native_recording_suffix(arguments.out):
         what, hint = f"'{arguments.out}' does not end in .h5", f"write --out {Path(arguments.out).with_suffix('.h5')}"
@@ -146,14 +146,14 @@ def _merged(
     known = {file: () if has_native_recording_suffix(file) else reader_option_names_for_file(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):
-            what = f"no format of these files has the option '{name}'"
+            what, hint = f"no format of these files has the option '{name}'", f"leave {_flag(name)} out"
             allowed = ", ".join(sorted(set().union(*known.values())))
-            raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint="leave it out")
+            raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint=hint)
     late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
     units = dict(options.get("units") or {})
     if units.get("effort") in base.MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}
-    columns, matched = options.get("column_meanings") or {}, set[str]()
+    columns, matched, present = options.get("column_meanings") or {}, set[str](), set[str]()
     parts = []
     for file in files:
         own = {name: value for name, value in options.items() if name in known[file] and name not in late}
@@ -162,15 +162,15 @@ def _merged(
             names = [source.name for source in preview_file(file).sources]
             known_here = (key for key in columns if any(map(column_pattern(key).fullmatch, names)))
             own["column_meanings"] = {key: columns[key] for key in known_here}
-            matched |= set(own["column_meanings"])
+            matched, present = matched | set(own["column_meanings"]), present.union(names)
         parts.append(read_third_party_recording(file, own, progress))
     if missing := set(columns) - matched:
-        what, allowed = f"no file has a column '{min(missing)}'", "columns that --preview lists"
-        raise DataError(what, where="--columns", allowed=allowed, hint="correct the name, or leave it out")
+        said = unknown_name_error_arguments(min(missing), sorted(present), "correct the name, or leave it out")
+        raise DataError(f"no file has a column '{min(missing)}'", where="--columns", **said)
     stems = [Path(file).stem for file in files]
     if len(set(stems)) < len(stems):
-        what, allowed = "two files have the same name, apart from folder and ending", "different names"
-        raise DataError(what, where=", ".join(files), allowed=allowed, hint="rename one of them")
+        what = f"two files have the name '{max(stems, key=stems.count)}', apart from folder and ending"
+        raise DataError(what, where=", ".join(files), allowed="files with different names", hint="rename one of them")
     parts = [replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)]
     merged = merge_recordings(parts, offsets)
     return base.convert_to_si_and_validate(merged, ", ".join(files), base.JointPointAndUnitOptions(**late))
@@ -225,10 +225,10 @@ def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
         try:
             pairs[key] = _MAPPINGS[option](value)
         except ValueError as error:
-            where, hint = f"{_flag(option)} {entry}", "write a number after ="
+            where, hint = f"{_flag(option)} {entry}", f"write a number after =, for example {key}=0.5"
             raise ConfigError(f"'{value}' is not a number", where=where, allowed="NAME=NUMBER", hint=hint) from error
         if not (key and equals and value):
-            what, hint = f"'{entry}' is not NAME=VALUE", "write =, and quote the entry if it has spaces or *"
+            what, hint = f"'{entry}' is not NAME=VALUE", "write NAME=VALUE, in quotes if it has spaces or *"
             raise ConfigError(what, where=_flag(option), allowed="NAME=VALUE,NAME=VALUE", hint=hint)
     return pairs
 

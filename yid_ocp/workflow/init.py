@@ -42,7 +42,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):
         hint = f"write --out {out.parent / (out.stem + '.yaml')}"
-        raise ConfigError(f"'{out.name}' is not a YAML file", where="--out", allowed="NAME.yaml or NAME.yml", hint=hint)
+        raise ConfigError(f"'{out.name}' does not end in .yaml", where="--out", allowed=".yaml or .yml", hint=hint)
     read_urdf(robot)
     item = _object_from_arguments(arguments)
     with stderr_progress_display(arguments) as progress:
@@ -55,8 +55,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     written = {file: raw for file, raw in made.items() if raw is not None}
     for file in (out, out.with_suffix(".html"), *written):
         if file.exists() and not arguments.replace:
-            hint = "choose another --out, or add --replace"
-            raise OutputError("the file already exists", where=str(file), allowed="a new file", hint=hint)
+            hint, allowed = "add --replace to overwrite it, or choose an --out in another folder", "a file that is new"
+            raise OutputError(f"{file.name} already exists", where=str(file), allowed=allowed, hint=hint)
 
     def near(path: str | Path) -> str:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
@@ -81,7 +81,7 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
     if word is None:
         for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
             if getattr(arguments, name):
-                what, hint = f"--{name} needs --object", f"add --object KIND, or leave --{name} out"
+                what, hint = f"--{name} needs --object", f"add --object cable or another kind, or leave --{name} out"
                 raise ConfigError(what, where=f"--{name}", allowed=f"with --object {', '.join(templates)}", hint=hint)
         return None
     if (template := templates.get(word)) is None:
@@ -89,30 +89,32 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
         raise ConfigError(f"there is no object '{word}'", where="--object", **said)
     links = template.default_links if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
-        raise ConfigError(f"the object has {links} links", where="--links", allowed="a whole number from 1 to 64")
+        what, hint = f"--links is {links}, but must be from 1 to 64", f"leave --links out for {template.default_links}"
+        raise ConfigError(what, where="--links", allowed="a whole number from 1 to 64", hint=hint)
     numbers, known = {name: getattr(arguments, name) for name in ("length", "mass", "radius")}, template.further_numbers
     for text in arguments.number:
         name, equals, value = text.partition("=")
         if name not in known or not equals:
             allowed = ", ".join(f"{key}=NUMBER, {words}" for key, words in known.items())
-            what = f"'{text}' is not an additional number of a {word}"
-            hint = f"write {name}=NUMBER" if name in known else nearest_name_question(name, known) or "leave it out"
+            what = f"--number is '{text}', which is not a NAME=NUMBER of the object '{word}'"
+            hint = f"write {name}=0.1" if name in known else nearest_name_question(name, known) or "leave it out"
             raise ConfigError(what, where="--number", allowed=allowed or "none", hint=hint)
         numbers[name] = parse_comma_separated_numbers(value, 1, "--number")[0]
     for name, number in ((n, x) for n, x in numbers.items() if x is not None and not 0 < x < math.inf):
         unit = "kg" if name == "mass" else "m" if name in ("length", "radius") else "SI unit"
-        raise ConfigError(f"the {name} is {number:g}", where=f"--{name}", allowed=f"a number above 0 [{unit}]")
+        what, flag = f"{name} is {number:g}, not above 0", f"--number {name}=" if name in known else f"--{name} "
+        raise ConfigError(what, where=flag, allowed=f"a number above 0 [{unit}]", hint=f"for example {flag}0.1")
     given = {**numbers, **{name: getattr(arguments, name) for name in ("section", "branch", "branches")}}
     if given["branch"] and not template.has_branches:
-        what, hint = f"a {word} has no branches", "set --object tree, or leave --branch out"
-        raise ConfigError(what, where="--branch", allowed="with --object tree", hint=hint)
+        what, hint = f"the object '{word}' has no branches", "write --object tree, or leave --branch out"
+        raise ConfigError(what, where="--branch", allowed="--branch with --object tree", hint=hint)
     item = template.build({name: value for name, value in given.items() if value}, links)
     for own in item.settings.segment_definitions():
         width, height = own.cross_section_size or (math.sqrt(math.pi) * (own.radius or math.nan),) * 2
         density = own.mass / (own.length * width * height)
         if density < 5 or density > 20_000:
             what, allowed = f"'{own.name}' has the density {density:.2g} kg/m^3", "5 (foam) to 20000 kg/m^3 (tungsten)"
-            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint="use the units kg and m")
+            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint="give kg and m")
     return item
 
 
@@ -121,8 +123,8 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
     for text in given:
         frame, equals, point = text.partition("=")
         if not (frame and equals and point):
-            hint = "write for example --grasp tool0=w_cable"
-            raise ConfigError(f"'{text}' is not FRAME=POINT", where="--grasp", allowed="FRAME=POINT", hint=hint)
+            hint, allowed = "write for example --grasp tool0=w_cable", "a frame of the robot = a point of the object"
+            raise ConfigError(f"'{text}' is not FRAME=POINT", where="--grasp", allowed=allowed, hint=hint)
         grasps[frame] = point
     return grasps
 
@@ -135,14 +137,14 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
             recording = import_recording.read_third_party_recording(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
         elif options:
-            what = f"{file.name} is a recording already, so options of the import do not apply"
+            what = f"{file.name} is a recording already, so options of the import do not apply to it"
             where, allowed = ", ".join(map(import_recording._flag, options)), "options with files of other formats"
-            raise ConfigError(what, where=where, allowed=allowed, hint="import the original file again with them")
+            raise ConfigError(what, where=where, allowed=allowed, hint="give the original file in place of this one")
         else:
             made[file] = None
     if len(made) < len(arguments.files):
-        what, where = "two files have the same name, apart from folder and ending", ", ".join(arguments.files)
-        raise DataError(what, where=where, allowed="different names", hint="rename one of them")
+        what, where = "two of the files have the same name, apart from folder and ending", ", ".join(arguments.files)
+        raise DataError(what, where=where, allowed="files with different names", hint="rename one of the two files")
     return made
 
 
@@ -186,24 +188,26 @@ def _summary_lines(
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
     lines = [
         f"joints: {abbreviated_names_text(proposal.joints, math.inf)}",
-        f"object held by: {', '.join(held)}" + f" (frames there for --holder: {', '.join(others)})" * bool(others),
+        f"object held by: {', '.join(held)}" + f" (other frames for --holder: {', '.join(others)})" * bool(others),
         f"model.arms.mode: {proposal.arm_mode} ({proposal.arm_mode_reason})",
         f"problem.initial_state: {proposal.initial_state} ({proposal.initial_state_reason})",
     ]
     damping = _value(proposal.urdf_joint_damping)
     lines += [f"damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
-        lines += [f"sensors.{group}: recorded {a} at {b} of the model ({c})" for a, b, c in _merged_places(places)]
-    picture = [f"picture of the guesses: {out.with_suffix('.html')}"] if has_picture else []
+        for names, frame, reason in _merged_places(places):
+            does = f"does not predict {names}" if frame == "?" else f"predicts {names} at {frame}"
+            lines.append(f"sensors.{group}: the model {does} ({reason})")
+    picture = [f"please check these choices in the picture {out.with_suffix('.html')}"] if has_picture else []
     for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
-        lines.append(f"diagnose will not try {', '.join(kinds)}, because no recording has {signals}")
+        lines.append(f"diagnose does not try the effects {', '.join(kinds)}, because no recording has {signals}")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "set sensors.joints.effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm"
     lines += [*[unseen] * is_left_out, *picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
-        lines.append(f"friction of the arm's joints: yid-ocp friction {quoted}{more}")
+        lines.append(f"to estimate the friction of the arm's joints: yid-ocp friction {quoted}{more}")
     return [*lines, ""]
 
 
@@ -211,7 +215,8 @@ def _merged_places(places: Iterable[Any]) -> list[tuple[str, str, str]]:
     """Return points, frame (`?` if unknown) and reason. Points with the same frame and reason are one entry."""
     points: dict[tuple[str, str], list[str]] = {}
     for own in places:
-        points.setdefault((own.frame or "?", own.reason), []).append(own.point)
+        frame = "the frame of the same name" if own.frame == own.point else own.frame or "?"
+        points.setdefault((frame, own.reason), []).append(own.point)
     return [(abbreviated_names_text(names, math.inf), *about) for about, names in points.items()]
 
 

@@ -145,7 +145,7 @@ def _linearised(step: Step, point: _LinearisationPoint) -> tuple[dict[str, Array
     found = step.jacobians(q, p, point.torque, point.theta, (path, path) if len(path) else None, z)
     if not all(np.isfinite(matrix).all() for matrix in found):
         what, allowed = "the step cannot be linearised: its equations are singular", "a model with regular equations"
-        hint = "give massless links a mass, or remove redundant grasps"
+        hint = "give massless links a mass, or remove redundant grasps under model.grasp"
         raise ModelError(what, where=point.description, allowed=allowed, hint=hint)
     rows = step_diagnostics.step_equation_jacobians_at_state(step, point.state, point.torque, point.theta, path)
     return dict(zip(("A", "B_u", "B_theta"), found, strict=True)), rows

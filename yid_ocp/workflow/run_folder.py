@@ -23,7 +23,7 @@ from yid_ocp import interruption
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.display import Progress
 from yid_ocp.errors import OutputError, YidError
-from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_text
+from yid_ocp.files import file_sha256, is_file, os_error_reason, to_json_types, write_text
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
@@ -173,11 +173,11 @@ def _publish(folder: RunFolder, lock: FileLock) -> None:
             break
         except OSError as error:
             if not os.path.lexists(target) or number > _NAMES:
-                what = f"the run is complete but its folder cannot be renamed: {os_error_reason(error)}"
+                what = f"the run is complete, but its folder cannot get its name: {os_error_reason(error)}"
                 raise OutputError(what, where=str(target), hint=f"rename {temporary}, which has the results") from error
             target = folder.final_path.with_name(f"{folder.final_path.name}-{number}")
     if target != folder.final_path:
-        log.warning("another run created %s in the meantime; the results are in %s", folder.final_path, target)
+        log.warning("another run created %s in the meantime, so the results are in %s", folder.final_path, target)
     folder.path = target
 
 
@@ -198,8 +198,8 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
             allowed = "no folder of this name, or the folder of an interrupted run"
-            hint, what = "move it, or choose another --out", "the hidden folder of this name is not from a run"
-            raise OutputError(what, where=str(temporary), allowed=allowed, hint=hint)
+            what = "the run needs this hidden folder while it works, but the folder has files that are not from a run"
+            raise OutputError(what, where=str(temporary), allowed=allowed, hint="rename it, or choose another --out")
         lock = _locked(temporary)
         if lock is None:
             continue
@@ -209,7 +209,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
             continue
         _remove_all_but_lock(temporary)
         return target, lock
-    hint, allowed = "choose another name with --out, or wait for the other run", "another name for every run"
+    hint, allowed = "choose another name with --out, or wait for the other run", "a folder that no other run writes"
     raise OutputError("another run is writing this folder", where=str(targets[0]), allowed=allowed, hint=hint)
 
 
@@ -265,8 +265,15 @@ def _refusing(what: str, target: Path, hint: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = f"the run folder cannot be {what}: {os_error_reason(error)}"
-        raise OutputError(reason, where=str(target), hint=hint) from error
+        raise folder_error(error, target, f"the run folder cannot be {what}", hint) from error
+
+
+def folder_error(error: Exception, folder: Path, what: str, hint: str = "choose a writable --out") -> OutputError:
+    """Make an `OutputError` with the reason why a folder cannot be used, such as a file in its path."""
+    if (file := next((path for path in (folder, *folder.parents) if is_file(path)), None)) is not None:
+        what, hint = f"{what}, because {file} is a file", f"choose another --out, or rename {file.name}"
+        return OutputError(what, where=str(folder), allowed="a path of folders, without a file among them", hint=hint)
+    return OutputError(f"{what}: {os_error_reason(error)}", where=str(folder), hint=hint)
 
 
 def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
@@ -276,19 +283,18 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
         return [parent / name for name in (stem, *(f"{stem}-{i}" for i in range(2, _NAMES)))]
     allowed = "a new name, or an empty folder"
     if not str(out).strip() or "\0" in str(out):
-        what, hint = f"{str(out)!r} is not a valid folder name", "choose another name"
+        what, hint = f"{str(out)!r} is not a valid folder name", "write for example --out runs/first"
         raise OutputError(what, where="--out", allowed=allowed, hint=hint)
     try:
         target = Path(out).expanduser().absolute()
         is_link, is_folder = target.is_symlink(), target.is_dir()
-        filled, is_file = is_folder and any(target.iterdir()), not is_folder and target.exists()
+        filled, is_existing_file = is_folder and any(target.iterdir()), not is_folder and target.exists()
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, or an unknown user's home
-        what = f"this cannot be a run folder: {os_error_reason(error)}"
-        raise OutputError(what, where=str(out)[:200], hint="choose a writable folder with --out") from error
+        raise folder_error(error, Path(str(out)[:200]), "this path cannot be a run folder") from error
     for found, what, hint in (
         (filled, "exists and is not empty", "choose another name with --out, or leave it out for a numbered one"),
         (is_link, "is a symbolic link", "give the folder that the link points to, or choose another --out"),
-        (is_file, "is an existing file", "choose another --out"),
+        (is_existing_file, "is an existing file", f"choose another --out, or rename {target.name}"),
     ):
         if found:
             raise OutputError(f"the run folder {what}", where=str(target), allowed=allowed, hint=hint)

@@ -31,6 +31,7 @@ from yid_ocp.model.objects import ObjectBuilder
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import ChannelPrediction
 from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, animation_of_trajectories
+from yid_ocp.version import package_version
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
@@ -70,15 +71,20 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
         fault = f"the key {error} is missing" if isinstance(error, KeyError) else f"a value is not valid ({error})"
-        what, hint = f"the result is damaged, or of another version: {fault}", "repeat the run that made this folder"
-        raise DataError(what, where=str(file), allowed="keys and values of this version", hint=hint) from error
+        what, allowed = f"the result is damaged, or of another version: {fault}", f"a result of {package_version()}"
+        raise DataError(what, where=str(file), allowed=allowed, hint=repeat_hint(result)) from error
     if not names:
         what, hint = "the run determined no parameter", "give a run that estimated one with a standard deviation"
         raise DataError(what, where=str(file), allowed="one parameter or more in `covariance`", hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
-        raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint="repeat the `solve` of this folder")
+        raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=repeat_hint(result))
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
+
+
+def repeat_hint(result: Mapping[str, Any]) -> str:
+    """Return a hint to repeat the command that made a result."""
+    return f"repeat the run with this version: {result.get('command', 'the command that made the folder')}"
 
 
 def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -120,11 +126,11 @@ def read_result_file(file: Path) -> dict[str, Any]:
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), allowed=allowed, hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
-        what, hint = "the file is not a result of a run", "repeat the command that made the folder"
-        raise DataError(what, where=str(file), allowed="an object in JSON", hint=hint)
+        what, hint = "the file does not have the result of a run", "repeat the command that made the folder"
+        raise DataError(what, where=str(file), allowed="result.json as a command wrote it", hint=hint)
     if result.get("format") in _OLD_FORMATS or "doubts" in result:  # an old key
         what = f"an earlier version wrote this result ({result.get('format')}), with other names of keys"
-        what, hint = f"{what}; {RENAMED_NAMES_HINT}", "repeat the command that made the folder, with this version"
+        what, hint = f"{what}; {RENAMED_NAMES_HINT}", repeat_hint(result)
         raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_FORMAT_BY_COMMAND.values()), hint=hint)
     return result
 
@@ -139,8 +145,8 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]
         except DataError as error:
             raise run.config_error(error.what, *where, allowed=error.allowed, hint=error.hint) from error
         if any(Path(folder).resolve() == Path(other.run_name).resolve() for other in found):
-            what, hint = f"the baseline run {folder} is given twice", "leave one of them out"
-            raise run.config_error(what, *where, allowed="every run once", hint=hint)
+            what, hint = f"the baseline run {folder} is given twice", "leave one of the two out"
+            raise run.config_error(what, *where, allowed="every baseline run once", hint=hint)
         if differing := _difference(run, _settings(folder)):
             what = f"{folder} is a run of another model: model.{differing} differs"
             hint = f"compare model.{differing} with {Path(folder) / 'config.yaml'}"
@@ -217,7 +223,7 @@ def recordings_without_effect_or_reason(run: RunSettings) -> tuple[tuple[Recordi
         if not is_file(file):
             where = ("recordings", "without_effect", i)
             what, allowed = f"there is no such recording: {file}", "the path of an existing file"
-            raise run.config_error(what, *where, allowed=allowed, hint="correct the path")
+            raise run.config_error(what, *where, allowed=allowed, hint="correct the path, or remove it from the list")
         found.append(read_recording(file))
     for folder in () if found else run.diagnosis.baseline_run_folders:
         there = _settings(folder)
@@ -254,11 +260,11 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Compare runs of one model as a history, or overlay two runs of the same recordings. Writes JSON and a page."""
     if len(paths) < 2:
-        what, hint = "fewer than two runs are given", "add run folders, for example of other days"
+        what, hint = "fewer than two runs are given", "add the folder of another run, for example of another day"
         raise ConfigError(what, where="arguments of `report`", allowed="two or more run folders", hint=hint)
     if twice := [str(path) for i, path in enumerate(paths) if path.resolve() in [p.resolve() for p in paths[:i]]]:
-        what, hint = "the run is given twice", "leave one of them out"
-        raise ConfigError(what, where=twice[0], allowed="every run once", hint=hint)
+        what, hint = f"the run folder {twice[0]} is given twice", "leave one of the two out"
+        raise ConfigError(what, where="arguments of `report`", allowed="every run folder once", hint=hint)
     if len(paths) == 2 and _have_same_recordings(paths):
         return _overlay_runs(paths, out, progress)
     labels = [path.name if len({own.name for own in paths}) == len(paths) else str(path) for path in paths]
@@ -397,6 +403,6 @@ def _overlaid_motions(
                         path = ConfigurationTrajectory(*model, np.array(group["t"]), np.array(group["q"]))
                         told.setdefault(name, []).insert(0, path)  # the last one is drawn in the first color
     except YidError as error:
-        log.warning("the report shows no animation: %s", error)
+        log.warning("the report has no animation of the motions; all else is complete. The reason: %s", error.what)
         return []
     return [animation_of_trajectories(r.name, told[r.name], r) for r in recordings if len(told.get(r.name, ())) == 2]

@@ -43,8 +43,8 @@ def load_plugins(run: RunSettings) -> None:
         name = prefix + file_sha256(path)
         loaded = [module for module in list(sys.modules) if module.startswith(prefix)]
         if loaded not in ([], [name]):
-            what, hint = "the plug-in changed after this process loaded it", "start a new Python process"
-            raise ConfigError(what, where=where, allowed="the loaded version", hint=hint)
+            what, hint = f"{path.name} was changed after this process loaded it", "start a new Python process"
+            raise ConfigError(what, where=where, allowed="the text that was loaded", hint=hint)
         if not loaded:
             with _registering(f"plug-in {path.name}", where, f"correct {path.name}", path, name):
                 _run(path, name)
@@ -93,7 +93,7 @@ def _registering(
         unchanged = all(set(registry) == names for registry, names in zip(registries, before, strict=True))
         if unchanged and not known:
             allowed = "@EFFECTS.register(NAME), or another decorator that docs/howto/extending.md describes"
-            raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add one of these")
+            raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
     except (Exception, SystemExit) as error:
         for registry, names in zip(registries, before, strict=True):
             registry.unregister_names(set(registry) - names)

@@ -99,7 +99,7 @@ def _run_track(
         written = folder.write_result_and_report(run, progress, result, animations=told, section_data=more)
         tasks.delete_files()
     if refused is not None:
-        hint = f"{refused.hint}; see pictures, and the reason of each frame, in {folder.path}"
+        hint = f"{refused.hint}. {folder.path} has pictures, and the reason for each frame"
         raise DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
     return CommandOutcome(folder.path, written, None)
 
