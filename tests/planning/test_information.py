@@ -282,7 +282,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_
         ({"effects_to_discriminate": ("joint_viscous", "joint_coulomb@elbow")}, ("has no location", "KIND@LOCATION")),
         ({"effects_to_discriminate": ("joint_viscus@elbow", PAIR[0])}, ("no effect 'joint_viscus'", "joint_viscous")),
         ({"effects_to_discriminate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
-        ({"start_joint_positions": {"shoulder": 1.5}}, ("which is 0.3 beyond its limit",)),
+        ({"start_joint_positions": {"shoulder": 1.5}}, ("which is 0.3 rad beyond its limit",)),
         ({"limits": PlanLimits(effort_fraction=1e-4)}, ("exceed their limits before they move", "limit 0.004")),
         ({"n_random_starts": 0}, ("n_random_starts = 0", "from 1")),
     ],

@@ -226,7 +226,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"point": None}, ("plan.point is missing",)),
         ({"point_target_offset_from_start": (0.0, 0.1, 0.0)}, ("is given twice", "plan.target_position, plan.point_t")),
         ({"target_position": None}, ("the target of the point", "is not given")),
-        ({"start_joint_positions": {"shoulder": 1.5}}, ("starts at 1.5", "0.3 beyond its limit", "-1.2 to 1.2")),
+        ({"start_joint_positions": {"shoulder": 1.5}}, ("starts at 1.5", "0.3 rad beyond its limit", "-1.2 to 1.2")),
         ({"start_joint_positions": {"sholder": 0.5}}, ("no moved joint 'sholder'", "did you mean 'shoulder'?")),
         ({"start_joint_positions": {}}, ("the position of shoulder is missing",)),
         ({"start_joint_positions": None}, ("the start positions of the joints are not given", "model.grasp")),

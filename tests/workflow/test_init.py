@@ -134,7 +134,7 @@ def test_the_first_lines_of_the_readme_run_as_printed(bench: Path, repository: P
 def test_a_page_shows_what_was_guessed_before_the_fit(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Arm, unbent object and markers in motion, markers under the names of their frames, so that lines join the two."""
     assert init(*CABLE) == 0
-    assert "please check these choices in the picture run.html" in capsys.readouterr().out
+    assert "check these choices in the picture run.html." in capsys.readouterr().out
     page = Path("run.html").read_text()
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
     model, measured = scene["scenes"][0]["motions"]

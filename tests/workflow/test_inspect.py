@@ -58,4 +58,4 @@ def test_what_has_no_rest_is_looked_at_where_all_is_zero(printed, written, tmp_p
     text = FAR.replace("URDF", str(urdf_folder / "double_pendulum.urdf"))
     told = printed("inspect", written(text), "--out", tmp_path / "run", code=2)
     assert "the step cannot be linearised: its equations are singular" in told
-    assert "where: zero, since there is no rest: " in told
+    assert "where: the zero state (no equilibrium was found: " in told

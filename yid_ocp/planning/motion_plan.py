@@ -134,13 +134,12 @@ def _place(options: PlanOptions, begin: Array) -> Array:
     target = options.target_position
     if (target is None) == (options.point_target_offset_from_start is None):
         keys = "plan.target_position", "plan.point_target_offset_from_start"
-        hint = f"set only {keys[0]}: [x, y, z] (m in the world), or only {keys[1]}: [dx, dy, dz] (m)"
+        hint = f"set only {keys[0]}: [x, y, z] (world, m), or only {keys[1]}: [dx, dy, dz] (from its start, m)"
         what = f"the target of the point '{options.point}' is {'not given' if target is None else 'given twice'}"
         raise ConfigError(what, where=", ".join(keys), allowed="exactly one of the two keys", hint=hint)
     if options.goal == "path" and not options.point_waypoint_offsets_from_start:
         what, hint = "plan.goal is path, but the path has no waypoints", "list them, such as [[0, 0, 0.1]]"
-        where, allowed = "plan.point_waypoint_offsets_from_start", "one or more offsets from the start [m]"
-        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
+        raise ConfigError(what, where="plan.point_waypoint_offsets_from_start", allowed="offsets [m]", hint=hint)
     if target is not None:
         return np.array(target, float)
     return begin + np.array(options.point_target_offset_from_start, float)

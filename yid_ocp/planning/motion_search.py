@@ -292,8 +292,7 @@ class DOptimalityCriterion:
         found = -0.5 * float(np.linalg.slogdet(own)[1])
         if not slope:
             return found, np.zeros((0, 0))
-        # d C = -C d(J'J) C
-        wide = whole[:, chosen]
+        wide = whole[:, chosen]  # d C = -C d(J'J) C
         return found, rows @ (wide @ np.linalg.solve(own, wide.T))
 
 

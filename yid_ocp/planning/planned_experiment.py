@@ -102,8 +102,7 @@ class SplineMotionExperiment:
             np.stack([np.interp(at, mover.node_times, x) for x in impulse.T], axis=1) for at in (t, t + period)
         )
         effort = (end - begin) / period
-        # the effort after the end is unknown
-        effort[t + period > duration + 1e-9] = rollout.effort[-1]
+        effort[t + period > duration + 1e-9] = rollout.effort[-1]  # the effort after the end is unknown
         columns = [joints.names.index(name) for name in system.prescribed]
         errors = base.input_errors
         known = (joints.position_std, joints.effort_std, joints.effort_bias_std)
@@ -207,8 +206,7 @@ class SplineMotionExperiment:
             std = np.zeros(len(joints.names)) if joints.effort_std is None else np.asarray(joints.effort_std)
             joints = replace(joints, effort_std=np.where(std > 0, std, ASSUMED_TORQUE_NOISE_STD))
         if self.configured_problem.system.driven:
-            # `_blur` represents the error of the motion
-            joints = replace(joints, position_std=None)
+            joints = replace(joints, position_std=None)  # `_blur` represents the error of the motion
             sensors.pop(JOINT_POSITION_GROUP_NAME, None)
         options = self._options(
             huber_threshold=np.inf, weak_prior_geometric_std=0.0, weighting="whitened", sensors=sensors

@@ -445,8 +445,7 @@ class EpisodePredictor:
         if by_torque is not None:
             own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.prescribed_path_sensitivity is not None:
-            # node 0 is part of the initial state
-            by_path = by_inputs.by_prescribed_path[1:]
+            by_path = by_inputs.by_prescribed_path[1:]  # node 0 is part of the initial state
             own[: len(total)] += np.einsum("kc,kcw->w", by_path, inputs.prescribed_path_sensitivity[1:])
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 

@@ -317,8 +317,7 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
     places = [step.system.mechanism.joint_index(name) for name in names]
     q = np.zeros((len(angles), step.sizes["n"]))
     q[:, places] = angles
-    # unit velocity of every joint in every configuration, together
-    velocity = np.zeros((len(places), *q.shape))
+    velocity = np.zeros((len(places), *q.shape))  # unit velocity of every joint in every configuration, together
     velocity[range(len(places)), :, places] = 1.0
     still = np.broadcast_to(q, velocity.shape).reshape(-1, q.shape[1])
     momentum = generalized_momentum_from_velocity(step, still, velocity.reshape(still.shape), theta)
@@ -349,8 +348,7 @@ def _samples(
     found = [data for kind in SENSOR_READERS for data in SENSOR_READERS[kind](around)]
     if options.weighting == "paper":
         found = [data for data in found if data.sensor.has_paper_weight]
-    # places before efforts, which follow from the motion
-    found.sort(key=lambda data: bool(data.sensor.effort_joints))
+    found.sort(key=lambda data: bool(data.sensor.effort_joints))  # places before efforts, which follow from the motion
     samples = tuple(measurements_located_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
         what, where = "no sensor of the model has a measurement in the recording", f"recording '{recording.name}'"

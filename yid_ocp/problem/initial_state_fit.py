@@ -23,15 +23,12 @@ from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 # Width of the elastic prior [rad]: this bend at a joint of mean stiffness costs as much as one standard deviation of a
 # measured point. The cost of other joints is proportional to their stiffness.
 _BEND_STD = 0.5
-# Joints without a spring, or with a much softer one, still have a weak prior.
-_MIN_STIFFNESS_RATIO = 1e-4
-# Standard deviation of a coordinate's velocity that the points do not determine [rad/s].
-_RATE_STD = 3.0
+_MIN_STIFFNESS_RATIO = 1e-4  # Joints without a spring, or with a much softer one, still have a weak prior.
+_RATE_STD = 3.0  # Standard deviation of a coordinate's velocity that the points do not determine [rad/s].
 _CONSTRAINT_STD = 1e-5
 # The fit starts with the noise of measurements multiplied by this factor: a stiff fit from the start ends in knots.
 _NOISE_FACTORS = (1000.0, 100.0, 10.0, 1.0)
-# Stage before which the best trial is chosen: the object then has its pose, but not its details.
-_SELECTION_STAGE = 2
+_SELECTION_STAGE = 2  # Stage before which the best trial is chosen: the object then has its pose, but not its details.
 # Number of initial values, spread over its bounds, of a parameter fitted with the initial state.
 _TRIALS_PER_PARAMETER = 4
 
@@ -211,8 +208,7 @@ class InitialStateFitter:
         theta[index] = values
         wanted = index[: task.wanted]
         span = (upper - lower)[: task.wanted]
-        # an angle is periodic, other parameters stop at their bounds
-        turns = np.abs(span - 2 * np.pi) < 1e-9
+        turns = np.abs(span - 2 * np.pi) < 1e-9  # an angle is periodic, other parameters stop at their bounds
 
         def spread(x: Array) -> tuple[Array, Array]:
             whole, moved = q.copy(), theta.copy()

@@ -18,8 +18,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.sensors import Sensor, SensorData
 from yid_ocp.sensors.base import ZeroPhaseFilterInterface
 
-# half an hour in steps of 10 ms; exceeded by a clock in milliseconds or with jumps
-_MAX_STEPS = 200_000
+_MAX_STEPS = 200_000  # half an hour in steps of 10 ms; exceeded by a clock in milliseconds or with jumps
 _MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as seconds needs a thousand
 
 

@@ -150,8 +150,7 @@ class _InputCorrectionFunctions:
     def _corrected(self, angle: ca.SX, effort: ca.SX) -> tuple[ca.SX, ca.SX]:
         angles, efforts = [], []
         for i, joint in enumerate(self.joint_names):
-            # the last effect is the nearest to the reading
-            true_effort, true_angle = effort[i], angle[i]
+            true_effort, true_angle = effort[i], angle[i]  # the last effect is the nearest to the reading
             # a servo's command is a target of its encoder reading
             channel = "joints.position" if joint in self.system.servos else "joints.effort"
             for effect in reversed(self._effects):
@@ -167,8 +166,7 @@ class _InputCorrectionFunctions:
         kind, _, joint = channel.partition(".")
         if kind == "torque" and joint in self.system.servos:
             total += self.system.servos[joint].command_delay
-        # delays are in true time, a recording has its own clock
-        return total / self.system.recorded_time_scale
+        return total / self.system.recorded_time_scale  # delays are in true time, a recording has its own clock
 
     def _lag(self, channel: str) -> ca.SX:
         total = sum((effect.channel_lag_time_constant(channel) for effect in self._effects), ca.SX(0))

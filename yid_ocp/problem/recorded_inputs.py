@@ -143,8 +143,7 @@ def _courses(
 ) -> list[scipy.interpolate.PPoly]:
     """Input of each joint over time, from the first sample to the end of the last sample's interval."""
     t = joints.t
-    # the last sample lasts as long as the previous one
-    edges = np.append(t, 2 * t[-1] - t[-2])
+    edges = np.append(t, 2 * t[-1] - t[-2])  # the last sample lasts as long as the previous one
     if servos:
         if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):
             return [_held(np.zeros(len(t)), edges)] * len(driven)  # motors are off

@@ -244,6 +244,6 @@ def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]])
     for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
             change = f"from {coarse['value']:g} to {fine['value']:g}{unit}"
-            percents = f"{100 * abs(a - b) / b:.2g} % of the latter, {100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
-            moved = f"{a:.3g} Hz to {b:.3g} Hz ({percents})"
+            limit = f"{100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
+            moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter, {limit})"
             warnings.append(f"natural frequency {i + 1} changes from {moved} when {what} {change}")

@@ -154,8 +154,7 @@ class _RemainingTime:
     def of_parts(self, done: int, total: int) -> str:
         """Return the text of a stage's remaining time, from its done parts. Empty if the command's time is known."""
         now = time.monotonic()
-        # stored results of an earlier run took no time
-        known, begun = self._first = self._first or (done, now)
+        known, begun = self._first = self._first or (done, now)  # stored results of an earlier run took no time
         if not math.isnan(self._ahead) or done <= known or done >= total or now - begun < _MIN_ESTIMATE_TIME:
             return ""
         return f", about {_format_duration((now - begun) * (total - done) / (done - known))} left"

@@ -138,7 +138,7 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         where, allowed = str(folder / "result.json"), "a result of `solve` or `diagnose` of this version"
         what = "the result has no valid parameter values: another version wrote it, or it is damaged"
-        raise DataError(what, where=where, allowed=allowed, hint=run_history.repeat_hint(result)) from error
+        raise DataError(what, where=where, allowed=allowed, hint=f"repeat {result.get('command', 'it')}") from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
     whole = run_history.settings_with_added_effects(nominal, run_history.group_parameter_values_by_effect_label(values))
@@ -401,8 +401,7 @@ def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
         told = [names[i] for i in forces]
         yield RosTopicTimeSeries("/unknown/joint_states", "joints", edges, {"effort": held[:, forces]}, told)
     for kind, form in _UNKNOWN_SHAPES.items():
-        # x, y and z by owner: `left.x`, `T1.push_y`
-        owners: dict[str, dict[int, int]] = {}
+        owners: dict[str, dict[int, int]] = {}  # x, y and z by owner: `left.x`, `T1.push_y`
         for i, name in enumerate(names):
             if kinds[i] == kind and name[-1] in "xyz":
                 owners.setdefault(name[:-2].removesuffix(".push"), {})["xyz".index(name[-1])] = i

@@ -198,12 +198,12 @@ def _summary_lines(
         for names, frame, reason in _merged_places(places):
             does = f"does not predict {names}" if frame == "?" else f"predicts {names} at {frame}"
             lines.append(f"sensors.{group}: the model {does} ({reason})")
-    picture = [f"please check these choices in the picture {out.with_suffix('.html')}"] if has_picture else []
+    picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
     for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
-        lines.append(f"diagnose does not try the effects {', '.join(kinds)}, because no recording has {signals}")
+        lines.append(f"`diagnose` does not try the effects {', '.join(kinds)}, because no recording has {signals}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
-    unseen = "set sensors.joints.effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm"
+    unseen = "Set sensors.joints.effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm."
     lines += [*[unseen] * is_left_out, *picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""

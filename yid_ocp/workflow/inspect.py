@@ -134,7 +134,7 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
     rest = EquilibriumSolver(step).solve(known, theta, torque)
     if rest.is_converged:
         return _LinearisationPoint(words, True, rest.state, rest.holding_torque, theta, known[len(system.driven) :])
-    words = f"zero, since there is no rest: {rest.message}"
+    words = f"the zero state (no equilibrium was found: {rest.message})"
     return _LinearisationPoint(words, False, np.zeros(sizes["nx"]), np.zeros(sizes["nu"]), theta, np.zeros(sizes["nc"]))
 
 

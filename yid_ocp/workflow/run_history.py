@@ -55,6 +55,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     Raises `DataError` without a finished run, or for a result that is unreadable, old, of another command, or failed.
     """
     file, result = Path(folder) / "result.json", read_estimation_result(folder)
+    again = f"repeat the run with this version: {result.get('command', 'the command of this folder')}"
     try:
         said = result.get("model", result)  # of a diagnosis, the final model
         known, parameters = said["covariance"], said["parameters"]
@@ -72,19 +73,14 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     except (LookupError, TypeError, ValueError) as error:
         fault = f"the key {error} is missing" if isinstance(error, KeyError) else f"a value is not valid ({error})"
         what, allowed = f"the result is damaged, or of another version: {fault}", f"a result of {package_version()}"
-        raise DataError(what, where=str(file), allowed=allowed, hint=repeat_hint(result)) from error
+        raise DataError(what, where=str(file), allowed=allowed, hint=again) from error
     if not names:
         what, hint = "the run determined no parameter", "give a run that estimated one with a standard deviation"
         raise DataError(what, where=str(file), allowed="one parameter or more in `covariance`", hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
-        raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=repeat_hint(result))
+        raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=again)
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
-
-
-def repeat_hint(result: Mapping[str, Any]) -> str:
-    """Return a hint to repeat the command that made a result."""
-    return f"repeat the run with this version: {result.get('command', 'the command that made the folder')}"
 
 
 def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -130,7 +126,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
         raise DataError(what, where=str(file), allowed="result.json as a command wrote it", hint=hint)
     if result.get("format") in _OLD_FORMATS or "doubts" in result:  # an old key
         what = f"an earlier version wrote this result ({result.get('format')}), with other names of keys"
-        what, hint = f"{what}; {RENAMED_NAMES_HINT}", repeat_hint(result)
+        what, hint = f"{what}; {RENAMED_NAMES_HINT}", f"repeat it with this version: {result.get('command', 'the run')}"
         raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_FORMAT_BY_COMMAND.values()), hint=hint)
     return result
 
