@@ -354,11 +354,12 @@ def check_rest_effort_and_spring_limits(
     springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
     largest = np.inf if limits.max_spring_angle is None else limits.max_spring_angle
     able = limits.effort_fraction
-    rows = [(i, "effort_fraction", "N m or N", effort, able * joints[i].effort_limit) for i, effort in efforts]
-    rows += [(i, "max_spring_angle", "rad", rest.state[i], largest) for i in springs]
-    for i, which, unit, value, limit in rows:
+    rows = [(i, "effort_fraction", "an effort", effort, able * joints[i].effort_limit) for i, effort in efforts]
+    rows += [(i, "max_spring_angle", "an angle", rest.state[i], largest) for i in springs]
+    for i, which, noun, value, limit in rows:
         if not abs(value) <= limit * (1 + 1e-9):
-            over = f"{value:.4g} {unit}, which is {abs(value) - limit:.3g} beyond its limit"
+            unit = "rad" if noun == "an angle" else "N m" if joints[i].coordinate_unit == "rad" else "N"
+            over = f"{noun} of {value:.4g} {unit}, which is {abs(value) - limit:.3g} {unit} beyond its limit"
             what, where = f"{joints[i].name} at rest {when} has {over}", f"plan.limits.{which}"
             hint = f"raise {where} if the robot allows it, or set another plan.start_joint_positions or target"
             raise ConfigError(what, where=where, allowed=f"up to {limit:.4g} {unit}", hint=hint)

@@ -153,7 +153,7 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
     low, high = np.array(options.box)
     if np.any(low >= high):
         worst = int(np.argmin(high - low))
-        what = f"the box is empty, because its {'xyz'[worst]} goes from {low[worst]:.4g} m up to {high[worst]:.4g} m"
+        what = f"the box is empty along {'xyz'[worst]}: it goes from {low[worst]:.4g} up to {high[worst]:.4g} m"
         raise ConfigError(what, where="plan.box", allowed="the lowest corner first", hint="exchange the two numbers")
     places = [(name, x, "starts") for name, x in zip(inside.names, at, strict=True)]
     if options.point in inside.names:

@@ -185,7 +185,7 @@ class SplineMotionExperiment:
         problem = problem_with_whitening_at(problem, problem.initial_unknowns)
         evaluation = problem.evaluate(problem.initial_unknowns)
         if not evaluation.ok:
-            raise failed_rollout_error(evaluation.message, "planned motion, with its torques")
+            raise failed_rollout_error(evaluation.message, "planned motion, simulated by its torques")
         return self._relative(problem, evaluation)
 
     def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:

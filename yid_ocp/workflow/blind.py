@@ -199,7 +199,7 @@ class _Proof:
         whole = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         plan = [entry for entry in whole if entry.number % of == own - 1]
         if not plan:
-            what, allowed = f"part {own}/{of} of {self.count} cases has no case", f"K/N with N up to {self.count}"
+            what, allowed = f"part {own}/{of} is empty: there are {self.count} cases", f"K/N with N up to {self.count}"
             raise ConfigError(what, where="--slice", allowed=allowed, hint="use fewer parts (N), or more --cases")
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
         self.progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")

@@ -183,7 +183,7 @@ def _clamped_system(run: RunSettings, cable: CableVertices) -> System:
             raise run.config_error(what, "model", key, allowed=allowed, hint=f"remove model.{key}")
     recordings = read_recordings_of_role(run)
     if not recordings:
-        what, hint = f"no recording is listed, from which the lengths of a {kind} are computed", "list its recordings"
+        what, hint = f"the lengths of a {kind} are computed from recordings, but none is listed", "list its recordings"
         raise run.config_error(what, "recordings", "estimate", allowed="one recording or more", hint=hint)
     with add_setting_location_to_errors(run, "model", "object"):
         lengths = typical_point_pair_distances(cable.edge_vertex_names, recordings)

@@ -55,7 +55,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     written = {file: raw for file, raw in made.items() if raw is not None}
     for file in (out, out.with_suffix(".html"), *written):
         if file.exists() and not arguments.replace:
-            hint, allowed = "add --replace to overwrite it, or choose an --out in another folder", "a file that is new"
+            hint, allowed = "add --replace to overwrite it, or choose an --out in another folder", "a new file"
             raise OutputError(f"{file.name} already exists", where=str(file), allowed=allowed, hint=hint)
 
     def near(path: str | Path) -> str:

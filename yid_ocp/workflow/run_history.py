@@ -110,7 +110,7 @@ def read_estimation_result(folder: str | Path, commands: Sequence[str] = ("solve
         hint = f"give a run folder of {' or '.join(f'`{command}`' for command in commands)}"
         raise DataError(what, where=str(file), allowed=" or ".join(formats), hint=hint)
     if result.get("status") == "failed":
-        what, hint = f"the run failed: {result.get('message')}", "give the folder of a successful run"
+        what, hint = f"the run in this folder failed: {result.get('message')}", "give the folder of a successful run"
         raise DataError(what, where=str(file), allowed="a successful run", hint=hint)
     return result
 
