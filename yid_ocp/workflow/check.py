@@ -243,7 +243,7 @@ def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]])
     coarse, fine = rows[0], rows[-1]
     for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
-            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}"
+            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}: use {'a shorter one' if unit else 'more links'}"
             limit = f"{100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
             moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter, {limit})"
             warnings.append(f"natural frequency {i + 1} changes from {moved} when {what} {change}")

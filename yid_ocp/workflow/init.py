@@ -196,11 +196,11 @@ def _summary_lines(
     lines += [f"damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
         for names, frame, reason in _merged_places(places):
-            does = f"does not predict {names}" if frame == "?" else f"predicts {names} at {frame}"
-            lines.append(f"sensors.{group}: the model {does} ({reason})")
+            to = "no frame of the model" if frame == "?" else frame
+            lines.append(f"sensors.{group}: `init` assigns recorded {names} to {to} ({reason})")
     picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
     for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
-        lines.append(f"`diagnose` does not try the effects {', '.join(kinds)}, because no recording has {signals}.")
+        lines.append(f"`diagnose` does not try {', '.join(kinds)}, because no recording has the signal {signals}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Set sensors.joints.effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm."
