@@ -240,10 +240,10 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
 
 def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row."""
-    coarse, fine = rows[0], rows[-1]
+    coarse, fine, remedy = rows[0], rows[-1], "a shorter one" if unit else "more links"
     for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
-            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}: use {'a shorter one' if unit else 'more links'}"
+            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}: use {remedy}"
             limit = f"{100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
             moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter, {limit})"
             warnings.append(f"natural frequency {i + 1} changes from {moved} when {what} {change}")
