@@ -373,7 +373,7 @@ def test_a_problem_cannot_be_changed_through_its_parameters(make):
         ({"prior_stds": {"elbow.damping": 0.1}}, "'elbow.damping' has a prior, but"),
         ({"values": {"elbow.stiffness": -1.0}}, "elbow.stiffness"),
         ({"seeds": (1, 1)}, "two recordings are called 'run_1'"),
-        ({"parameters_by_recording": {"run_2": {"elbow.rest": 0.3}}}, "elbow.rest is free, but this recording has a"),
+        ({"parameters_by_recording": {"run_2": {"elbow.rest": 0.3}}}, "'elbow.rest' is free, but the recording has a"),
     ],
 )
 def test_what_does_not_fit_is_refused(make, given, words):

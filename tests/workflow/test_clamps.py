@@ -136,7 +136,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
     [
         ({"format": "yid-plan/1"}, "another command"),
         ({"format": "yid-diagnosis/1"}, "table of CHANGELOG.md"),
-        ({"status": "failed", "message": "no"}, "the run failed"),
+        ({"status": "failed", "message": "no"}, "the run in this folder failed: no"),
         ({"covariance": {}}, "the key .names. is missing"),
         ({"covariance": {"names": [], "matrix": []}}, "determined no parameter"),
     ],

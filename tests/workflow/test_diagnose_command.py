@@ -276,7 +276,7 @@ def test_recorded_torques_that_nothing_uses_are_told(problem_of):
     ],
 )
 def test_a_fraction_of_what_is_not_stated_is_refused(problem_of, role, group, entry, missing):
-    with pytest.raises(ConfigError, match=f"needs the {missing} of '{group}'"):
+    with pytest.raises(ConfigError, match=f"needs sensors.{group}.{missing}, which is not set"):
         _with_noise_only_stds(problem_of(role, STATED | {group: entry}), SETTINGS)
 
 
