@@ -191,9 +191,8 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
         if not low <= 0.0 <= high:
             unit = next(joint.coordinate_unit for joint in mover.step.system.mechanism.joints if joint.name == name)
             what = f"joint {name} starts {max(low, -high):.3g} {unit} beyond its position limit"
-            allowed = "start positions within the position limits of the joints"
-            hint = f"set plan.start_joint_positions.{name} to a position within its limits"
-            raise ConfigError(what, where="plan.start_joint_positions", allowed=allowed, hint=hint)
+            where, hint = "plan.start_joint_positions", f"set plan.start_joint_positions.{name} within its limits"
+            raise ConfigError(what, where=where, allowed="positions within the limits of the joints", hint=hint)
     values, _ = limits.constraints_and_jacobian(mover.simulate_path(still), still)
     if broken := limits.worst_value_and_bound_by_violated_limit(values):
         parts = ((what, *passed) for what, passed in broken.items())

@@ -162,8 +162,7 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
         over = np.maximum(low - where, where - high)
         if np.any(over > 0):
             row = int(np.argmax(over))
-            what = f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}"
-            what += f", at {where[row]:.4g} m"
+            what = f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}, at {where[row]:.4g} m"
             hint = "enlarge the box, or list the frames to keep in it under plan.frames_in_box"
             raise ConfigError(what, where="plan.box", allowed=f"{low[row]:.4g} to {high[row]:.4g} m", hint=hint)
 

@@ -150,8 +150,7 @@ def _courses(
         if joints.position_command is None:
             what = "the servos of the model follow commanded positions, but the recording has none"
             allowed = "the commanded position of every joint; or efforts of zero throughout if the motors are off"
-            hint = "import the commands (action of a LeRobot dataset, --command-topic of a bag), "
-            hint += "or set model.arms.mode: prescribed"
+            hint = "import the commands (for a bag: --command-topic TOPIC), or set model.arms.mode: prescribed"
             raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
         rows = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)].T
         held = [servos[name].command_interpolation == "held" for name in driven]
