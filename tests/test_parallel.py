@@ -256,7 +256,7 @@ class Breaking(InlineExecutor):
 
 def test_an_executor_that_breaks_leaves_what_was_done(tmp_path):
     found = run_tasks(slow, tasks_of(3), tmp_path, Breaking())
-    assert [(entry.value, entry.error) for entry in found] == [(0, ""), *[(None, "the executor broke")] * 2]
+    assert [(entry.value, entry.error) for entry in found] == [(0, ""), *[(None, "the workers were lost")] * 2]
 
 
 def test_one_process_and_two_find_the_same(tmp_path):

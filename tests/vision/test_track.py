@@ -192,7 +192,7 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, messa
     with pytest.raises(DataError, match="no frame could be used") as caught:
         track_object(SceneDescription(system), small.recording, sequence, options)
     assert message in caught.value.what
-    assert f": in {len(small.clouds)} of {len(small.clouds)}" in caught.value.what  # all for one reason
+    assert f"In {len(small.clouds)} of {len(small.clouds)} frames, " in caught.value.what  # all for one reason
     assert "dimensions contradict the model" not in caught.value.what
     assert caught.value.hint
 

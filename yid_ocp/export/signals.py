@@ -76,8 +76,8 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
             with atomic_write(path) as temporary:
                 os.replace(file, temporary)
     except OSError as error:
-        what, hint = f"the file cannot be written: {os_error_reason(error)}", "choose another folder or free space"
-        raise OutputError(what, where=str(path), hint=hint) from error
+        what, hint = f"the file cannot be written: {os_error_reason(error)}", "choose another --out, or free disk space"
+        raise OutputError(what, where=str(path), allowed="a writable folder with free space", hint=hint) from error
     return shift
 
 

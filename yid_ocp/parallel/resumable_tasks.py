@@ -70,8 +70,8 @@ class WorkerConfig:
 
     def __post_init__(self) -> None:
         if self.n_processes is not None and self.n_processes < 1:
-            what, allowed = f"{self.n_processes} workers are requested", "a whole number from 1"
-            raise ConfigError(what, where="--workers", allowed=allowed, hint="set a number, or remove the option")
+            what, hint = f"{self.n_processes} workers are requested, but 1 is needed", "set --workers 1, or omit it"
+            raise ConfigError(what, where="--workers", allowed="a whole number from 1", hint=hint)
         if self.n_processes is not None and self.scheduler_address:
             what, where = "the number of workers is given together with a scheduler", "--workers and --scheduler"
             hint = "remove --workers: the scheduler knows how many workers it has"
@@ -164,7 +164,7 @@ def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _
         at_once = 1 if isinstance(executor, InlineExecutor) else len(jobs)
         lost, never = _drain(executor, jobs, at_once, finished, look)
         for job in (*lost, *never):
-            finished(job, job.kept() or TaskResult(job.task.name, error="the executor broke"))
+            finished(job, job.kept() or TaskResult(job.task.name, error="the workers were lost"))
 
 
 def _task_input(function: _TaskFunction, task: Task, code: str) -> dict[str, Any]:
@@ -351,7 +351,7 @@ def _dask_executor(
 
     def look() -> None:
         if not client.nthreads():
-            log.warning("the scheduler at %s has no workers; tasks wait for them", scheduler)
+            log.warning("the scheduler at %s has no workers, so the tasks wait: start `dask worker`", scheduler)
 
     with client:
         look()

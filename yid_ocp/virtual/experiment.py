@@ -45,7 +45,7 @@ def baxter_foam_y_system(arms: int) -> System:
     every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms.
     """
     if arms not in (1, 2):
-        raise ConfigError(f"there is no system with {arms} arms", where="arms", allowed="1 or 2", hint="choose 1 or 2")
+        raise ConfigError(f"there is no system with {arms} arms", where="arms", allowed="1 or 2", hint="pass arms=1")
     sides = ("left", "right")[:arms]
     names = [f"{side}_{joint}" for side in sides for joint in joint_motion.BAXTER_JOINT_NAMES_WITHOUT_SIDE]
     robot = read_urdf("package:baxter", joints=names)
@@ -209,8 +209,8 @@ def _joints(
 
 def _by_joint(std: float | tuple[float, ...], joints: int, where: str) -> Array:
     if np.ndim(std) and np.size(std) != joints:
-        what, allowed = f"{np.size(std)} standard deviations for {joints} joints", f"1 or {joints} standard deviations"
-        raise ConfigError(what, where=where, allowed=allowed)
+        what, allowed = f"there are {np.size(std)} standard deviations for {joints} joints", f"1 or {joints} of them"
+        raise ConfigError(what, where=where, allowed=allowed, hint="pass one number, or one for each driven joint")
     return np.asarray(std, dtype=float)
 
 
@@ -278,7 +278,7 @@ def recording_with_sensor_error(
     if joints.effort is None:
         what = f"recording '{recording.name}' has no joint efforts, from which the effect {kind} is computed"
         where, allowed = f"{kind}@{location}", "recordings with joint efforts"
-        raise ModelError(what, where=where, allowed=allowed, hint="remove this effect")
+        raise ModelError(what, where=where, allowed=allowed, hint="pass a recording with efforts, or omit this effect")
     if kind == "effort_delay":
         effort = joints.effort.copy()
         # an effort acts only after the delay, so the recording contains it earlier

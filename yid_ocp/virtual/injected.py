@@ -328,7 +328,7 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     turn = value(frame.placement.rotation).reshape(3, 3, order="F")
     mass = size["mass"]
     if not np.linalg.norm(reach) <= _MAX_INJECTED_PAYLOAD_DISTANCE * abs(mass):
-        what = f"the added mass is {np.linalg.norm(reach) / max(abs(mass), 1e-300):.3g} m from its frame"
+        what = f"the added mass is too far, {np.linalg.norm(reach) / max(abs(mass), 1e-300):.3g} m from its frame"
         allowed = f"a distance |(mx, my, mz)/mass| of at most {_MAX_INJECTED_PAYLOAD_DISTANCE:g} m"
         raise ModelError(what, where=where, allowed=allowed, hint="give smaller mx, my, mz, or a larger mass")
     point = value(frame.placement.translation) + turn @ reach / mass
@@ -339,7 +339,7 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     tensor += own * mass / (own + mass) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
     moments, axes = np.linalg.eigh(tensor)
     if own + mass <= 0 or moments[0] <= 0:
-        what = "the effect removes more mass or inertia than the link has"
+        what = f"the effect, with mass {mass:.3g} kg, removes more mass or inertia than the link has ({own:.3g} kg)"
         hint = "give a less negative mass, or one nearer to the link's centre of mass"
         raise ModelError(what, where=where, allowed="a positive mass and inertia of the link", hint=hint)
     axes[:, 2] *= np.linalg.det(axes)

@@ -270,6 +270,6 @@ def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[i
     if miss > 1e-7:
         where = ", ".join(f"{grasp.holder_frame} -> {grasp.held_frame}" for grasp in system.grasps)
         what = f"the grippers miss the grasped points by {1e3 * miss:.3g} mm at the best joint angles found"
-        hint = "place the object nearer to the robot (model.object), or give other start angles"
+        hint = "set model.object.mount.xyz nearer to the robot, or pass other start_angles or offsets"
         raise ModelError(what, where=where, allowed="grasps within reach and within the joint limits", hint=hint)
     return at(result.x)

@@ -271,7 +271,8 @@ def mujoco_xml(
         Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
     """
     if not time_step > 0:
-        raise ConfigError(f"time_step = {time_step} is not above 0", where="mujoco_xml", allowed="a number above 0 [s]")
+        what, hint = f"time_step is {time_step}, but must be above 0", "pass for example time_step=0.0005"
+        raise ConfigError(what, where="mujoco_xml", allowed="a number above 0 [s]", hint=hint)
     tree, weights = _weighed(system.mechanism_with_values(values))
     value = CasadiEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
@@ -315,7 +316,7 @@ def _bodies(
         if _shares_body(tree, j):
             elements[j] = elements[joint.parent_index]
             if joint.parent_index in carried:
-                what = f"the frame '{carried[joint.parent_index]}' is on a joint without mass"
+                what = f"the frame '{carried[joint.parent_index]}' is on a joint without mass, which MuJoCo cannot hold"
                 where, hint = f"joint '{joint.name}'", "give a mass to the link that carries the frame"
                 raise ModelError(what, where=where, allowed="frames on links with mass", hint=hint)
         else:
@@ -332,8 +333,7 @@ def _bodies(
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
             SubElement(elements[j], "joint", {**kind, **gears[name]})
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
-            what = "more than six joints in series have no mass between them"
-            hint = "give a mass to one of the links between them"
+            what, hint = "more than six joints in series have no mass between them", "give a link between them a mass"
             allowed = "up to six joints in series, with a mass on the link of the last one"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         body = merge_inertias(joint.bodies)
@@ -354,7 +354,7 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
         shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
         if len(shares) > 1:
             what, where = "the ratio of weight to mass differs between bodies of one joint", f"joint '{joint.name}'"
-            hint = "remove one of the effects that change weights"
+            hint = "leave out one of the effects that change weights (model.effects)"
             raise ModelError(what, where=where, allowed="one ratio for all bodies of a joint", hint=hint)
         weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
     return tree.with_gravity_fraction(None), weights
@@ -449,7 +449,7 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
             changed = elements_by_aspect_and_file_format()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
             allowed = ", ".join(own["is"] for name, own in elements_by_aspect_and_file_format().items() if name in able)
-            where, hint = f"effect '{effect.kind}@{effect.location}'", "remove the effect"
+            where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out of model.effects"
             raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
@@ -459,15 +459,15 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
     for joint, compliance in system.joint_compliances.items():
         if value._is_zero_at_parameter_values(compliance):
             what = f"the compliance of joint '{joint}' is zero, an infinite stiffness, which MuJoCo cannot express"
-            hint = "remove the effect that adds the compliance"
+            hint = "leave out the effect that adds the compliance (model.effects)"
             raise ModelError(what, where=f"joint '{joint}'", allowed="a compliance above zero", hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):
-            what, hint = f"the servo of '{joint}' has a dead band", f"set {joint}.servo_dead_band to 0"
+            what, hint = f"the servo of '{joint}' has a dead band, unlike MuJoCo's", f"set {joint}.servo_dead_band to 0"
             raise ModelError(what, where=f"joint '{joint}'", allowed=f"{joint}.servo_dead_band: 0", hint=hint)
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
-        what, allowed, hint = "the recorded time is scaled", "a time scale of 1", "remove the effect on the clock"
-        raise ModelError(what, where="effects of the model", allowed=allowed, hint=hint)
+        what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave the effect on the clock out"
+        raise ModelError(what, where="model.effects", allowed="a time scale of 1", hint=hint)
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:

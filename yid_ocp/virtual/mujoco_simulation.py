@@ -69,15 +69,17 @@ class SimulationOptions:
         inner = self._steps_per_period
         if periods < 1 or abs(periods * self.sample_rate / controller - 1.0) > 1e-9:
             what = f"controller_rate = {controller:g} Hz is not a multiple of sample_rate = {self.sample_rate:g} Hz"
-            raise ConfigError(what, where="controller_rate", allowed="k * sample_rate with a whole number k from 1")
+            allowed, hint = "k * sample_rate, k = 1, 2, ...", f"pass {max(periods, 1) * self.sample_rate:g} for example"
+            raise ConfigError(what, where="controller_rate", allowed=allowed, hint=hint)
         if inner < 1 or abs(inner * self.time_step * controller - 1.0) > 1e-9:
             what = f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz"
-            raise ConfigError(what, where="time_step", allowed="1 / (k * controller_rate) with a whole number k from 1")
+            allowed, hint = "1 / (k * controller_rate), k = 1, 2, ...", f"pass 1 / {max(inner, 1) * controller:g}"
+            raise ConfigError(what, where="time_step", allowed=allowed, hint=hint)
         require_known_names([self.effort_kind], get_args(EffortSamplingKind), "kind", "effort_kind", ConfigError)
         if self.effort_kind == "command" and periods > 1:
             what = f"effort_kind = 'command', but the controller ({controller:g} Hz) changes commands within a sample"
             allowed = f"sample or mean; command with controller_rate = {self.sample_rate:g} Hz"
-            raise ConfigError(what, where="effort_kind", allowed=allowed)
+            raise ConfigError(what, where="effort_kind", allowed=allowed, hint="pass effort_kind='mean'")
 
     @property
     def _controller_rate(self) -> float:
@@ -152,8 +154,8 @@ def simulate_in_mujoco(
     """
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
-        allowed = f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
-        what, hint = "the motion does not move exactly the driven joints", "give a motion of the driven joints"
+        allowed = f"a motion of the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
+        what, hint = "the motion does not move exactly the driven joints", "pass a motion of all driven joints"
         raise ModelError(what, where=f"motion of {', '.join(motion.joints) or 'nothing'}", allowed=allowed, hint=hint)
     mujoco = import_mujoco()
     model = mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
@@ -179,7 +181,7 @@ def simulate_in_mujoco(
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
-        hint = f"set a time_step shorter than {chosen.time_step:g} s, or give a slower motion"
+        hint = f"pass a time_step shorter than {chosen.time_step:g} s, or a slower motion"
         raise ModelError("the simulation diverged", where="MuJoCo", allowed="finite positions and efforts", hint=hint)
     return result
 
@@ -329,11 +331,11 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
         if _lost(scene):
             what = "the simulation diverged before the motion began, while the object settled"
-            hint = "set a shorter time_step, or initial joint angles nearer to the grasp"
+            hint = "pass a shorter time_step, or initial_joint_angles nearer to the grasp"
             raise ModelError(what, where="MuJoCo", allowed="finite positions and velocities", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)
-    what = f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)"
+    what = f"the object still moves at {calm:.2g} rad/s after {_SETTLING_LIMIT:g} s of settling (limit {_REST:g} rad/s)"
     hint = "give every joint of the object more damping, and enough stiffness to carry the weight"
     raise ModelError(what, where="settling before the motion", allowed="an object that comes to rest", hint=hint)
 
@@ -415,14 +417,15 @@ def replay_mismatch_by_channel(
     joints = recording.joints
     missing = set(moved).difference(() if joints is None else joints.names)
     if joints is None or missing or not moved:
-        what = f"the recording has no angles of {', '.join(sorted(missing)) or 'a driven or prescribed joint'}"
-        allowed, hint = "angles of all driven and prescribed joints", "import a file with the missing angles again"
+        names = f"{', '.join(sorted(missing)) or 'a joint'}, of the {len(moved)} joints that are driven or prescribed"
+        what, hint = f"the recording has no angles of {names}", "import it again from a file with these joints"
+        allowed = "angles of all driven and prescribed joints"
         raise ModelError(what, where=f"recording '{recording.name}': joints", allowed=allowed, hint=hint)
     columns = [joints.names.index(name) for name in moved]
     quantity, words = ("position_command", "commanded positions") if system.servos else ("effort", "efforts")
     if system.driven and getattr(joints, quantity) is None:
-        what, where = f"the driven joints of the model need {words}", f"recording '{recording.name}': joints/{quantity}"
-        raise ModelError(what, where=where, allowed=f"recorded {words}", hint=f"import the {words} too")
+        what, where = f"the recording has no {words} of the driven joints", f"recording '{recording.name}': joints"
+        raise ModelError(what, where=where, allowed=f"the channel {quantity}", hint=f"import it again with {words}")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
     effort = None if joints.effort is None else joints.effort[:, columns]
     scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
@@ -534,7 +537,7 @@ def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
 ) -> dict[str, ReplayErrorAgainstRecording]:
     if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
-        what, hint = "the simulation in MuJoCo diverged", "set a smaller `timestep` in the file"
+        what, hint = "the replay in MuJoCo diverged", "set a smaller `timestep` under `option` in the MJCF text"
         raise ModelError(what, where=f"recording '{recording.name}'", allowed="finite positions and efforts", hint=hint)
     found: dict[str, ReplayErrorAgainstRecording] = {}
     t = joints.t - joints.t[0]

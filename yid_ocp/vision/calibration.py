@@ -223,7 +223,7 @@ class CameraCalibration:
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
     """Return a calibration with the specified pose and clock offset. `reason` says why nothing was estimated."""
     offset = options.initial_stamp_minus_joint_time
-    text = f"clock offset {1e3 * offset:.0f} ms as specified" + (f": {reason}" if reason else "")
+    text = f"clock offset {1e3 * offset:.0f} ms as specified" + f" (not estimated, because {reason})" * bool(reason)
     state = CameraState(pose, clock_offset=offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
@@ -253,7 +253,7 @@ def calibrate_camera(
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_without_estimation(pose, clock, reason)
         known = "track.options.calibration.fix_pose: true and track.options.clock_offset_search.search_half_width: 0"
-        hint = f"{advice}; if pose and clock are known, set {known}"
+        hint = f"{advice}; if camera pose and clock are known, set {known}"
         what, allowed = f"the camera cannot be calibrated by the arm: {reason}", "frames that show the moving arm"
         raise DataError(what, where=source, allowed=allowed, hint=hint) from None
 
@@ -285,7 +285,7 @@ class _Calibrator:
     def run(self, frames: Sequence[StampedCloud]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
         if len(glimpses) < _MIN_FRAMES:
-            needed = f"the arm is in view in {len(glimpses)} frames, {_MIN_FRAMES} are needed"
+            needed = f"the arm is in view in {len(glimpses)} frames, but at least {_MIN_FRAMES} are needed"
             raise _UntoldError(needed, "turn the camera so that it sees the arm, or record for longer")
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
@@ -297,18 +297,20 @@ class _Calibrator:
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _MIN_FRAMES:
-                told = f"one clock offset fits only {len(chosen)} of {len(used)} frames, {_MIN_FRAMES} are needed"
-                raise _UntoldError(told, "check the frames' time stamps: one clock without jumps")
+                told = f"one clock offset fits only {len(chosen)} of {len(used)} frames, but at least {_MIN_FRAMES}"
+                raise _UntoldError(f"{told} are needed", "check that all time stamps come from one clock without jumps")
         presence = seen_occluded_and_seen_through_surface_fractions(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= _MIN_ARM_COVERAGE * free:
-            seen = f"points are seen behind {100 * presence.through / max(free, 1e-9):.0f} % of the arm's surface"
-            hint = "check the specified pose, the robot's description and which recording belongs to the frames"
-            raise _UntoldError(f"{seen}, for every camera pose and clock offset tried", hint)
+            seen, least = 100 * presence.there / max(free, 1e-9), 100 * _MIN_ARM_COVERAGE
+            told = f"points lie on {seen:.0f} % of the arm's unobstructed surface, but {least:.0f} % are needed"
+            hint = "check track.camera_pose, model.robot and whether recordings.estimate is of the same motion"
+            raise _UntoldError(told, hint)
         covariance = cost(state).state_covariance(self.precision)
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < _MAX_CLOCK_OFFSET_STD:
-            told = f"the arm moves too little to determine the clock offset, whose std is {1e3 * std:.0f} ms"
+            limit = f"{1e3 * std:.0f} ms, but must be below {1e3 * _MAX_CLOCK_OFFSET_STD:.0f} ms"
+            told = f"the arm moves too little to determine the clock offset, whose std is {limit}"
             known = "set track.options.clock_offset_search.initial_stamp_minus_joint_time, and search_half_width: 0"
             raise _UntoldError(told, f"record a faster motion, or {known}")
         used_state = state
@@ -364,7 +366,7 @@ class _Calibrator:
             if len(near) >= MIN_ARM_POINTS_PER_FRAME:
                 chosen.append(StampedCloud(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _MIN_FRAMES:
-            hint = "check the specified pose and the unit of the clouds"
+            hint = "check track.camera_pose and track.point_cloud_unit"
             raise _UntoldError(f"only {len(chosen)} frames have points on the arm, {_MIN_FRAMES} are needed", hint)
 
         def cost(state: CameraState) -> RobustCostDerivatives:
@@ -395,11 +397,11 @@ class _Calibrator:
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTION_STDS**2 * 3:
-                off = f"it sees the arm {1e3 * away:.0f} mm from its place by the joint angles"
-                words.append(f"the arm contradicts the fixed pose of the camera: {off} (included in each point's std)")
+                off = f"the camera at its fixed pose sees the arm {1e3 * away:.0f} mm from its place by the joints"
+                words.append(f"{off} (part of each point's std); track.options.calibration.fix_pose: false corrects it")
         elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
-            off = f"the camera at its specified pose sees the arm {1e3 * away:.0f} mm from its place by the joints:"
-            moved = f"pose wrong by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm"
-            words.append(f"{off} {moved}, depth measured {math.exp(-change[DEPTH_SCALE_INDEX]):.3f} times as large")
+            off = f"the camera at its specified pose sees the arm {1e3 * away:.0f} mm from its place by the joints"
+            moved = f"its pose is corrected by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm"
+            words.append(f"{off}; {moved}, its depth is {math.exp(-change[DEPTH_SCALE_INDEX]):.3f} times the true one")
         return "; ".join(words)

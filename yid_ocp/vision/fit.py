@@ -81,7 +81,7 @@ class ShapeFitOptions:
         check_option_bounds(self, "fit options")
         if not self.node_loss_scales and not self.surface_loss_scales:
             what, where = "node_loss_scales and surface_loss_scales are both empty", "track.options.shape_fit"
-            raise ConfigError(what, where=where, allowed="one scale or more [m]", hint="add a scale to one setting")
+            raise ConfigError(what, where=where, allowed="one scale or more [m]", hint="set node_loss_scales: [0.05]")
 
 
 class ShapeFitter:
@@ -101,7 +101,7 @@ class ShapeFitter:
         self.system = system
         self.options = options or ShapeFitOptions()
         if not system.segment_layouts:
-            what, hint = "the model has no object whose shape could be fitted", "set model.object with segments"
+            what, hint = "the model has no object whose shape could be fitted", "set model.object, such as kind: foam_y"
             raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
         bends = [entry for entry in system.elastic_joints if entry.deformation == "bend" and entry.axis]
         self.bend_joints = tuple(system.mechanism.joint_index(entry.joint_name) for entry in bends)
@@ -162,7 +162,8 @@ class ShapeFitter:
         """
         if not len(cloud.points) or not len(cloud.skeleton_nodes):
             what = f"the filtered cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
-            raise DataError(what, where="cloud", allowed="one or more", hint="loosen track.options.filters")
+            hint = "pass a cloud with points; if filters removed them, loosen track.options.filters"
+            raise DataError(what, where="cloud", allowed="points and skeleton_nodes of shape (n, 3), n >= 1", hint=hint)
         free = list(self.free_joints)
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]

@@ -47,8 +47,7 @@ def _read_cloud(path: Path, coloured: bool = False) -> _Cloud:
 
 
 def _read_npz(path: Path) -> _Cloud:
-    allowed = f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers from 0"
-    allowed += " to 255 if wanted"
+    allowed = f"`{_POINTS_ARRAY}`: numbers of shape (N, 3); optional `{_COLOURS_ARRAY}`: uint8 of shape (N, 3)"
     try:
         with zipfile.ZipFile(path) as packed:
             files.check_not_too_many_numbers(sum(entry.file_size for entry in packed.infolist()), str(path))
@@ -58,10 +57,10 @@ def _read_npz(path: Path) -> _Cloud:
         raise _damaged(path, "it is damaged, or not an NPZ file") from error
     points, colours = arrays.get(_POINTS_ARRAY), arrays.get(_COLOURS_ARRAY)
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        what, hint = f"the file has no array `{_POINTS_ARRAY}` of points", "write the points as this array"
+        what, hint = f"the file has no array `{_POINTS_ARRAY}` of points", "write it with numpy.savez(FILE, points=xyz)"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
-        what, hint = f"the array `{_COLOURS_ARRAY}` is not one RGB colour per point", "correct it, or leave it out"
+        what, hint = f"the array `{_COLOURS_ARRAY}` is not one RGB colour per point", "write uint8, or leave it out"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     return points.astype(np.float64), colours
 
@@ -72,9 +71,9 @@ def _read_xyz(path: Path) -> _Cloud:
             warnings.simplefilter("ignore", UserWarning)
             rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
     except (OSError, ValueError, UnicodeDecodeError) as error:
-        raise _damaged(path, "it is not a table with x y z in every row") from error
+        raise _damaged(path, "it is not a table with numbers x y z in every row") from error
     if rows.shape[0] and rows.shape[1] < 3:
-        raise _damaged(path, f"it has {rows.shape[1]} columns instead of x y z")
+        raise _damaged(path, f"it has {rows.shape[1]} columns, but needs x, y and z")
     seen = rows[:, 3:6]
     coloured = seen.shape[1] == 3 and bool(((seen >= 0) & (seen <= 255) & (seen == np.rint(seen))).all())
     return rows[:, :3].copy(), seen.astype(np.uint8) if coloured else None
@@ -85,7 +84,7 @@ def _read_pcd(path: Path) -> _Cloud:
     with path.open("rb") as file:
         declared = _PCD_POINT_COUNT.search(file.read(_PCD_HEADER_BYTES))
     if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
-        raise _damaged(path, f"it is cut off: {path.stat().st_size} bytes for {int(declared[1])} points")
+        raise _damaged(path, f"it is cut off and has only {path.stat().st_size} bytes for {int(declared[1])} points")
     # Open3D prints errors to standard output and returns an empty cloud
     try:
         with files.limit_process_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -106,7 +105,7 @@ def _read_depth_image(path: Path) -> Array:
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
         what = f"the depth image has shape {image.shape}, type {image.dtype}" if image.size else "the image is damaged"
-        raise DataError(what, where=str(path), allowed="16-bit grey PNG", hint="write the image again as 16-bit PNG")
+        raise DataError(what, where=str(path), allowed="16-bit grey PNG", hint="export it again as 16-bit grey PNG")
     return image.astype(np.float64)
 
 
@@ -142,7 +141,8 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
 
 
 def _damaged(path: Path, why: str) -> DataError:
-    allowed, hint = f"a complete {path.suffix} file with x, y, z of points", "copy the file again, or export it again"
+    allowed = f"a complete {path.suffix} file with x, y and z of every point"
+    hint = f"export the cloud again with x, y and z of every point, or remove its row from {STAMP_FILE}"
     return DataError(f"the point cloud cannot be used: {why}", where=str(path), allowed=allowed, hint=hint)
 
 
@@ -177,7 +177,7 @@ def _vertices(
         raise _damaged(path, "its vertices lack x, y or z, contain lists, or name a property twice")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if count * size > len(body) + (not order):  # the last line of a text may end without a newline
-        raise _damaged(path, f"it is cut off: {len(body)} bytes for {count} points")
+        raise _damaged(path, f"it is cut off and has only {len(body)} bytes for {count} points")
     if not count:
         raise _damaged(path, "it has no vertices")
     wanted = [*_AXIS_PROPERTIES, *(_COLOUR_PROPERTIES if coloured and set(_COLOUR_PROPERTIES) <= set(names) else ())]
@@ -191,7 +191,7 @@ def _vertices(
         except (ValueError, IndexError) as error:
             raise _damaged(path, f"a vertex differs from the header ({error})") from error
     if len(values) < count:
-        raise _damaged(path, "vertices are missing")
+        raise _damaged(path, f"it has {len(values)} of the {count} vertices that its header states")
     return values[:, :3], values[:, 3:].astype(np.uint8) if len(wanted) > 3 else None
 
 
@@ -214,8 +214,9 @@ def read_frame_folder(
     """
     path = Path(folder)
     if not path.is_dir():
-        allowed = f"a folder with {STAMP_FILE} and clouds or depth images"
-        raise DataError("there is no such folder", where=str(path), allowed=allowed, hint="correct track.frames_path")
+        what = "a file stands where a folder is needed" if path.exists() else "the folder of frames does not exist"
+        allowed, hint = f"a folder with {STAMP_FILE} and clouds or depth images", "pass the path of such a folder"
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
     camera = frames.validated_camera_pose(head.get("pose") if pose is None else pose, where)
@@ -251,8 +252,8 @@ def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             made = o3d.t.io.write_point_cloud(str(path / name), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
         if not made:
-            hint = "choose another folder, or free disk space"
-            raise OutputError("the cloud cannot be written", where=str(path / name), hint=hint)
+            allowed, hint = "a writable folder on a disk with free space", "choose another folder, or free disk space"
+            raise OutputError("Open3D cannot write the cloud", where=str(path / name), allowed=allowed, hint=hint)
     pose = sequence.camera_pose.tolist()
     head: dict[str, Any] = {"format": _FRAMES_FORMAT, "pose": pose, "frame": "camera", "unit": "m"}
     if sequence.intrinsics is not None:
@@ -275,11 +276,12 @@ def _read_camera(path: Path) -> dict[str, Any]:
         return {}
     head = files.read_input_json(path)
     if not isinstance(head, dict):
-        what, hint = "the file is not a JSON object", 'write {"pose": [[...], ...], "unit": "m"}'
+        what, hint = "the file holds no JSON object {...}", 'write for example {"pose": [[...], ...], "unit": "m"}'
         raise DataError(what, where=str(path), allowed=f"an object with {', '.join(_CAMERA_FILE_KEYS)}", hint=hint)
     require_known_names(head, _CAMERA_FILE_KEYS, "key", str(path), DataError)
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
-        what, hint = f"the format of the frames is '{head['format']}'", "update yid_ocp, or leave `format` out"
+        what = f"the format of the frames is '{head['format']}', which this version of yid_ocp does not read"
+        hint = "update yid_ocp, or leave `format` out"
         raise DataError(what, where=f"{path}: format", allowed=_FRAMES_FORMAT, hint=hint)
     return head
 
@@ -289,11 +291,11 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: frames.CameraIn
     for name in names:
         kind = Path(name).suffix.lower()
         if kind not in known:
-            what, hint = f"'{name}' is neither a cloud nor a depth image", "remove the row, or convert the file"
+            what, hint = f"'{name}' is neither a cloud nor a depth image", "convert the file, or remove its row"
             raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known), hint=hint)
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
-            what, hint = "the intrinsics of the camera are missing; depth images need them", "add the key `intrinsics`"
-            allowed = "intrinsics with width, height, fx, fy, cx, cy [pixels]"
+            what, hint = f"the intrinsics of the camera are missing, which '{name}' needs", "add the key `intrinsics`"
+            allowed = '"intrinsics": {"width": 640, "height": 480, "fx": 577, "fy": 577, "cx": 319.5, "cy": 239.5}'
             raise DataError(what, where=str(folder / _CAMERA_FILE), allowed=allowed, hint=hint)
 
 
@@ -304,44 +306,44 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        what = f"the intrinsics have the keys: {', '.join(map(str, entry)) if isinstance(entry, dict) else 'none'}"
-        raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint="write exactly the allowed keys")
+        keys = ", ".join(map(str, entry)) if isinstance(entry, dict) else "none"
+        what, hint = f"the intrinsics have wrong or missing keys: {keys}", "add missing keys, remove unknown ones"
+        raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
     if not isinstance(coefficients, (list, tuple)) or not all(type(k) in (int, float) for k in coefficients):
         what = f"the lens' coefficients {coefficients!r} are no list of numbers"
-        raise DataError(what, where=f"{where}: intrinsics", allowed="[number, ...]")
+        allowed, hint = "a list such as [0.1, -0.2, 0, 0]", "write the calibration's, or leave `coefficients` out"
+        raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     model, distortion = str(entry.get("model", "plumb_bob")), tuple(float(k) for k in coefficients)
     return frames.CameraIntrinsics(int(width), int(height), fx, fy, cx, cy, model, distortion)
 
 
 def _number(value: object, name: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
-        raise DataError(f"{name} is {value!r}", where=where, allowed="a finite number above 0")
+        what, hint = f"{name} is {value!r}, but must be above 0", "correct it; depth_unit is 0.001 for images in mm"
+        raise DataError(what, where=where, allowed="a finite number above 0 [m or pixels]", hint=hint)
     return float(value)
 
 
 def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
-    allowed = "CSV with the columns file, t [s]"
+    allowed, hint = "CSV with the columns file, t [s]", "write the row file,t and one for each frame, as 0.ply,0.033"
     if not path.exists():
-        what, hint = "the file of time stamps does not exist", "write the file, with one row per frame"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
+        raise DataError("the file of time stamps does not exist", where=str(path), allowed=allowed, hint=hint)
     try:
         rows = list(csv.DictReader(files.read_input_text(path).splitlines()))
     except csv.Error as error:
-        what, hint = f"the time stamps are not CSV ({error})", "write the file again as CSV"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
+        raise DataError(f"the file is not CSV: {error}", where=str(path), allowed=allowed, hint=hint) from error
     if not rows:
-        what, hint = "the table of time stamps has no rows", "add one row per frame"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
+        raise DataError("the table of time stamps has no rows", where=str(path), allowed=allowed, hint=hint)
     if not {"file", "t"} <= set(rows[0]):
-        what, hint = f"the columns are {', '.join(map(str, rows[0]))}", "rename the columns to file and t"
+        what, hint = f"the columns are {', '.join(map(str, rows[0]))}, not file and t", "rename them to file and t"
         raise DataError(what, where=f"{path}, line 1", allowed=allowed, hint=hint)
     times = []
     for number, row in enumerate(rows, start=2):
         try:
             times.append(float(row["t"]))
         except (TypeError, ValueError) as error:
-            where, hint = f"{path}, line {number}", "correct the time, or remove the row"
-            raise DataError(f"the time is {row['t']!r}", where=where, allowed="a number [s]", hint=hint) from error
+            what, where = f"the time is {row['t']!r}, but must be a number", f"{path}, line {number}"
+            raise DataError(what, where=where, allowed="seconds", hint="correct it, or remove the row") from error
     return tuple(str(row["file"]) for row in rows), np.array(times)

@@ -28,6 +28,7 @@ _DEPTH_ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4
 """Encodings of depth images: type of a pixel and its unit [m]; REP 118. RealSense's files say `mono16`."""
 _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of the fields of a PointCloud2."""
+_DAMAGED_FRAME_HINT = "record the bag again; `yid-ocp track` drops a damaged frame and uses the others"
 _PER_METRE = "/option/Depth_Units/value"  # topic of RealSense's files with the unit of their depth images [m]
 
 
@@ -94,8 +95,8 @@ def _first(bag: OpenBag, topic: str) -> Any:
 
 
 def _empty_topic(bag: OpenBag, topic: str) -> DataError:
-    what, allowed = f"the topic '{topic}' has no messages", "a topic with one message or more"
-    return DataError(what, where=str(bag.path), allowed=allowed, hint="choose another topic with track.frame_topic")
+    what, hint = f"the topic '{topic}' has no messages", "set track.frame_topic to another one, or record this one"
+    return DataError(what, where=str(bag.path), allowed="a topic with one message or more", hint=hint)
 
 
 def _depth_unit(bag: OpenBag, topic: str) -> float:
@@ -116,10 +117,12 @@ def _topic(bag: OpenBag, wanted: str | None) -> str:
     if len(deep) == 1:
         return deep[0]
     if deep:
-        what, hint = f"the bag has {len(deep)} topics of clouds or depth images", "choose one with track.frame_topic"
+        what = f"the bag has {len(deep)} topics of clouds or depth images, of which one must be chosen"
+        hint = f"set for example track.frame_topic: {deep[0]}"
         raise DataError(what, where=str(bag.path), allowed=", ".join(deep), hint=hint)
-    encoded = f"{_IMAGE_MESSAGE} with the encoding {' or '.join(_DEPTH_ENCODINGS)}, not compressed"
-    raise bag.no_usable_topics_error("the bag has no clouds and no depth images", f"{_CLOUD_MESSAGE}, or {encoded}")
+    allowed = f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} of {' or '.join(_DEPTH_ENCODINGS)}, not compressed"
+    hint = "record the camera's topic too, or set track.frames_path to the bag that has it"
+    raise bag.no_usable_topics_error("the bag has no clouds and no depth images", allowed, hint)
 
 
 def _is_depth(bag: OpenBag, topic: str) -> bool:
@@ -135,7 +138,7 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
-        what = f"the intrinsics of the camera are unknown: {len(nearest)} topics of the bag may contain them"
+        what = f"the intrinsics of the camera are unknown: {len(nearest) or 'no'} topics of the bag may contain them"
         allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
         raise DataError(what, where=str(bag.path), allowed=allowed, hint=f"record {beside_it}/camera_info as well")
     info = _first(bag, nearest[0])
@@ -148,8 +151,8 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
         return CameraIntrinsics(*size, fx, fy, cx, cy)
     fx, _, cx, _, fy, cy = matrix[:6]
     if not (fx > 0 and fy > 0):
-        hint = "calibrate the camera, or write a folder of frames with camera.json"
-        what, allowed = "the camera is not calibrated: a focal length is not above 0", "focal lengths above 0 [pixels]"
+        hint = "record with a calibrated camera, or write a folder of frames whose camera.json has the intrinsics"
+        what, allowed = f"the camera is not calibrated: fx = {fx:g}, fy = {fy:g}", "focal lengths above 0 [pixels]"
         raise DataError(what, where=f"{bag.path}: {nearest[0]}", allowed=allowed, hint=hint)
     model = {"": "plumb_bob", "fisheye": "equidistant"}.get(str(info.distortion_model), str(info.distortion_model))
     return CameraIntrinsics(*size, fx, fy, cx, cy, model, tuple(bent))
@@ -158,16 +161,16 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
 def _depth(content: Any, per_metre: float, where: str) -> Array:
     encoding = str(content.encoding)
     if encoding not in _DEPTH_ENCODINGS:
-        what, hint = f"the image has the encoding '{encoding}'", "choose a topic of depth images with track.frame_topic"
+        what, hint = f"'{encoding}' is no encoding of depth images", "set track.frame_topic to a topic of depth images"
         raise DataError(what, where=where, allowed=", ".join(_DEPTH_ENCODINGS), hint=hint)
     kind, size = _DEPTH_ENCODINGS[encoding]
     pixel = np.dtype((">" if content.is_bigendian else "<") + kind)
     height, width, step = int(content.height), int(content.width), int(content.step)
     data = np.asarray(content.data, np.uint8).tobytes()
     if step < width * pixel.itemsize or len(data) < height * step:
-        what = f"the image has {len(data)} bytes for {width} x {height} pixels"
+        what = f"the image is cut off and has only {len(data)} bytes for {width} x {height} pixels"
         allowed = f"at least {height * max(step, width * pixel.itemsize)} bytes"
-        raise DataError(what, where=where, allowed=allowed, hint="record the bag again, or leave this frame out")
+        raise DataError(what, where=where, allowed=allowed, hint=_DAMAGED_FRAME_HINT)
     image = np.ndarray((height, width), pixel, data, strides=(step, pixel.itemsize))
     return image.astype(np.float64) * (size * per_metre)
 
@@ -184,9 +187,8 @@ def _cloud_columns(content: Any, names: Iterable[str], where: str) -> list[NDArr
         kind = np.dtype(order + _POINT_FIELD_TYPES.get(int(fields[name].datatype), "u1"))
         offset = int(fields[name].offset)
         if offset + kind.itemsize > step or row < width * step or len(data) < height * row:
-            what = f"the cloud has {len(data)} bytes for {width} x {height} points of {step} bytes"
-            allowed, hint = "all bytes of all points", "record the bag again, or leave this frame out"
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+            what = f"the cloud is cut off and has only {len(data)} bytes for {width} x {height} points of {step} bytes"
+            raise DataError(what, where=where, allowed=f"{width * height * step} bytes", hint=_DAMAGED_FRAME_HINT)
         found.append(np.ndarray((height, width), kind, data, offset, (row, step)).ravel())
     return found
 
@@ -194,9 +196,9 @@ def _cloud_columns(content: Any, names: Iterable[str], where: str) -> list[NDArr
 def _points(content: Any, where: str) -> Array:
     axes = _cloud_columns(content, "xyz", where)
     if axes is None:
-        names = ", ".join(str(field.name) for field in content.fields)
-        hint = "choose another topic with track.frame_topic"
-        raise DataError(f"the cloud has the fields {names}", where=where, allowed="the fields x, y and z", hint=hint)
+        what = f"the cloud has the fields {', '.join(str(field.name) for field in content.fields)}, but not x, y and z"
+        hint = "set track.frame_topic to a topic whose clouds have x, y and z"
+        raise DataError(what, where=where, allowed="the fields x, y and z", hint=hint)
     return np.stack([axis.astype(np.float64) for axis in axes], axis=1)
 
 
@@ -228,9 +230,9 @@ def read_frames(
             return read_frame_folder(place, pose=pose, unit=unit)
     if place.is_dir() or (place.is_file() and place.suffix.lower() in _BAG_SUFFIXES):
         return _read_bag_frames(place, pose, unit or "m", topic)
+    what, hint = "there is no such file or folder of frames", "set track.frames_path to an existing folder or bag"
     if place.exists():
-        allowed = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})"
-        hint = "write depth images as 16-bit PNG into a folder with timestamps.csv and camera.json"
-        raise DataError("the file or folder is not a frame sequence", where=str(place), allowed=allowed, hint=hint)
-    allowed, hint = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})", "correct track.frames_path"
-    raise DataError("there is no such file or folder", where=str(place), allowed=allowed, hint=hint)
+        what = "the file is not a frame sequence"
+        hint = f"write its frames as .ply or 16-bit .png files into a folder with {STAMP_FILE} and camera.json"
+    allowed = f"a folder with {STAMP_FILE}, or a bag ({', '.join(_BAG_SUFFIXES)})"
+    raise DataError(what, where=str(place), allowed=allowed, hint=hint)

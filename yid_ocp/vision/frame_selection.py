@@ -108,7 +108,7 @@ _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a n
 def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str | None:
     """Return the reason to reject a frame for its own fit, regardless of other frames. None if it is good."""
     if not np.isfinite(fit.q).all():
-        return "the fit failed"
+        return "the fit of the shape failed, its angles are not finite"
     # a mean distance of normal noise is 0.8 of its standard deviation
     widest = options.max_mean_surface_distance_in_radii * float(shape.link_radii.mean())
     limit = math.hypot(widest, _MEAN_ABS_DEVIATION * shape.options.surface_noise_std)
@@ -119,9 +119,12 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
         return f"{_NO_FIT}: {off} allows {1e3 * limit:.1f} mm"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > _MAX_BEND_ANGLE:
-        return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
+        most = f"{math.degrees(_MAX_BEND_ANGLE):.0f} degrees are allowed"
+        return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees, {most}"
     if fit.visible_length_coverage < options.min_covered_visible_length_fraction:
-        return f"{_NO_FIT}: only {100 * fit.visible_length_coverage:.0f} % of its visible length has points of its own"
+        seen, least = (100 * x for x in (fit.visible_length_coverage, options.min_covered_visible_length_fraction))
+        off = f"only {seen:.0f} % of its visible length has points of its own, min_covered_visible_length_fraction"
+        return f"{_NO_FIT}: {off} requires {least:.0f} %"
     return None
 
 
@@ -138,9 +141,10 @@ def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport]) -> list[Frame
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
         if fit.mean_distance > _MAX_DISTANCE_OVER_MEDIAN * usual:
             off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, the median is {1e3 * usual:.1f} mm"
-            reason = f"the shape fits worse than in other frames: {off}"
+            reason = f"the shape fits worse than in other frames: {off} ({_MAX_DISTANCE_OVER_MEDIAN} times are allowed)"
         elif apart > _MAX_GRASP_GAP_CHANGE:
-            reason = f"{_END_ELSEWHERE}: {1e3 * apart:.0f} mm more than usual (a late stamp?)"
+            most = f"{1e3 * _MAX_GRASP_GAP_CHANGE:.0f} mm are allowed (its time stamp may be late)"
+            reason = f"{_END_ELSEWHERE}: the gap is {1e3 * apart:.0f} mm larger than usual, {most}"
         made[k] = replace(frames[k], drop_reason=reason)
     return made
 
@@ -182,10 +186,10 @@ def times_configurations_points_of_good_frames(
     if unseen.all():
         best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
         wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_seen_point_std).all())
-        limit = f"the smallest std is {best:.0f} mm, max_seen_point_std is {1e3 * options.max_seen_point_std:g} mm"
+        limit = f"the smallest std is {best:.0f} mm, but must be at most {1e3 * options.max_seen_point_std:g} mm"
         what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
-        check = f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame"
-        allowed = f"a frame in which a point has a std of at most {1e3 * options.max_seen_point_std:g} mm"
+        check = f"check track.camera_pose and the camera's clock ({calibration.message})"
+        allowed = "a std of at most track.options.max_seen_point_std for one point in one frame"
         raise DataError(what, where=source, allowed=allowed, hint=_hint(sizes, foreign_objects, check))
     position, std, shared = (np.where(unseen[..., None], np.nan, entry) for entry in (position, std, shared))
     return t, np.array([fit.q for fit in fits]), position, std, shared
@@ -198,24 +202,24 @@ def _none_good(
     for frame in frames:
         kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
     often = sorted(kinds.values(), key=len, reverse=True)[:3]
-    counts = [f"in {len(own)} of {len(frames)}{', for example,' * (len(set(own)) > 1)} {own[0]}" for own in often]
+    starts = [f"In {len(own)} of {len(frames)} frames, {'for example, ' * (len(set(own)) > 1)}" for own in often]
     most = next((reasons[0] for reasons in often), "")
     cause = _because(sizes, most.startswith(_MISFIT_REASONS))
-    hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
+    hint = "check track.camera_pose, track.point_cloud_unit and track.options.filters"
     of_cause = {
-        "stamp is late": "set track.options.clock_offset_search.initial_stamp_minus_joint_time, or drop late frames",
+        "stamp is late": "set track.options.clock_offset_search.initial_stamp_minus_joint_time to the offset [s]",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
         "from end to end": _hint(sizes, things, "tighten track.options.filters, or loosen them if a part is missing"),
-        "crosses or touches itself": "record the object without crossings, or look whether the filters join its parts",
+        "crosses or touches itself": "record the object without crossings and contacts of its parts",
     }
     hint = next((own for words, own in of_cause.items() if words in most), _hint(sizes, things, hint))
-    what, allowed = f"{cause}no frame could be used: {'; '.join(counts)}", "one usable frame or more"
-    return DataError(what, where=source, allowed=allowed, hint=hint)
+    what = ". ".join([f"{cause}no frame could be used", *(x + own[0] for x, own in zip(starts, often, strict=True))])
+    return DataError(what, where=source, allowed="one usable frame or more", hint=hint)
 
 
 def _because(sizes: TubeDimensionEstimates, matters: bool) -> str:
     """Beginning of an error message: the contradicted dimensions of the object, if they are the likely cause."""
-    return f"{sizes.contradiction_message}: " if matters and sizes.contradiction_message else ""
+    return f"{sizes.contradiction_message}, and " if matters and sizes.contradiction_message else ""
 
 
 def _hint(sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], otherwise: str) -> str:
@@ -243,9 +247,9 @@ def choose_root_end_of_frames(frames: Sequence[FrameReport], options: TrackOptio
     fitted = _good_fits(frames)
     two = [k for k in fitted if frames[k].alternative_fit is not None]
     if not two:
-        near = "the end nearest to approximate_root_position"
-        said = "determined by lengths and branches" if options.approximate_root_position is None else near
-        return _fixed(frames, options), f"root: {said}"
+        near = "is the end nearest to track.options.approximate_root_position"
+        said = "follows from the object's lengths and branches" if options.approximate_root_position is None else near
+        return _fixed(frames, options), f"the object's root {said}"
     made, last = list(frames), None
     for k in fitted:
         other_fit = made[k].alternative_fit
@@ -258,16 +262,16 @@ def choose_root_end_of_frames(frames: Sequence[FrameReport], options: TrackOptio
     between = float(np.median(np.linalg.norm(roots - tips, axis=1)))
     own = float(np.median(np.linalg.norm(roots - _ends(made[k].alternative_fit for k in two)[0], axis=1)))
     if own < _SAME_ROOT_FRACTION * between:
-        other, said = False, "determined; equal branches were followed from frame to frame, and may be exchanged"
+        other, said = False, "is determined; equal branches are followed from frame to frame, and may be exchanged"
     elif options.root_placement == "fixed" and max(moving) > _FIXED_ROOT_MOTION_RATIO * min(moving):
-        other, said = moving[0] > moving[1], "the end that stays in its place"
+        other, said = moving[0] > moving[1], "is the end that stays in its place"
     elif abs(above) > _HANGING_HEIGHT_FRACTION * between:
-        other, said = above < 0, "the higher end"
+        other, said = above < 0, "is the higher end"
     else:
-        other, said = False, "either end may be the root, one was chosen; approximate_root_position selects it"
+        other, said = False, "may be at either end, one is chosen; track.options.approximate_root_position selects it"
     if other:
         made = [_exchanged(frame) for frame in made]
-    return _fixed(made, options), f"root: {said}"
+    return _fixed(made, options), f"the object's root {said}"
 
 
 def _exchanged(frame: FrameReport) -> FrameReport:
@@ -294,8 +298,9 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
     if options.root_placement == "fixed" and good:
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
-            if away > _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std:
-                reason = f"the object's root is not where other frames have it: {1e3 * away:.0f} mm away"
+            if away > (most := _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std):
+                off = f"{1e3 * away:.0f} mm away, {1e3 * most:.0f} mm are allowed"
+                reason = f"the object's root is not where other frames have it: {off}"
                 made[k] = replace(frames[k], drop_reason=reason)
     return made
 

@@ -32,6 +32,14 @@ from yid_ocp.model.mechanism import homogeneous_transform
 
 PointColourArray = NDArray[np.uint8]
 
+
+class UnusableFrameError(DataError):
+    """A `DataError` that is raised for a frame that the tracking drops. Its `reason` is the frame's `drop_reason`."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason, where="frame", allowed="a frame that shows the object", hint="leave this frame out")
+
+
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Allowed numbers of coefficients by distortion model. Order: k1, k2, p1, p2, k3 (k4, k5, k6); equidistant k1 to k4."""
 _MAX_UNDISTORTION_STEPS = 30  # largest number of Newton steps for a pixel's direction
@@ -61,9 +69,10 @@ class CameraIntrinsics:
             raise DataError(f"the distortion model '{self.model}' is unknown", where="intrinsics: model", **known)
         count = _DISTORTION_COEFFICIENT_COUNTS.get(self.model, ())
         if self.has_distortion and (len(self.coefficients) not in count or not np.isfinite(self.coefficients).all()):
-            what = f"the distortion model '{self.model}' has the coefficients {self.coefficients}"
             allowed = f"{' or '.join(map(str, count))} finite numbers"
-            raise DataError(what, where="intrinsics: coefficients", allowed=allowed)
+            what = f"the distortion model '{self.model}' has the coefficients {self.coefficients}, not {allowed}"
+            hint = "copy all coefficients of the camera's calibration, or leave them out for a lens without distortion"
+            raise DataError(what, where="intrinsics: coefficients", allowed=allowed, hint=hint)
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal: float) -> CameraIntrinsics:
@@ -93,9 +102,9 @@ class CameraIntrinsics:
         """
         image, rays = np.asarray(depth, float), self.pixel_rays_at_unit_depth
         if image.shape != (self.height, self.width):
-            allowed = f"({self.height}, {self.width}), as in the intrinsics"
-            hint = "correct width and height of the intrinsics, or export the image in this size"
-            raise DataError(f"the image has shape {image.shape}", where="depth image", allowed=allowed, hint=hint)
+            what = f"the depth image has shape {image.shape}, but must have shape ({self.height}, {self.width})"
+            hint = "correct width and height in `intrinsics`, or export the image in this size"
+            raise DataError(what, where="depth image", allowed="(height, width) of the intrinsics", hint=hint)
         seen = np.flatnonzero(np.isfinite(image) & (image > 0) & np.isfinite(rays[..., 0]))
         # a third of the time that a mask over rows takes
         points = rays.reshape(-1, 3).take(seen, axis=0)
@@ -197,19 +206,17 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
     """Check and return a camera pose (4, 4). Raises `DataError` if it is missing or not a rigid transform."""
-    allowed = "a 4x4 matrix from camera to world coordinates: x right, y down, z forward, translation in metres"
-    hint = "set track.camera_pose, or, for a folder of frames, `pose` in its camera.json"
-    if pose is None:
-        raise DataError("the pose of the camera is missing", where=where, allowed=allowed, hint=hint)
     try:
         matrix = np.asarray(pose, float)
-    except (TypeError, ValueError) as error:
-        what = "the pose of the camera is not a matrix of numbers"
-        raise DataError(what, where=where, allowed=allowed, hint=hint) from error
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
     good = matrix.shape == (4, 4) and np.isfinite(matrix).all() and np.allclose(matrix[3], [0, 0, 0, 1])
     turn = matrix[:3, :3] if good else -np.eye(3)
     if not (np.allclose(turn.T @ turn, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0):
-        what, hint = "the pose of the camera is not a rigid transform", "make the axes orthonormal and right-handed"
+        fault = "not a rigid transform of shape (4, 4)" if matrix.size else "not a matrix of numbers"
+        what = f"the pose of the camera is {'missing' if pose is None else fault}"
+        allowed = "4x4 from camera (x right, y down, z forward) to world [m]: orthonormal axes, last row 0, 0, 0, 1"
+        hint = "set track.camera_pose (in Python: pose=), or, for a folder of frames, `pose` in its camera.json"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return matrix
 

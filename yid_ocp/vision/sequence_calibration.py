@@ -123,8 +123,7 @@ def foreign_clusters_to_objects(
         beside = bool(((low > box[1]) | (high < box[0])).any())
         how = f"moving with {link}" if link else "moving" if moving else "static"
         big, where = (mark.join(f"{x:.2f}" for x in of) for mark, of in ((" x ", size), (", ", centre)))
-        text = f"a foreign object of {big} m at ({where}) m ({how}, "
-        text += f"in {len(group)} of {len(clusters)} frames): "
+        text = f"a foreign object of {big} m is at ({where}) m ({how}, in {len(group)} of {len(clusters)} frames): "
         boxed = "leave it out with track.options.filters.box_lower and box_upper"
         if link:
             text += f"give its shape under model.surfaces_missing_from_urdf with parent_frame: {link}"
@@ -203,7 +202,7 @@ class TubeDimensionEstimates:
         """A text on model dimensions that contradict the frames and are not estimated. Empty if there are none."""
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
-            f"{self.names[i]}: {values[i]:.4g} mm in the model, {fitting[i]:.4g} mm by the fit"
+            f"{self.names[i]} is {values[i]:.4g} mm in the model, {fitting[i]:.4g} mm by the fit"
             for i in np.flatnonzero(self.contradicted_model_value_mask & ~np.array(self.estimated_dimension_mask))
         ]
         return f"the object's dimensions contradict the model ({'; '.join(wrong)})" if wrong else ""
@@ -220,7 +219,7 @@ class TubeDimensionEstimates:
             if self.estimated_dimension_mask[i]:
                 lines.append(f"{name} is estimated: {found}; {said}")
             elif self.contradicted_model_value_mask[i]:
-                remedy = f"estimate it: track.options.estimated_dimensions: [{name.rpartition('.')[2]}]"
+                remedy = f"set track.options.estimated_dimensions: [{name.rpartition('.')[2]}] to estimate it"
                 lines.append(f"{name} seems to be wrong: {found}, {said}. Measure it again, or {remedy}")
         return tuple(lines)
 

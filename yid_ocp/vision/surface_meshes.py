@@ -275,7 +275,7 @@ def load_robot_meshes_by_joint(
     path = urdf_path_from_robot_name(urdf)
     if not is_file(path):
         what, allowed = f"there is no URDF file '{path}'", "the path of a URDF file, or package:NAME"
-        raise ModelError(what, where=str(urdf), allowed=allowed, hint="correct model.robot")
+        raise ModelError(what, where=str(urdf), allowed=allowed, hint="set model.robot to one, such as package:ur5")
     bare = {"build_scene_graph": False, "load_meshes": False, "load_collision_meshes": False}
     try:
         robot = yourdfpy.URDF.load(str(check_input_file(path)), **bare)
@@ -340,13 +340,13 @@ def extra_meshes_by_joint_index(extra: Sequence[ExtraMesh], mechanism: Mechanism
         where = f"model: surfaces_missing_from_urdf: {number}"
         given = [kind for kind in _EXTRA_MESH_SHAPES if getattr(entry, kind) is not None]
         if len(given) != 1:
-            what, hint = f"the entry has {' and '.join(given) or 'no shape'}", "define exactly one shape"
+            what, hint = f"the entry has {' and '.join(given) or 'no shape'}, not one shape", "set one of these keys"
             raise ConfigError(what, where=where, allowed=f"one of {', '.join(_EXTRA_MESH_SHAPES)}", hint=hint)
         mesh = _solid(entry.box_size, entry.cylinder_radius_and_length, entry.sphere_radius)
         if entry.mesh_file is not None:
             if not is_file(Path(entry.mesh_file)):
                 what, allowed = f"there is no mesh file '{entry.mesh_file}'", "an STL, OBJ or DAE file"
-                raise ModelError(what, where=where, allowed=allowed, hint="correct mesh_file")
+                raise ModelError(what, where=where, allowed=allowed, hint="set mesh_file to an existing file")
             mesh = _load_mesh_file(Path(entry.mesh_file))
         assert mesh is not None
         joint, placement = -1, np.eye(4)
@@ -371,7 +371,7 @@ def _mesh_of_file(file: Path, changed: int) -> TriangleMesh:
         return TriangleMesh._of(trimesh.load(check_input_file(file, _MAX_MESH_BYTES), force="mesh"))
     except Exception as error:  # trimesh's readers raise many kinds
         reason = f"{file.suffix} files are not supported" if isinstance(error, ImportError) else error
-        what, hint = f"the mesh cannot be read: {reason}", "export it again as STL or OBJ"
+        what, hint = f"the mesh {file.name} cannot be read: {reason}", "export the mesh again as STL or OBJ"
         raise ModelError(what, where=str(file), allowed="an STL, OBJ or DAE file", hint=hint) from error
 
 
@@ -404,7 +404,7 @@ def model_link_lengths_and_radius_by_segment(
 def _tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
     """Meshes of the object's links by joint index: cylinders, joined by balls, in joint frames. `DataError` if none."""
     if not system.segment_layouts:
-        what, hint = "the model has no object that a camera could see", "set model.object with segments"
+        what, hint = "the model has no object that a camera could see", "set model.object, such as kind: foam_y"
         raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
     meshes, sizes = dict[int, TriangleMesh](), model_link_lengths_and_radius_by_segment(system, values)
     for segment in system.segment_layouts:
@@ -500,7 +500,8 @@ class VirtualCameraTiming:
     def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
         if not self.mean_rate > 0:
-            raise ConfigError(f"mean_rate = {self.mean_rate}", where="mean_rate", allowed="a frame rate above 0 [Hz]")
+            what, hint = f"mean_rate is {self.mean_rate}, but must be above 0", "pass for example mean_rate=3.0"
+            raise ConfigError(what, where="VirtualCameraTiming", allowed="a frame rate above 0 [Hz]", hint=hint)
         count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
         taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
         taken = taken[taken < stop]

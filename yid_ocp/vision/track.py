@@ -30,7 +30,7 @@ from yid_ocp.vision.calibration import (
 from yid_ocp.vision.camera_registration import MovingArmSurface, StampedCloud
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
-from yid_ocp.vision.frames import FrameSequence, OcclusionMap
+from yid_ocp.vision.frames import FrameSequence, OcclusionMap, UnusableFrameError
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
@@ -116,7 +116,7 @@ class SingleFrameTracker:
         anywhere = options.root_placement != "model"
         if anywhere and scene.robot_urdf is not None:
             hint = "set track.options.root_placement: model; to track the object without a robot, model.robot: null"
-            what = f"root_placement is '{options.root_placement}', but the robot determines the place of the root"
+            what = f"root_placement is '{options.root_placement}', but the robot determines the place of the object"
             raise ConfigError(what, where="track.options.root_placement", allowed="model", hint=hint)
         if anywhere:
             system, loose = add_free_root_joints(system, values)
@@ -134,8 +134,8 @@ class SingleFrameTracker:
         if scene.robot_urdf is not None:
             robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in robot):
-                what, where = "no joint of the model moves a link of the robot", str(scene.robot_urdf)
-                allowed, hint = "the URDF of the model's robot", "check model.robot and model.arms.joints"
+                what, where = "no joint of the model moves a link of this URDF that has a mesh", str(scene.robot_urdf)
+                allowed, hint = "the URDF of the arm in model.arms.joints", "correct model.robot or model.arms.joints"
                 raise ModelError(what, where=where, allowed=allowed, hint=hint)
             meshes |= {joint: [mesh, *meshes.get(joint, ())] for joint, mesh in robot.items()}
         whole = {joint: TriangleMesh.concatenate(parts) for joint, parts in meshes.items()}
@@ -199,7 +199,7 @@ class SingleFrameTracker:
     def _calibration(self) -> CameraCalibration:
         options, pose = self.options, self.sequence.camera_pose
         if self.arm_surface is None:
-            return calibration_without_estimation(pose, options.clock_offset_search, "no robot to compare")
+            return calibration_without_estimation(pose, options.clock_offset_search, "there is no robot to compare")
         glimpses = []
         for i in self.calibration_frames:
             try:
@@ -221,10 +221,10 @@ class SingleFrameTracker:
         begin, end = self.joint_time_span
         if first > end + reach or last < begin - reach:
             spans = f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {begin:.3f} s to {end:.3f} s"
-            hint = "set track.options.clock_offset_search.initial_stamp_minus_joint_time "
-            hint += f"({first + offset - begin:.3f} s if they started together)"
-            what, where = f"the clocks differ: {spans}", self.sequence.source
-            raise DataError(what, where=where, allowed="frames and joints whose times overlap", hint=hint)
+            hint = "set track.options.clock_offset_search.initial_stamp_minus_joint_time: "
+            hint += f"{first + offset - begin:.3f} if frames and joints started together"
+            what, allowed = f"the clocks differ: {spans}", f"times that overlap if shifted by up to {reach:g} s"
+            raise DataError(what, where=self.sequence.source, allowed=allowed, hint=hint)
 
     def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
         """The shape fitter with the estimated dimensions of the object."""
@@ -257,11 +257,14 @@ class SingleFrameTracker:
         finite: BoolArray = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points if finite.all() else points[finite]
         if not len(points):
-            raise DataError("the cloud has no finite points", where=where, allowed="finite points", hint="delete it")
+            raise DataError(
+                "the cloud has no finite points", where=where, allowed="finite x y z", hint="export it again"
+            )
         far = float(np.median(np.abs(points[:: 1 + len(points) // _DISTANCE_SAMPLE_POINTS]).max(axis=1)))
         if far > _MAX_DISTANCE:
             what = f"the cloud is not in metres: half of its points are {far:.0f} m away or more"
-            raise DataError(f"{what} (if in mm, set track.point_cloud_unit)", where=where, allowed="points in metres")
+            hint = "if the cloud is in mm, set track.point_cloud_unit: mm, or unit: mm in camera.json"
+            raise DataError(what, where=where, allowed=f"points within {_MAX_DISTANCE:.0f} m", hint=hint)
         return points, finite
 
     def _read(self, index: int, calibration: CameraCalibration) -> tuple[WeightedCloud, Array]:
@@ -272,14 +275,14 @@ class SingleFrameTracker:
         q = self._configuration_at_rest(float(state.stamps_to_joint_clock(self.sequence.stamps[index])))
         inside = self.object_region.membership_mask_function_at(q, calibration.camera_position)(points)
         if not inside.any():
-            raise DataError("no point lies in the region that the object can reach: check track.camera_pose")
+            raise UnusableFrameError("no point lies in the region that the object can reach: check track.camera_pose")
         if filters.object_colours and self.sequence.load_colours is not None:
             colours = self.sequence.load_colours(index)
             if colours is None:
-                raise DataError("the cloud has no colours, which track.options.filters.object_colours needs")
+                raise UnusableFrameError("the cloud has no colours, which track.options.filters.object_colours needs")
             inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], filters.object_colours)
             if not inside.any():
-                raise DataError("no point has a colour of the object: check track.options.filters.object_colours")
+                raise UnusableFrameError("no point has a colour of track.options.filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
     def process_one_frame(self, index: int, common: SequenceEstimates) -> FrameReport:
@@ -383,7 +386,7 @@ class SingleFrameTracker:
         cloud, raw = self._read(index, calibration)
         work.say(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
-            raise DataError("no joint angles were recorded at the time of the frame")
+            raise UnusableFrameError("no joint angles were recorded at the time of the frame")
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
@@ -391,7 +394,8 @@ class SingleFrameTracker:
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
                 if own.is_significant:
-                    raise DataError(f"the frame's time stamp is late: by {1e3 * own.delay:.0f} ms")
+                    late = f"the frame's time stamp is {'late' if own.delay > 0 else 'early'}"
+                    raise UnusableFrameError(f"{late}: by {1e3 * abs(own.delay):.0f} ms")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:
@@ -402,7 +406,7 @@ class SingleFrameTracker:
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
         if len(cloud) < _MIN_POINTS:
-            raise DataError(f"too few points of the object: {len(cloud)} left")
+            raise UnusableFrameError(f"too few points of the object: {len(cloud)} are left, {_MIN_POINTS} are needed")
         if len(cloud) > _MAX_POINTS:
             cloud = cloud.select(np.sort(rng.choice(len(cloud), _MAX_POINTS, replace=False)))
             work.say(n_filtered_points=len(cloud))
@@ -422,7 +426,7 @@ class SingleFrameTracker:
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
-            raise DataError("no part of the cloud is dense enough for a skeleton")
+            raise UnusableFrameError("no part of the cloud is dense enough for a skeleton")
         work.filtered = rest = cloud.select(found.node_of_point >= 0)
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
@@ -435,7 +439,7 @@ class SingleFrameTracker:
         work.skeleton = course.to_skeleton
         work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):
-            raise DataError("the object crosses or touches itself: its cloud closes a loop")
+            raise UnusableFrameError("the object crosses or touches itself: its cloud closes a loop")
         found = starts.shape_guesses_along_centerline(course)
         if options.approximate_root_position is not None:
             place = np.array(options.approximate_root_position)
@@ -462,13 +466,13 @@ def _joint_angles(
         return None, None
     need = "which the self-filter and the grasps need"
     if recording is None:
-        hint = "list the recording of the same time under recordings.estimate, or set model.robot to null"
+        hint = "set recordings.estimate: [FILE.h5] to the recording of the same time, or model.robot: null"
         what, allowed = f"there is no recording with the joint angles, {need}", "the joint angles during the frames"
         raise DataError(what, where="recordings.estimate", allowed=allowed, hint=hint)
     joints = recording.joints
     if joints is None:
         what, where = f"the recording has no joint angles, {need}", f"recording '{recording.name}'"
-        hint = "list a recording with the joints, or set model.robot to null"
+        hint = "set recordings.estimate: [FILE.h5] to a recording with joints, or model.robot: null"
         raise DataError(what, where=where, allowed="a recording with the group `joints`", hint=hint)
     t, position = joints.t, joints.position[:, recorded_joint_column_indices(joints, tuple(known), recording.name)]
     return (float(t[0]), float(t[-1])), lambda at: np.array([np.interp(at, t, column) for column in position.T])
@@ -476,12 +480,12 @@ def _joint_angles(
 
 def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
     """Indices of the frames by time stamp, and why frames without a stamp or with a repeated stamp are dropped."""
-    reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
+    reasons = {int(i): "the frame's time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
     for i in (i for i in order if i not in reasons):
         if stamps[i] - before < _SAME_TIME_TOLERANCE:
-            reasons[i] = "its time stamp equals that of another frame: a duplicate"
+            reasons[i] = "the frame's time stamp equals that of another frame, so it is a duplicate"
         else:
             before = float(stamps[i])
     return tuple(order), reasons

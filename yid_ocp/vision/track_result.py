@@ -160,7 +160,8 @@ def _pictures(stages: SingleFrameStages) -> list[_Picture]:
         title = f"{count_with_noun(len(edges), 'edge')}, {parts}"
         made.append(_Picture("graph", title, [nodes], list(edges), _BLUE))
         if fit is not None:
-            title = f"fitted shape, {1e3 * fit.mean_distance:.1f} mm from the points on average"
+            off = f", {1e3 * fit.mean_distance:.1f} mm from the points on average (frame used)"
+            title = "fitted shape" + ("" if stages.report.drop_reason else off)
             places = [faint, (fit.link_ends.reshape(-1, 3), _GREEN, 18.0), (fit.point_positions, _ORANGE, 40.0)]
             made.append(_Picture("fit", title, places, list(fit.link_ends), _GREEN))
     return made
