@@ -74,8 +74,7 @@ def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
 
 
 def _working(parser: argparse.ArgumentParser, absent: str = "one for each processor") -> None:
-    text = f"processes that share the work; {absent} when absent"
-    parser.add_argument("--workers", metavar="N", type=int, help=text)
+    parser.add_argument("--workers", metavar="N", type=int, help=f"processes that share the work; {absent} when absent")
     text = "HOST:PORT of a Dask scheduler, or its scheduler file, whose workers do the work instead"
     parser.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
 
@@ -345,8 +344,8 @@ class _Parser(argparse.ArgumentParser):
             raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
         where, allowed = self.prog, "the arguments that --help lists"
         if wrong := re.fullmatch(r"argument (\S+): invalid (\w+) value: (.*)", message, re.DOTALL):
-            message, where = f"{wrong[3]} is not allowed", f"{self.prog} {wrong[1]}"
-            allowed = {"int": "a whole number", "float": "a number"}[wrong[2]]
+            allowed, where = {"int": "a whole number", "float": "a number"}[wrong[2]], f"{self.prog} {wrong[1]}"
+            message = f"{wrong[1]} is {wrong[3]}, but must be {allowed}"
         raise ConfigError(message, where=where, allowed=allowed, hint=self._help())
 
     def _help(self) -> str:
@@ -518,7 +517,7 @@ def _failed(error: Exception, as_json: bool) -> int:
         what, allowed = "a path contains a null character", "paths without null characters"
         return _wrong(ConfigError(what, where="command line", allowed=allowed, hint="correct the path"), as_json)
     if isinstance(error, MemoryError):
-        what, hint = f"there is not enough memory: {error}", "use shorter recordings, fewer links or fewer --workers"
+        what, hint = f"there is not enough memory: {error}", "use shorter recordings, fewer links or --workers 1"
         allowed = "a run that fits into the free memory"
         return _wrong(InsufficientMemoryError(what, where="this machine", allowed=allowed, hint=hint), as_json)
     # any other exception is a bug of this package

@@ -104,7 +104,7 @@ def test_what_sizes_do_to_points():
     covariance = np.diag([0.01**2, 0.02**2])
     change = np.array([0.05, 0.05])  # five and two and a half standard deviations
 
-    told = "the object's dimensions contradict the model (a.length: 1000 mm in the model, 1051 mm by the fit)"
+    told = "the object's dimensions contradict the model (a.length is 1000 mm in the model, 1051 mm by the fit)"
     for used, std in (((False, False), [0.05, 0, 0]), ((True, False), [0.01, 0, 0]), ((True, True), [0.01, 0.02, 0])):
         check = TubeDimensionEstimates(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5)
         assert check.point_std_from_dimensions(moves)[0] == pytest.approx(std)

@@ -221,7 +221,7 @@ _TaskFinishedCallback = Callable[[_Job, TaskResult], None]
 def _perform(job: _Job) -> str:
     """Run a task and write its result file; returns the error message, empty on success."""
     if unlike := software_fingerprint_differences(job.maker, software_fingerprint()):
-        return f"ParallelWorkError: {_unfit(socket.gethostname(), unlike).what}"
+        return f"ParallelWorkError: {_unfit(socket.gethostname(), unlike)}"
     begun = time.perf_counter()
     entry = {"format": _TASK_FORMAT, "name": job.task.name, "input": job.input}
     failed = job.file.with_suffix(".error.json")

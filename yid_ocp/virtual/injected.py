@@ -505,8 +505,8 @@ def run_experiment_with_injected_effects(
     `system` is the nominal system, with driven joints. The recording stores `values` as `true_parameters`. The
     experiment's `injected_terms` are replaced. If `ordinary_friction` is None, dry friction of joints in `effects` is a
     smooth force. If it is given (it can be empty), MuJoCo's constraint solver simulates it and the dry friction in
-    `effects`, including sticking. Raises `ConfigError` if an effect kind cannot be simulated, and `ModelError` if a
-    payload is too far from its frame or removes more mass than its link has. Other errors: `run_virtual_experiment`.
+    `effects`, including sticking. Raises `ConfigError` if an effect kind cannot be simulated, `ModelError` if a payload
+    is impossible. Other errors: `run_virtual_experiment`.
     """
     known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_FORCE_BUILDERS)
     known = known if ordinary_friction is None else tuple(dict.fromkeys((*known, *_ORDINARY_FRICTION)))

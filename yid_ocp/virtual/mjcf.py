@@ -252,9 +252,7 @@ def mujoco_xml(
     Joints keep their names. Consecutive massless joints at one location become one body with several joints, which is
     kinematically equivalent. Every point and grasp end is a site: points under their own name, grasps as
     `grasp_NAME_holder` and `grasp_NAME_held`. There are no contacts or limits. Everything is inside one fixed body
-    `world_base`, because some readers require a single root. Raises `ModelError` if MuJoCo cannot express the system: a
-    moving body without mass, more than six massless joints at one location, a frame on one of them, a compliant grasp,
-    a cubic spring with a rest angle, an effect among `_NON_NATIVE_ASPECTS`.
+    `world_base`, because some readers require a single root. Raises `ModelError` if MuJoCo cannot express the system.
 
     Parameters
     ----------

@@ -135,8 +135,7 @@ def simulate_in_mujoco(
     """Simulate a system in MuJoCo while a controller moves its driven joints along a motion, from equilibrium.
 
     Position servos are MuJoCo actuators, whose commands follow the motion. Parameters without an entry in `values` are
-    nominal. Raises `ModelError` if MuJoCo cannot express the system (`mujoco_xml`), or if the system has a prescribed
-    joint or no driven joint, does not settle, or diverges.
+    nominal. Raises `ModelError` if MuJoCo cannot express or simulate the system.
 
     Parameters
     ----------
@@ -409,8 +408,8 @@ def replay_mismatch_by_channel(
     this requires is compared with the recorded torque.
 
     Keys: `joints.position` (all driven joints together) [rad] or `joints.effort` (all prescribed joints) [N m], and
-    `GROUP.POINT` for every point [m]. Raises `ModelError` if the recording lacks the channels that drive the model, or
-    if the model does not settle or diverges, and `DataError` if MuJoCo is not installed.
+    `GROUP.POINT` for every point [m]. Raises `ModelError` if channels are missing or the simulation fails, and
+    `DataError` if MuJoCo is not installed.
     """
     mujoco, model = import_mujoco(), mujoco_model_from_mjcf_text(text)
     moved = system.driven or system.prescribed

@@ -397,8 +397,10 @@ class _Calibrator:
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTION_STDS**2 * 3:
-                off = f"the camera at its fixed pose sees the arm {1e3 * away:.0f} mm from its place by the joints"
-                words.append(f"{off} (part of each point's std); track.options.calibration.fix_pose: false corrects it")
+                off = (
+                    f"the arm contradicts the fixed pose of the camera by {1e3 * away:.0f} mm, part of each point's std"
+                )
+                words.append(f"{off} (to correct the pose, set track.options.calibration.fix_pose: false)")
         elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
             off = f"the camera at its specified pose sees the arm {1e3 * away:.0f} mm from its place by the joints"

@@ -19,7 +19,7 @@ import ctypes
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from types import ModuleType
 
 import numpy as np
@@ -32,14 +32,8 @@ from yid_ocp.model.mechanism import homogeneous_transform
 
 PointColourArray = NDArray[np.uint8]
 
-
-class UnusableFrameError(DataError):
-    """A `DataError` that is raised for a frame that the tracking drops. Its `reason` is the frame's `drop_reason`."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason, where="frame", allowed="a frame that shows the object", hint="leave this frame out")
-
-
+dropped_frame_error = partial(DataError, where="frame", allowed="a frame that shows the object", hint="leave it out")
+"""Makes the `DataError` that drops a frame from its argument, the `drop_reason` of the frame."""
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Allowed numbers of coefficients by distortion model. Order: k1, k2, p1, p2, k3 (k4, k5, k6); equidistant k1 to k4."""
 _MAX_UNDISTORTION_STEPS = 30  # largest number of Newton steps for a pixel's direction

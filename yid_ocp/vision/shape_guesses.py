@@ -27,7 +27,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System, six_joint_floating_mechanism
-from yid_ocp.vision.frames import UnusableFrameError
+from yid_ocp.vision.frames import dropped_frame_error
 from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
 
 _N_NEIGHBOURS = 10
@@ -266,13 +266,13 @@ class ShapeGuessFinder:
     def shape_guesses_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
         """Find initial shapes that follow a centerline whose path lengths between ends match the object's lengths.
 
-        Raises `UnusableFrameError` for other ends or lengths: part of the object is hidden, or another body touches it.
+        Raises `DataError` for other ends or lengths: part of the object is hidden, or another body touches it.
         """
         edges_of_node = np.bincount(trace.edges.ravel(), minlength=len(trace.nodes))
         leaves, n_ends = np.flatnonzero(edges_of_node <= 1), len(self._end_distances)
         if not n_ends <= len(leaves) <= _MAX_ENDS:
             counts = f"its cloud has {len(leaves)} free ends, but the object has {n_ends}"
-            raise UnusableFrameError(f"the object cannot be followed from end to end: {counts}")
+            raise dropped_frame_error(f"the object cannot be followed from end to end: {counts}")
         # the middles of the last slices are half a slice from the ends
         along = np.array([trace.path_lengths_from(int(leaf))[0][leaves] for leaf in leaves]) + trace.slice_width
         np.fill_diagonal(along, 0.0)
@@ -284,7 +284,7 @@ class ShapeGuessFinder:
         if best > max(_WHOLE_OBJECT_TOLERANCE * float(self._root_to_tip_lengths.max()), trace.slice_width):
             own = self._end_distances[0, 1]
             lengths = f"{along[nearest[0], nearest[1]]:.2f} m from end to end, but the object has {own:.2f} m"
-            raise UnusableFrameError(f"the object cannot be followed from end to end: the cloud has {lengths}")
+            raise dropped_frame_error(f"the object cannot be followed from end to end: the cloud has {lengths}")
         limit = max(_TRIED_MATCH_RATIO * best, trace.slice_width)
         kept = [chosen for off, chosen in sorted(ways) if off <= limit][: 2 * n_ends]
         return [self._along(trace, [int(leaves[k]) for k in chosen]) for chosen in kept]

@@ -534,8 +534,7 @@ def render_virtual_frames(
     """Return the frames that a virtual camera takes of a motion. A frame is rendered when it is loaded, reproducibly.
 
     The configurations `q` (N, n) at times `t` (N,) [s] can come from any simulator; a cubic spline interpolates them.
-    In a scene with a robot, a floor under the foam Y and a wall behind Baxter are added. Raises `DataError` or
-    `ModelError` if Open3D or the object is missing, a mesh is unreadable, or the camera's pose is invalid.
+    In a scene with a robot, a floor under the foam Y and a wall behind Baxter are added.
     """
     lens, pose = camera.sensor_model.intrinsics, frames.validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)

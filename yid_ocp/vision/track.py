@@ -30,7 +30,7 @@ from yid_ocp.vision.calibration import (
 from yid_ocp.vision.camera_registration import MovingArmSurface, StampedCloud
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
-from yid_ocp.vision.frames import FrameSequence, OcclusionMap, UnusableFrameError
+from yid_ocp.vision.frames import FrameSequence, OcclusionMap, dropped_frame_error
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
@@ -68,8 +68,8 @@ def track_object(
     model has no robot. Without a URDF file, there is no self-filter and no clock offset. `empty` holds frames of the
     background without robot and object, by the same camera.
 
-    Raises `DataError` if joint angles are missing, time stamps come from another clock, or no frame is good (with the
-    reasons). Raises `ConfigError` if a point does not exist in the system, and `ModelError` if meshes cannot be read.
+    Raises `DataError` if the data do not fit or no frame is good (with the reasons), `ConfigError` if a point does not
+    exist in the system, and `ModelError` if meshes cannot be read.
     """
     tracker = SingleFrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.estimate_shared_values()
@@ -275,14 +275,14 @@ class SingleFrameTracker:
         q = self._configuration_at_rest(float(state.stamps_to_joint_clock(self.sequence.stamps[index])))
         inside = self.object_region.membership_mask_function_at(q, calibration.camera_position)(points)
         if not inside.any():
-            raise UnusableFrameError("no point lies in the region that the object can reach: check track.camera_pose")
+            raise dropped_frame_error("no point lies in the region that the object can reach: check track.camera_pose")
         if filters.object_colours and self.sequence.load_colours is not None:
             colours = self.sequence.load_colours(index)
             if colours is None:
-                raise UnusableFrameError("the cloud has no colours, which track.options.filters.object_colours needs")
+                raise dropped_frame_error("the cloud has no colours, which track.options.filters.object_colours needs")
             inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], filters.object_colours)
             if not inside.any():
-                raise UnusableFrameError("no point has a colour of track.options.filters.object_colours")
+                raise dropped_frame_error("no point has a colour of track.options.filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
     def process_one_frame(self, index: int, common: SequenceEstimates) -> FrameReport:
@@ -386,7 +386,7 @@ class SingleFrameTracker:
         cloud, raw = self._read(index, calibration)
         work.say(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
-            raise UnusableFrameError("no joint angles were recorded at the time of the frame")
+            raise dropped_frame_error("no joint angles were recorded at the time of the frame")
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
@@ -395,7 +395,7 @@ class SingleFrameTracker:
                 work.say(stamp_delay=own.delay)
                 if own.is_significant:
                     late = f"the frame's time stamp is {'late' if own.delay > 0 else 'early'}"
-                    raise UnusableFrameError(f"{late}: by {1e3 * abs(own.delay):.0f} ms")
+                    raise dropped_frame_error(f"{late}: by {1e3 * abs(own.delay):.0f} ms")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:
@@ -406,7 +406,7 @@ class SingleFrameTracker:
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
         if len(cloud) < _MIN_POINTS:
-            raise UnusableFrameError(f"too few points of the object: {len(cloud)} are left, {_MIN_POINTS} are needed")
+            raise dropped_frame_error(f"too few points of the object: {len(cloud)} are left, {_MIN_POINTS} are needed")
         if len(cloud) > _MAX_POINTS:
             cloud = cloud.select(np.sort(rng.choice(len(cloud), _MAX_POINTS, replace=False)))
             work.say(n_filtered_points=len(cloud))
@@ -426,7 +426,7 @@ class SingleFrameTracker:
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
-            raise UnusableFrameError("no part of the cloud is dense enough for a skeleton")
+            raise dropped_frame_error("no part of the cloud is dense enough for a skeleton")
         work.filtered = rest = cloud.select(found.node_of_point >= 0)
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
@@ -439,7 +439,7 @@ class SingleFrameTracker:
         work.skeleton = course.to_skeleton
         work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):
-            raise UnusableFrameError("the object crosses or touches itself: its cloud closes a loop")
+            raise dropped_frame_error("the object crosses or touches itself: its cloud closes a loop")
         found = starts.shape_guesses_along_centerline(course)
         if options.approximate_root_position is not None:
             place = np.array(options.approximate_root_position)
