@@ -161,8 +161,7 @@ def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _
         if isinstance(executor, WorkerConfig):
             cluster = _dask_executor(executor.scheduler_address, jobs[0].function, jobs[0].folder)
             executor, look = held.enter_context(cluster)
-        at_once = 1 if isinstance(executor, InlineExecutor) else len(jobs)
-        lost, never = _drain(executor, jobs, at_once, finished, look)
+        lost, never = _drain(executor, jobs, 1 if isinstance(executor, InlineExecutor) else len(jobs), finished, look)
         for job in (*lost, *never):
             finished(job, job.kept() or TaskResult(job.task.name, error="the workers were lost"))
 
@@ -277,8 +276,7 @@ def _drain(
                     continue
                 except Exception as error:  # the executor gave the task up
                     name = type(error).__name__
-                    killed = "every worker that tried it ended abruptly"
-                    text = killed if name == "KilledWorker" else f"{name}: {error}"
+                    text = "every worker that tried it ended abruptly" if name == "KilledWorker" else f"{name}: {error}"
                 result = None if text else _arrived(job, look is not None)
                 finished(job, result or TaskResult(job.task.name, error=text or "it left no result"))
     except BaseException:

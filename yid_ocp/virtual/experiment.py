@@ -244,8 +244,7 @@ def _noisy(clean: Array, std: float | Array, rng: np.random.Generator) -> Array:
 
 
 def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera) -> Array:
-    count = math.ceil(2 * duration * camera.frame_rate) + 2
-    times = np.cumsum(rng.uniform(0.75, 1.25, count) / camera.frame_rate)
+    times = np.cumsum(rng.uniform(0.75, 1.25, math.ceil(2 * duration * camera.frame_rate) + 2) / camera.frame_rate)
     times = times[times < duration]
     if camera.has_dropouts:
         number = max(1, round(duration / 2.5))

@@ -546,8 +546,7 @@ def _errors(
     name, unit = ("joints.position", "rad") if system.driven else ("joints.effort", "N m")
     said, noise = (getattr(joints, name.removeprefix("joints.") + part) for part in ("", "_std"))
     if said is not None and inside.any():
-        model = _at(t[inside], played.t, played.values)
-        error = float(np.sqrt(np.mean((model - said[inside][:, columns]) ** 2)))
+        error = float(np.sqrt(np.mean((_at(t[inside], played.t, played.values) - said[inside][:, columns]) ** 2)))
         level = np.zeros(1) if noise is None else np.broadcast_to(noise, (len(joints.names),))[columns]
         found[name] = ReplayErrorAgainstRecording(error, float(np.sqrt(np.mean(level**2))), unit)
     for group in recording.points:

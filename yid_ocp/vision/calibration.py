@@ -142,8 +142,7 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
     if not known:
         return [], 0.0
     delay, std, square = np.array(list(known.values())).T
-    apart = np.abs(delay - weighted_median(delay, std**-2))
-    near = apart < np.maximum(_MIN_STAMP_ERROR, _STAMP_ERROR_STDS * std)
+    near = np.abs(delay - weighted_median(delay, std**-2)) < np.maximum(_MIN_STAMP_ERROR, _STAMP_ERROR_STDS * std)
     return [i for i, good in zip(known, near, strict=True) if good], float(np.median(square))
 
 

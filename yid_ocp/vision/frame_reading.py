@@ -138,7 +138,7 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
-        what = f"the intrinsics of the camera are unknown: {len(nearest) or 'no'} topics of the bag may contain them"
+        what = f"the intrinsics of the camera are unknown: {len(nearest)} instead of 1 topic may contain them"
         allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
         raise DataError(what, where=str(bag.path), allowed=allowed, hint=f"record {beside_it}/camera_info as well")
     info = _first(bag, nearest[0])

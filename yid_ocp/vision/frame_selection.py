@@ -101,7 +101,7 @@ _MISFIT_REASONS = (_NO_FIT, _END_ELSEWHERE)
 _MAX_BEND_ANGLE = 1.2  # of a joint in a good frame [rad]
 _MAX_DISTANCE_OVER_MEDIAN = 1.7  # of a frame's mean distance, over the median of good frames
 _MAX_GRASP_GAP_CHANGE = 0.008  # distance of an end from its gripper, beyond the usual, of a wrong stamp [m]
-_MAX_NOTES = 4  # notes in a hint
+_MAX_NOTES = 2  # notes in a hint
 _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a normal variable, in stds
 
 
@@ -201,7 +201,7 @@ def _none_good(
     kinds: dict[str, list[str]] = {}
     for frame in frames:
         kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
-    often = sorted(kinds.values(), key=len, reverse=True)[:3]
+    often = sorted(kinds.values(), key=len, reverse=True)[:2]
     starts = [f"In {len(own)} of {len(frames)} frames, {'for example, ' * (len(set(own)) > 1)}" for own in often]
     most = next((reasons[0] for reasons in often), "")
     cause = _because(sizes, most.startswith(_MISFIT_REASONS))
@@ -300,8 +300,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > (most := _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std):
                 off = f"{1e3 * away:.0f} mm away, {1e3 * most:.0f} mm are allowed"
-                reason = f"the object's root is not where other frames have it: {off}"
-                made[k] = replace(frames[k], drop_reason=reason)
+                made[k] = replace(frames[k], drop_reason=f"the object's root is not where other frames have it: {off}")
     return made
 
 

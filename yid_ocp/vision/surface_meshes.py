@@ -337,7 +337,7 @@ def extra_meshes_by_joint_index(extra: Sequence[ExtraMesh], mechanism: Mechanism
     """
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
-        where = f"model: surfaces_missing_from_urdf: {number}"
+        where = f"model.surfaces_missing_from_urdf, entry {number + 1}"
         given = [kind for kind in _EXTRA_MESH_SHAPES if getattr(entry, kind) is not None]
         if len(given) != 1:
             what, hint = f"the entry has {' and '.join(given) or 'no shape'}, not one shape", "set one of these keys"

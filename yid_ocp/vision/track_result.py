@@ -157,8 +157,7 @@ def _pictures(stages: SingleFrameStages) -> list[_Picture]:
         faint, nodes, edges = (near, _GREY, 0.4), (skeleton.nodes, _ORANGE, 14.0), skeleton.nodes[skeleton.edges]
         made.append(_Picture("skeleton", f"{len(skeleton.nodes)} nodes of the skeleton", [faint, nodes]))
         parts = count_with_noun(len(set(skeleton.component_of_node.tolist())), "connected part")
-        title = f"{count_with_noun(len(edges), 'edge')}, {parts}"
-        made.append(_Picture("graph", title, [nodes], list(edges), _BLUE))
+        made.append(_Picture("graph", f"{count_with_noun(len(edges), 'edge')}, {parts}", [nodes], list(edges), _BLUE))
         if fit is not None:
             off = f", {1e3 * fit.mean_distance:.1f} mm from the points on average (frame used)"
             title = "fitted shape" + ("" if stages.report.drop_reason else off)
@@ -211,7 +210,7 @@ def write_tracked_points_plot(track: TrackResult, file: str | os.PathLike[str]) 
             panel.axvline(t, color=_GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(f"{name} [mm]")
     axes[0].legend(loc="upper right", ncols=3, frameon=False)
-    said = "about the mean, two standard deviations; dotted: dropped frames"
+    said = "positions about their mean, with two standard deviations; dotted: dropped frames"
     axes[0].set_title(f"{said}\n{track.camera_calibration.message}", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     with atomic_write(Path(file)) as temporary:
