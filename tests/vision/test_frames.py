@@ -139,7 +139,7 @@ def test_units_and_frames_of_clouds(folder):
         ({"frame": "base"}, "no coordinate frame 'base'"),
         ({"posse": 1}, "there is no key 'posse'"),
         ({"format": "yid-frames/7"}, "format of the frames"),
-        ({"intrinsics": {"width": 3}}, "the intrinsics have wrong or missing keys: width"),
+        ({"intrinsics": {"width": 3}}, "missing or unknown: cx, cy, fx, fy, height"),
         ({"depth_unit": -1}, "depth_unit is -1"),
     ],
 )

@@ -305,8 +305,8 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        keys = ", ".join(map(str, entry)) if isinstance(entry, dict) else "none"
-        what, hint = f"the intrinsics have wrong or missing keys: {keys}", "add missing keys, remove unknown ones"
+        odd = sorted(set(needed) ^ ((set(entry) if isinstance(entry, dict) else set()) - set(bent)))
+        what, hint = f"keys of the intrinsics are missing or unknown: {', '.join(odd)}", "add or remove these keys"
         raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
