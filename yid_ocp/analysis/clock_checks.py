@@ -153,12 +153,12 @@ def robot_held_point_clock_issues(
         yield _drift_issue(found, group.name, limit, severity)
     elif abs(late) > _MIN_Z * found.delay_std and abs(late) > limit:
         error = f"{1e3 * abs(late):.3g} ± {1e3 * found.delay_std:.2g} ms {'late' if late > 0 else 'early'}"
-        words = f"time stamps of {group.name} are {error} on the joints' clock (limit: {1e3 * limit:.3g} ms)"
+        words = f"time stamps of {group.name} are {error} on the joints' clock ({1e3 * limit:.3g} ms is tolerated)"
         camera = "camera" in f"{group.name} {group.sensor_name}".lower() or group.camera_pose is not None
-        setting = f"sensors.{group.name}.use: false"
+        advice, setting = f"add {-late:+.3g} s to their times, or leave them out", f"sensors.{group.name}.use: false"
         if camera and late > 0:
             setting = known_effect_config_line("camera_latency", "camera", "delay", late)
-        advice = f"add {-late:+.3g} s to their times"
+            advice = f"add {-late:+.3g} s to their times, or model the delay"
         yield Issue("clock_offset", words, severity, abs(late) / limit, advice, "", group.name, "t", setting=setting)
 
 
@@ -166,9 +166,10 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSe
     late, drift, whole = found.delay, found.drift, found.whole_drift
     begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
     size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
-    words = f"time stamps of {group} are {begin} off the joints' clock at the beginning and {end} at the end"
-    words = f"{words}: their clock runs {size} parts per thousand too {how}"
-    advice, setting = timestamp_correction_advice(late, drift, 0.5 * sum(found.span)), f"sensors.{group}.use: false"
+    words = f"time stamps of {group} are {begin} off the joints' clock at the beginning and {end} at the end "
+    words += f"(a change by {1e3 * limit:.3g} ms is tolerated): their clock runs {size} parts per thousand too {how}"
+    advice = f"{timestamp_correction_advice(late, drift, 0.5 * sum(found.span))}, or leave the points out"
+    setting = f"sensors.{group}.use: false"
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
@@ -245,10 +246,12 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
                     recordings[i] = replace(recordings[i], points=tuple(groups))
         made = recordings[:count], problem.free, problem.options, None, recordings[count:]
         problem = EstimationProblem(problem.step, *made)
-    issues, advice = list[Issue](), "if the offset is known, import again with --clock-offset"
+    issues, advice = list[Issue](), "values may be used, as the fit shifts the times; if you know the offset, import "
+    advice += "again with --clock-offset FILE=SECONDS"
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
-        words = f"a fit finds time stamps of {name} {said} and corrects them, but only ± {1e3 * std:.3g} ms is stated"
+        words = f"a fit finds time stamps of {name} {said} and corrects them, but only ± {1e3 * std:.3g} ms is stated "
+        words += f"({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
         if (ratio := abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)) > 1:
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
     return problem, issues
@@ -331,10 +334,12 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
-        leaves = f"after the fit, the error of {group} is {seen * usual:.2g} {unit} (rms, slow errors included)"
+        leaves = (
+            f"after the fit, the rms error of {group} (noise and slow errors together) is {seen * usual:.2g} {unit}"
+        )
         severity = 1 / (least * max(seen, 1e-9))
-        times = f"{least * severity:.2g} times smaller than stated ({usual:.2g} {unit}; {least:g} times is tolerated)"
-        advice = "set the std to the actual noise: the stated std makes every ± too wide and hides small gaps"
+        times = f"{least * severity:.2g} times below the stated {usual:.2g} {unit} ({least:g} times is tolerated)"
+        advice = "the large std makes every ± too wide and hides small gaps: state the std of the actual noise"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         where = group.partition(".")[0]
         yield Issue("noise_overstated", f"{leaves}, {times}", "warning", severity, advice, "", where, setting=setting)

@@ -375,11 +375,11 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             if better := _clearly_better_baseline(entry, channels):
                 best, guess, error = better
                 unit = units[channels[0]]
-                what = f"the rms error of the model is {error:.3g} {unit}, that of the guess '{best}' without a model"
+                what = f"the rms error of the model is {error:.3g} {unit}, that of the guess '{best}' without a model "
+                what += f"only {guess:.3g} {unit} (the model's may be {_WORSE_RATIO:g} times as large)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])
-                what = f"{what} only {guess:.3g} {unit}"
                 found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))
     return found
 

@@ -184,7 +184,8 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
     beyond = np.maximum(low - position, position - high).max(axis=0)
     inside = np.all((degrees > low - margin) & (degrees < high + margin))
     if np.any(beyond > margin) and inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
-        words = f"angles reach {np.max(np.abs(position)):.3g} rad; if they are degrees, all are within the joint limits"
+        words = f"angles reach {np.max(np.abs(position)):.3g} rad, {np.max(beyond):.3g} rad beyond their joint's limit "
+        words += f"({margin:g} rad is tolerated); if they are degrees, all are within the joint limits"
         advice = "convert angles to radians, or for a CSV with degrees set import.units: {position: deg}"
         yield Issue("degrees", words, "refused", float(np.max(beyond)) / margin, advice, "", channel="position")
         return
@@ -205,9 +206,9 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
     ratio = np.percentile(speed, 99, axis=0) / limits
     j = int(np.argmax(ratio))
     if ratio[j] > _MAX_SPEED_RATIO:
-        able = f"{limits[j]:.3g} {arm.joints[j].coordinate_unit}/s"
+        able = f"{limits[j]:.3g} {arm.joints[j].coordinate_unit}/s; {_MAX_SPEED_RATIO:g} times is tolerated"
         words = f"{arm.joint_names[j]} turns {ratio[j]:.3g} times as fast as its speed limit ({able})"
-        advice, depth = "check the unit of time and of angles", float(ratio[j]) / _MAX_SPEED_RATIO
+        advice, depth = "check the units of times and angles", float(ratio[j]) / _MAX_SPEED_RATIO
         yield Issue("speed_limits", words, "not_trusted", depth, advice, "", channel="t")
 
 
@@ -247,7 +248,8 @@ def slow_motion_excitation_issues(
     if seen < _MIN_SIGNAL_STDS:
         j = int(np.argmax(size / noise))
         asked = f"even at {arm.joint_names[j]}, the best joint, speed and acceleration require only {size[j]:.2g} N m"
-        words = f"{asked} (rms), but the noise of the efforts is {noise[j]:.2g} N m"
+        words = f"{asked} (rms), but the noise of the efforts is {noise[j]:.2g} N m. Over all samples and joints, the "
+        words += f"signal has {seen:.2g} standard deviations of noise (at least {_MIN_SIGNAL_STDS:g} are needed)"
         advice = "move faster: slow motions determine weight and stiffness, not damping, friction or inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
@@ -353,8 +355,9 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
     found, ratio = list[Issue](), np.percentile(np.abs(motion.effort), 99, axis=0) / largest
     if np.any(ratio > _MAX_EFFORT_RATIO):
         j = int(np.argmax(ratio))
-        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times its effort limit ({largest[j]:.3g} N m)"
-        advice = "check the unit of efforts (N m) and the robot's description"
+        words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times its effort limit ({largest[j]:.3g} N m; "
+        words += f"{_MAX_EFFORT_RATIO:g} times is tolerated)"
+        advice = "check the unit of efforts (N m) and the effort limit in the robot's URDF"
         found.append(_issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j]))
     most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
     if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
@@ -365,8 +368,9 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
         dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
         if dead.any():
             which = "all joints" if dead.all() else ", ".join(np.array(arm.joint_names)[dead])
-            words = f"the effort of {which} is zero throughout, although gravity and motion require more"
-            advice = "record efforts, or use none: prescribe the motion of the arms and switch their effort sensor off"
+            words = f"the effort of {which} is zero throughout, although gravity and motion require more (up to "
+            words += f"{np.max(wanted[dead]):.2g} N m, rms)"
+            advice = "record efforts, or move the arms as measured and use no efforts"
             setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
             found.append(_issue("effort_zero", words, 1e3, advice, setting=setting))
         else:
@@ -395,7 +399,8 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
         if not 1 / factor < scale < factor:
-            words = f"efforts are about {scale:.2g} times what gravity and motion require"
+            words = f"efforts are about {scale:.2g} times what gravity and motion require (1/{factor:g} to {factor:g} "
+            words += "times is tolerated)"
             advice = f"divide efforts by {1 / common:g}, if they are in another unit than N m"
             yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
             common = 1.0  # said; each joint is compared with the others
@@ -406,7 +411,8 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         off = abs(inverse - 1) / (common * float(fit.std[j]))
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
-            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion require"
+            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion require, which is "
+            words += f"{off:.2g} standard deviations from 1 ({_MIN_Z:g} are tolerated)"
             advice = "find out the unit and scale of the recorded effort, and on which side of the gear it is measured"
             yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)
@@ -414,19 +420,22 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
         strange = f"efforts of {lost.sum()} of {len(names)} joints ({', '.join(np.array(names)[lost])})"
-        words = f"{strange} do not match this robot and motion: their error is {left:.2g} times the usual model error"
+        words = f"{strange} do not match this robot and motion: their error is {left:.2g} times the usual model error "
+        words += f"({_WRONG_ROBOT_RMS:g} times is tolerated)"
         advice = "check that the recording is of this robot, and check its unit of time and the order of its joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
 
 def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:
-    depth = -fit.inverse / fit.std / (_MIN_Z / 2)
+    least = _MIN_Z / 2
+    depth = -fit.inverse / fit.std / least
     wrong = ((arm.joint_names[j], float(depth[j])) for j in np.flatnonzero(turned))
     cases = [(f"the effort of {name} has", by, name) for name, by in wrong]
     if turned.sum() >= 2 and not upright.any():
         cases = [("all efforts have", float(np.max(depth[turned])), "")]
     for who, by, joint in cases:
-        words = f"{who} the opposite sign of what gravity and motion require"
+        words = f"{who} the opposite sign of what gravity and motion require: the fitted gain is {by * least:.2g} std"
+        words += f" below zero ({least:g} std are tolerated)"
         yield _issue("effort_sign", words, by, "reverse the sign: effort is the motor's torque on the joint", joint)
 
 
@@ -442,9 +451,9 @@ def _offsets(data: _Data, fit: _EffortFit, told: BoolArray) -> Iterator[Issue]:
         balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
         if abs(offset[j]) > _MIN_Z * fit.offset_std[j] and not balanced:
             name, value = data.arm.joint_names[j], float(offset[j])
-            words = f"the effort of {name} has a constant error of {value:+.3g} N m"
-            depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
-            setting = known_effect_config_line("effort_offset", name, "offset", value)
+            limit = 3 * _OFFSET_FRACTION * float(size[j])
+            words = f"the effort of {name} has a constant error of {value:+.3g} N m ({limit:.2g} N m is tolerated)"
+            setting, depth = known_effect_config_line("effort_offset", name, "offset", value), abs(value) / limit
             yield _issue("effort_offset", words, depth, "correct the sensor's zero, or model the offset", name, setting)
 
 
@@ -464,9 +473,11 @@ def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
         when, arms = "earlier" if lag > 0 else "later", joint_names_by_arm(data.arm.system)
         words = f"efforts fit the motion best if their times are {abs(lag):.2g} s {when}"
+        words += f" (shifts are tried in steps of {_LAG_SEARCH_STEP:g} s; none should be needed)"
         lines = [known_effect_config_line("effort_delay", name, "delay", lag) for name in arms]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
-        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "correct the times of efforts", setting=setting)
+        advice = "correct the times of efforts" + ", or model the delay" * bool(setting)
+        yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, advice, setting=setting)
 
 
 def _fitted(data: _Data) -> _EffortFit:

@@ -33,6 +33,7 @@ _UNIT_SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 1
 _MIN_CLOCK_OFFSET = 0.05  # smallest clock offset that is tried as the cause of large position errors [s]
 _PATH_SAMPLE_RATE = 50.0  # rate at which paths of held points are computed, with splines in between [Hz]
 _LENGTH_RTOL = 0.2  # allowed relative error of lengths that cannot change
+_MAX_EDGE_RATIO = 1.6  # ratio of a cable edge's measured and undeformed length, above which points are exchanged
 
 
 class _Change(NamedTuple):
@@ -101,14 +102,14 @@ def _explained(
     error, far = _rms(apart), ", ".join(name for i, name in enumerate(names) if _rms(apart[:, i]) > allowed)
     best = min((change.error for change in changes), default=math.inf)
     good = (c for c in changes if c.error <= max(1.3 * best, allowed) and c.error < _MAX_REMAINING_FRACTION * error)
-    words, depth = f"points ({far or 'all'}) are {error:.3g} m (rms) from the model", error / allowed
+    words = f"points ({far or 'all'}) are {error:.3g} m (rms) from the model ({allowed:.2g} m is tolerated)"
     for chosen in good:
         words = f"{words}, but only {chosen.error:.2g} m {chosen.words}"
         place = recording, "joints" if chosen.channel else group, chosen.channel
-        return Issue(chosen.cause, words, "not_trusted", depth, chosen.advice, *place, setting=chosen.setting)
+        return Issue(chosen.cause, words, "not_trusted", error / allowed, chosen.advice, *place, setting=chosen.setting)
     words = f"{words}, and no simple change explains this"
     advice = "check the frame and the names of the points, and the URDF of the robot"
-    return Issue("point_unlike", words, "not_trusted", depth, advice, recording, group)
+    return Issue("point_unlike", words, "not_trusted", error / allowed, advice, recording, group)
 
 
 def _noise(group: PointGroup) -> float:
@@ -252,10 +253,11 @@ def points_too_distant_issues(
                 # a point at the root has no information on a scale
                 worst, ratio = far / allowed, far / bound if bound > 0 else 1.0
                 words = f"{one} is measured {far:.3g} m from {two}, but the object allows at most {bound:.3g} m"
+                words += f" ({allowed:.3g} m is tolerated)"
         if worst > 1:
             cause, advice = "point_reach", "check frame and names of the points, and the camera's pose"
             if ratio > 5:
-                cause, advice = "point_scale", f"check the unit of positions ({ratio:.2g} times the possible distance)"
+                cause, advice = "point_scale", f"check the unit of positions (the factor is {ratio:.2g} or more)"
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
@@ -307,10 +309,11 @@ def cable_point_geometry_issues(cable: CableVertices, recording: Recording, grav
             continue
         rest = {name: np.asarray(cable.undeformed_positions[name], float) for name in at}
         typical = float(np.median(_lengths(at, edges) / _lengths(rest, edges)))
+        low, high = 1 - _LENGTH_RTOL, 1 + _LENGTH_RTOL
         found: list[Issue | None] = [_exchanged(at, rest, edges), _upside_down(cable, at, rest, gravity)]
-        if abs(typical - 1) > _LENGTH_RTOL:
+        if not low <= typical <= high:
             words = f"distances of neighbouring points are {typical:.3g} times those of the undeformed cable"
-            depth = abs(math.log(typical)) / math.log(1 + _LENGTH_RTOL)
+            words, depth = f"{words} ({low:g} to {high:g} times is tolerated)", max(typical / high, low / typical)
             found[0] = Issue("point_scale", words, "not_trusted", depth, f"divide positions by {typical:.3g}", "")
         for issue in found:
             if issue is not None:
@@ -323,7 +326,7 @@ def _lengths(where: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Ar
 
 def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Issue | None:
     """Return the issue for an edge of wrong length, and whether exchanging two points corrects the lengths."""
-    known, most = _lengths(rest, edges), math.log(1.6)
+    known, most = _lengths(rest, edges), math.log(_MAX_EDGE_RATIO)
     ratio = _lengths(at, edges) / known
     off = np.abs(np.log(ratio)) > most
     if not off.any():
@@ -335,12 +338,13 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
         if left < least:
             best, least = (one, two), left
     worst = int(np.argmax(np.abs(np.log(ratio))))
-    words = f"the edge {edges[worst][0]} to {edges[worst][1]} has {ratio[worst]:.3g} times its undeformed length"
+    words = f"the edge {edges[worst][0]} to {edges[worst][1]} has {ratio[worst]:.3g} times its undeformed length "
+    words += f"(1/{_MAX_EDGE_RATIO:g} to {_MAX_EDGE_RATIO:g} times is tolerated)"
     cause, advice = "point_reach", "check the names of the points"
     if least < 0.5 * off.sum():
         words += f". If {best[0]} and {best[1]} are exchanged, {int(off.sum()) - least} more edges are right"
         cause, advice = "point_swapped", f"exchange {best[0]} and {best[1]}"
-    return Issue(cause, words, "not_trusted", float(abs(math.log(ratio[worst]))) / most, advice, "")
+    return Issue(cause, words, "not_trusted", max(ratio[worst], 1 / ratio[worst]) / _MAX_EDGE_RATIO, advice, "")
 
 
 def _upside_down(
@@ -362,6 +366,8 @@ def _upside_down(
     height, allowed = rise(at) / span, 0.05 + abs(rise(rest)) / span
     if not height > allowed:
         return None
-    words = f"the cable's points are on average {height * span:.3g} m above its clamps, although gravity pulls down"
-    advice, line = "check which axis points up, or set model.gravity", "model.gravity"
+    words = f"the cable's points are on average {height * span:.3g} m above its clamps ({allowed * span:.2g} m is "
+    words += "tolerated), although gravity pulls down"
+    advice = "check which axis of the recording points up; if it is the opposite one, reverse gravity"
+    line = f"model.gravity: [{', '.join(f'{x:g}' for x in 0.0 - gravity)}]"
     return Issue("point_mirrored", words, "not_trusted", height / allowed, advice, "", setting=line)

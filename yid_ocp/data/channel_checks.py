@@ -75,9 +75,11 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         if quantity == "effort" and values[begin] in (0.0, np.max(values), np.min(values)):
             continue  # no effort was recorded, or it is cut off: other causes
         if evidence >= 1:
-            start, stop = float(t[begin]), float(t[end])
+            start, stop, least = float(t[begin]), float(t[end]), QUALITY_LIMITS.min_stuck_samples
             what = f"{channel} repeats one value for {stop - start:.3g} s"
-            what += f", although its velocity means a rotation by {turned:.2g} rad" if turned > unseen else ""
+            what += f", {count} times (fewer than {least} are tolerated)" if is_unlikely else ""
+            if turned > unseen:
+                what += f", although its velocity means a rotation by {turned:.2g} rad ({unseen:g} rad is tolerated)"
             advice = "check the sensor, and cut out this time (Python: Recording.time_slice) or do not use the channel"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
@@ -146,12 +148,14 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
         least = 5 * QUALITY_LIMITS.min_joint_motion if channel.startswith("position") else 0.0
         few, unit = step > wide / 16 and wide > least, JOINT_CHANNEL_UNITS.get(channel.partition(".")[0], "m")
         setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
-        tolerated = f" (up to {QUALITY_LIMITS.max_noise_ratio:g} times as much is tolerated)"
+        every = " for all joints" if group == "joints" else ""
+        tolerated = f"times the stated {stated:.2g} {unit} ({QUALITY_LIMITS.max_noise_ratio:g} times is tolerated)"
         if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
             what = f"{channel} has steps of {step:.3g} {unit}, so rounding alone has a std of {size:.2g} {unit}"
-            what += f". The stated std is only {stated:.2g} {unit}{tolerated}" if stated else ""
+            levels = f". Only {wide / step:.3g} steps span its range (at least 16 are needed), and no std is stated"
+            what += f", {size / stated:.2g} {tolerated}" if stated else levels
             ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
-            advice, line = "set the std to that of rounding, or record with more digits", f"{setting}: {size:.2g}"
+            advice, line = f"record with more digits, or state the std of rounding{every}", f"{setting}: {size:.2g}"
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
@@ -159,9 +163,9 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
             # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, stated is {stated:.2g} {unit}{tolerated}"
+            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, {seen / stated:.2g} {tolerated}"
             ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
-            advice = "set the std to that of the actual noise"
+            advice = f"find the cause of the noise, or state its actual std{every}"
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
@@ -204,7 +208,9 @@ def overstated_noise_std_issues(recording: Recording, options: SensorOptionsFunc
         ratio, unit = stated / most[channel], JOINT_CHANNEL_UNITS.get(channel.partition(".")[0], "m")
         what = f"the noise of {channel} has a std of at most {seen_of[channel]:.2g}, not {stated:.2g} {unit} as stated"
         what += f" (too large for {len(low)} of {len(entries)} such channels)" if len(low) > 1 else ""
-        advice = "set the std to that of the actual noise: a larger std makes every ± too wide and hides small gaps"
+        factor = f"{stated / seen_of[channel]:.2g} times as much ({QUALITY_LIMITS.max_overstatement_ratio:g} times is "
+        what += f". Stated is {factor}tolerated)"
+        advice = "the large std makes every ± too wide and hides small gaps: state the std of the actual noise"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
         yield Issue("noise_overstated", what, "warning", ratio, advice, "", group, channel, setting=setting)
@@ -226,9 +232,11 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             if alone and again and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
-                advice = "record within the sensor's range, or cut out these times. If the efforts are "
-                advice += "commands of a controller, set sensors.joints.effort.effort_sampling_kind: command"
-                yield Issue("saturated", what, "not_trusted", at.sum() / least, advice, "", group, channel, begin, end)
+                what += f" (fewer than {least} such samples are tolerated)"
+                advice = "if the sensor measures torque, record within its range or cut out these times; "
+                advice += "if the efforts are a controller's commands, say so"
+                line, place = f"sensors.{JOINT_EFFORT_SENSOR_KEY}.effort_sampling_kind: command", (group, channel)
+                yield Issue("saturated", what, "not_trusted", at.sum() / least, advice, "", *place, begin, end, line)
 
 
 def typical_point_pair_distances(
@@ -251,7 +259,7 @@ def typical_point_pair_distances(
         if not seen:
             what = f"no frame shows both points of the edge {edge[0]} to {edge[1]}, so its length is unknown"
             where = ", ".join(f"recording '{r.name}'" for r in recordings)
-            hint = "list a recording under recordings.estimate in which both points are visible"
+            hint = f"add to recordings.estimate a recording in which {edge[0]} and {edge[1]} are visible at one time"
             raise DataError(what, where=where, allowed="at least one frame with both points", hint=hint)
         result[edge] = float(np.median(seen))
     return result
@@ -322,9 +330,9 @@ class Issue:
 
     @property
     def certainty_word(self) -> str:
-        """Certainty of the issue by `limit_violation_ratio`: `perhaps`, `likely` (from 1.5) or `certain` (from 3)."""
-        ratio = self.limit_violation_ratio
-        return "perhaps" if ratio < 1.5 else "likely" if ratio < 3 else "certain"
+        """Certainty by `limit_violation_ratio`: `perhaps`, `likely` (from 1.5) or `certain` (from 3, or a count)."""
+        ratio, is_counted = self.limit_violation_ratio, self.cause == "few_samples"
+        return "certain" if is_counted or ratio >= 3 else "perhaps" if ratio < 1.5 else "likely"
 
     @property
     def location_text(self) -> str:

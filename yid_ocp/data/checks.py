@@ -35,6 +35,7 @@ _MIN_PART_DURATION = 0.5  # shortest part of a recording that is kept [s]
 _MAX_ROTATION_AT_REST = 0.01  # largest rotation in the first 0.2 s of a part that starts at rest [rad]
 _MAX_CLOCK_JUMP_PERIODS = 5  # a gap that joints cross in fewer periods at their speed is a clock jump
 _MIN_JUMP_ROTATION = 0.05  # rotation at joint speed over a gap required to detect a clock jump [rad]
+_RATES_TOLERATED = f"1/{QUALITY_LIMITS.max_rate_ratio:g} to {QUALITY_LIMITS.max_rate_ratio:g} times is tolerated"
 _INTERVAL_GRID = math.sqrt(2.0) * 1e-6  # grid for the comparison of intervals; usual ones are not on its edges [s]
 _HASH_BASE = np.uint64(0x9E3779B97F4A7C15)
 
@@ -69,7 +70,7 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
     named = tuple(replace(one, name=f"{recording.name}{part}") for one, part in zip(kept, parts, strict=False))
     said = f"{count_with_noun(len(kept), 'part')} of the data ({left:.3g} s) {'is' if len(kept) == 1 else 'are'} used"
     if not anywhere and len(kept) < len(edges):
-        said += " (a part must start at rest)"
+        said += " (with this problem.initial_state, a part must start at rest)"
     return _RecordingParts(named, tuple(_doubt(recording, t, int(gap), allowed, said) for gap in gaps))
 
 
@@ -100,9 +101,9 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         fastest = float(np.max(speed))
         at_once = np.max(way) < _MAX_CLOCK_JUMP_PERIODS * median_sample_period(t) * fastest
         jumped = fastest * length > _MIN_JUMP_ROTATION and bool(at_once)
-    what = f"the data that move the model have no samples for {length:.3g} s"
+    what = f"the data that move the model have no samples for {length:.3g} s ({allowed:.2g} s is tolerated)"
     if jumped:
-        what = f"the clock jumps by {length - median_sample_period(t):.3g} s although the joints continue smoothly"
+        what += f", but the joints continue smoothly: the clock jumps by {length - median_sample_period(t):.3g} s"
     cause, group = "clock_jump" if jumped else "gap", "joints" if joints is not None else ""
     advice = "find out why samples are missing; to use another part, cut it out (Python: Recording.time_slice)"
     what, begin, end = f"{what}. {said}", float(t[gap]), float(t[gap + 1])
@@ -135,11 +136,12 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         slowest = limits.max_point_period if isinstance(group, PointGroup) else limits.max_joint_period
         if step <= slowest:
             continue
-        what, advice = f"{group.name}/t has only one sample every {step:.4g} s", "write times in seconds"
+        what = f"{group.name}/t has only one sample every {step:.4g} s (at most {slowest:g} s is allowed)"
+        advice = "write times in seconds"
         for unit, size in _CLOCK_UNITS.items():
             if 2e-4 <= step * size <= 2 * slowest:
                 what += f". If the times are in {unit}, the rate is {1 / (step * size):.4g} Hz"
-                advice += f" (divide them by {1 / size:g})"
+                advice += f" (in that case divide them by {1 / size:g})"
                 break
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
 
@@ -148,7 +150,8 @@ def _few_samples(recording: Recording) -> Iterator[Issue]:
     for group in recording.joint_and_point_groups:
         count, least = len(group.t), QUALITY_LIMITS.min_samples
         if count < least:
-            what, advice = f"{group.name} has {count} of at least {least} samples", "check the file, or record more"
+            what = f"{group.name} has only {count_with_noun(count, 'sample')} (at least {least} are needed)"
+            advice = "check whether the file is complete; if it is, record some seconds of motion"
             yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 
@@ -162,18 +165,21 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         if end < first or begin > last:
             far = min(abs(begin - last), abs(first - end))
             epoch = (abs(begin) > _MIN_UNIX_TIME) != (abs(first) > _MIN_UNIX_TIME)
-            since = "one of two clocks counts from 1970: " if epoch else ""
+            since = ", because one of their clocks counts from 1970" if epoch else f": {far:.3g} s lie between them"
             spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
-            ratio = LIMIT_VIOLATION_RATIO_CAP if epoch else 1 + far / max(last - first, 1e-9)
-            what, advice = f"{since}joints were recorded {spans}", "convert the times of all groups to one clock"
-            yield Issue("clock_base", what, "refused", ratio, advice, "", group.name, "t")
+            what, advice = f"joints were recorded {spans}{since}", "convert the times of all groups to one clock"
+            yield Issue("clock_base", what, "refused", LIMIT_VIOLATION_RATIO_CAP, advice, "", group.name, "t")
             continue
         slack = max(QUALITY_LIMITS.max_clock_mismatch_fraction * (last - first), 5 * median_sample_period(group.t))
         late, over = begin - first, end - last
         shift = min(late, over) if late > 0 else max(late, over)
         if late * over > 0 and abs(shift) > slack:
             how = f"starts {abs(late):.3g} s and ends {abs(over):.3g} s {'later' if late > 0 else 'earlier'}"
-            what, advice = f"{group.name} {how} than the joints", "if the clocks differ, shift the times of the points"
+            what = f"{group.name} {how} than the joints ({slack:.3g} s is tolerated at one of the two ends)"
+            advice = (
+                "if the clocks differ, import again with --clock-offset FILE=SECONDS, which are added to the times; "
+            )
+            advice += "if not, cut out the common time (Python: Recording.time_slice)"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
         elif (
             len(recording.points) == 1  # a note does not say which of several groups is late
@@ -182,11 +188,14 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             and group.clock_offset_std is None
         ):
             lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
-            setting = f"sensors.{group.name}.clock_offset_std: {lag.split()[0].lstrip('+-')}"
-            late = "if points beside the gripper are as late as the others, the clock is late: import again with "
-            remedy = f"{late}--clock-offset {option.rstrip(')')}, or set {setting}, so that a fit estimates the shift"
-            what, advice = LATE_POINTS_WORDS + lag, f"{remedy}; if not, the object swings behind the arm: do nothing"
-            yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=setting)
+            late, lag = "late" if lag[0] == "-" else "early", lag.partition(":")[0]
+            what = f"{LATE_POINTS_WORDS}{lag}. Their clock is {late}, or the object swings behind the arm"
+            advice = (
+                f"compare points beside the gripper. If they are not {late}, the object swings: do nothing. If they"
+            )
+            advice += f" are, a damping would be wrong: import again with --clock-offset {option.rstrip(')')}, or let a"
+            advice, line = f"{advice} fit estimate it", f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"
+            yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=line)
 
 
 def _dropped(recording: Recording) -> Iterator[Issue]:
@@ -203,9 +212,9 @@ def _dropped(recording: Recording) -> Iterator[Issue]:
     small = count[count < 50]  # longer ones are gaps
     missing = float(np.sum(small - 1) / np.sum(small))
     if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
-        what = f"{100 * missing:.2g} % of the joint samples are missing (at the rate of {1 / base:.4g} Hz)"
-        advice = "find the cause; torques are interpolated between the remaining samples"
-        ratio = missing / QUALITY_LIMITS.max_missing_fraction
+        ratio, at = missing / (most := QUALITY_LIMITS.max_missing_fraction), f"the joint samples at {1 / base:.4g} Hz"
+        what = f"{100 * missing:.2g} % of {at} are missing ({100 * most:g} % is tolerated)"
+        advice = "find out why they are missing; torques are interpolated between the remaining samples"
         yield Issue("dropped_samples", what, "warning", ratio, advice, "", "joints", "t")
 
 
@@ -247,7 +256,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
             cause, channel, advice = "degrees", "position", "convert angles to radians"
         elif abs(typical * math.degrees(1.0) - 1) < 0.1:
             cause, channel, advice = "degrees", "velocity", "convert velocities to radians per second"
-        what = f"all angles change {typical:.3g} times as fast as the recorded velocities state"
+        what = f"all angles change {typical:.3g} times as fast as the recorded velocities state ({_RATES_TOLERATED})"
         ratio_beyond = max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio
         yield Issue(cause, what, "not_trusted", ratio_beyond, advice, "", "joints", channel)
         return
@@ -255,6 +264,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
         size, cause = abs(ratio[j]), "angle_scale"
         evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
         what = f"the angle of {names[j]} changes {ratio[j]:.3g} times as fast as its recorded velocity states"
+        what += f" ({_RATES_TOLERATED})"
         advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}, or correct the velocity"
         if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
             cause, evidence, advice = "angle_sign", LIMIT_VIOLATION_RATIO_CAP, f"reverse the sign of {names[j]}'s angle"
@@ -267,27 +277,31 @@ def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: A
     for i, j in combinations(off, 2):
         across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
         if min(across) > 0.9:
-            what = f"the angle of {names[i]} changes like the velocity of {names[j]}, and vice versa"
-            evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two joints' angles"
+            own = max(abs(fit[i]), abs(fit[j]), 1e-3)
+            what = f"the angle of {names[i]} changes like the velocity of {names[j]}, and vice versa (correlation "
+            what += f"{min(across):.2g}), not like its own velocity (correlation {own:.2g})"
+            evidence, advice = min(across) / own, "exchange the columns of the two angles"
             yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", f"position.{names[i]}")
 
 
 def _standstill(recording: Recording) -> Iterator[Issue]:
-    joints, moved = recording.joints, []
+    joints, moved = recording.joints, list[tuple[float, str]]()
     if joints is not None:
-        width = 9 if len(joints.t) >= 9 else 1
+        width, least = 9 if len(joints.t) >= 9 else 1, QUALITY_LIMITS.min_joint_motion
         smoothed = np.lib.stride_tricks.sliding_window_view(joints.position, width, axis=0).mean(axis=-1)
-        moved.append(float(np.max(np.ptp(smoothed, axis=0))) / QUALITY_LIMITS.min_joint_motion)
+        size = float(np.max(np.ptp(smoothed, axis=0)))
+        moved.append((size / least, f"the joints turn by at most {size:.2g} rad (at least {least:g} rad is needed)"))
     for group in recording.points:
         seen = group.position[:, np.isfinite(group.position).any(axis=(0, 2))]
         size = float(np.max(np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0), initial=0.0))
         known = np.zeros(0) if group.std is None else group.std[np.isfinite(group.std)]
         noise = 6 * float(np.median(known)) if len(known) else 0.0
-        moved.append(size / max(QUALITY_LIMITS.min_point_travel, noise))
-    if max(moved, default=2.0) < 1.0:
-        what = f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise"
+        least = max(QUALITY_LIMITS.min_point_travel, noise)
+        moved.append((size / least, f"{group.name} moves by at most {size:.2g} m (at least {least:.2g} m is needed)"))
+    if moved and max(moved)[0] < 1.0:
         advice = "record a motion: at rest, only weights and stiffnesses can be found"
-        yield Issue("standstill", what, "warning", 1 / max(*moved, 1e-3), advice, "")
+        what = " and ".join(words for _, words in moved)
+        yield Issue("standstill", what, "warning", 1 / max(max(moved)[0], 1e-3), advice, "")
 
 
 def _transitions(one: JointGroup | PointGroup, other: JointGroup | PointGroup) -> tuple[IntArray, IntArray]:
@@ -348,5 +362,6 @@ def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     few = min(len(group.t) for recording in (one, other) for group in recording.joint_and_point_groups[:1])
     if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None
-    what = f"{count} samples of {other.name} equal samples of {one.name} to the last digit"
-    return Issue("same_data", what, "warning", LIMIT_VIOLATION_RATIO_CAP, "list every measurement once", other.name)
+    what = f"{count} samples of {other.name} equal samples of {one.name} to the last digit, which is no coincidence"
+    advice = "list only one of the two under recordings"
+    return Issue("same_data", what, "warning", LIMIT_VIOLATION_RATIO_CAP, advice, other.name)

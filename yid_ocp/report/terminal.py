@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
+from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, LIMIT_VIOLATION_RATIO_CAP, mean_sample_rate
 from yid_ocp.display import abbreviated_names_text
 from yid_ocp.inference import uncertainty
 from yid_ocp.sensors.base import channel_specs_for_group_name
@@ -106,20 +106,25 @@ def p_value_text(p_value: float) -> str:
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
     issues = result.get("issues", ())
-    rows: TableRows = [("issue", "where", "certainty", "value / limit")]
+    rows: TableRows = [("issue", "where", "certainty", "times the limit")]
     advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in issues):
         alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
         for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE], start=1):
             left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
             where = entry["where"] + f" and {left} more" * bool(left)
-            rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}"))
-            do = entry["advice"][:1].upper() + entry["advice"][1:] + ". In the configuration:" * bool(entry["setting"])
-            advice += [f"{words}: {entry['what']}. {do}", CodeBlock(entry["setting"])]
+            has_limit = 1.0 < entry["evidence"] < LIMIT_VIOLATION_RATIO_CAP  # else a fact, or only a suspicion
+            rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}" if has_limit else "–"))
+            do = entry["advice"][:1].upper() + entry["advice"][1:]
+            do += " by this line of the configuration:" if entry["setting"] else "."
+            place = f" ({where})" if len(alike) > 1 else ""
+            advice += [f"{words}{place}: {entry['what']}. {do}", CodeBlock(entry["setting"])]
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
     if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
         yield SummaryStatement(f"no value counts as found until this is corrected: {'; '.join(severe)}", "verdict")
+    if mild := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] == "warning"):
+        yield f"these issues change no verdict, so values may be used once their causes are clear: {'; '.join(mild)}"
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
