@@ -214,7 +214,7 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden, e=estimate(2.0, 0.1))
     other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0))
     found = compared({"c": 11.25}, one=best, two=other)
-    said = f"from one (in brackets) in a.b 12.35 (10), e 3 (2): {why}"  # the reason once, no ± of sensor noise alone
+    said = f"from one (values in brackets) in a.b 12.35 (10) N m/rad, e 3 (2) N m/rad, because {why}"  # no ±
     assert found.disagreements == {"one": [], "two": [said]}
     weak, lost = found.explanations
     assert all(fact in weak for fact in ("c (truth 11.25)", "weakly", "one 5, two 99")), weak
@@ -274,7 +274,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     # what cannot weigh this noise has no verdict of its own
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
-    assert found.disagreements["single_shooting"][0].startswith("from steepest_descent (in brackets) in a 7.5 (7)")
+    assert found.disagreements["single_shooting"][0].startswith("from steepest_descent (values in brackets) in a 7.5")
     told = "a (7 for 10, in doubt); the recordings determine a, but steepest_descent does not find it: it ignores noise"
     assert told in found.explanations[-1]
 

@@ -155,7 +155,7 @@ def test_a_wrong_name_gets_the_nearest(symbols, text, what, hint):
 
 @pytest.mark.parametrize("text", ["", "del[elbow],", "del[elbow], h, h"])
 def test_neither_one_name_nor_two_is_refused(symbols, text):
-    with pytest.raises(ConfigError, match="is not an entry"):
+    with pytest.raises(ConfigError, match="is neither one name nor two names"):
         symbols.equation_or_derivative_by_name(text)
 
 

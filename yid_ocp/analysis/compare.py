@@ -97,7 +97,7 @@ def compare_methods(
             if callback is not None:
                 callback(name, entry)
             if time.perf_counter() - begun > share:
-                raise StopSearch(f"stopped after {share:.3g} s, its part of compare.total_time_budget")
+                raise StopSearch(f"stopped after {share:.3g} s, its part of compare.total_time_budget (raise this)")
 
         return told
 
@@ -129,21 +129,21 @@ def compare_methods(
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
     if not run.has_values:
-        return ["in that it was stopped before its first iteration and has no values"]
+        return ["in that it was stopped before its first iteration and has no values; raise compare.total_time_budget"]
     values = []
     for name in (name for name, entry in judged.items() if entry.verdict == "identifiable"):
         entry, reference = run.solution.parameters[name], best.solution.parameters[name]
         # a fit that stopped early has a large ± from its misfit, which would agree with everything
         std = max(entry.std, reference.std) if run.solution.status == Status.CONVERGED else reference.std
         if abs(entry.value - reference.value) > max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
-            values.append(f"{name} {entry.value:.4g} ({reference.value:.4g})")
+            values.append(f"{name} {entry.value:.4g} ({reference.value:.4g}) {entry.unit}")
     if run.solution.status != Status.CONVERGED:
         why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
     elif run.whitened_cost > best.whitened_cost + 2.0:
         why = "it stopped in another local minimum"
     else:
         why = "its cost weights the measurements differently"
-    return [f"from {best.method} (in brackets) in {', '.join(values)}: {why}"] if values else []
+    return [f"from {best.method} (values in brackets) in {', '.join(values)}, because {why}"] if values else []
 
 
 def _explanations(

@@ -337,8 +337,9 @@ def parameter_shifts_at_finer_discretisation(
         except YidError as error:
             own = error.what
         if isinstance(own, str):
-            remedy = f"To check it, {_REFINED_SETTINGS[key]}, run `solve` again and compare the estimates"
-            notes.append(f"whether {words} would change the estimates is unknown: {own}. {remedy}")
+            remedy = f"To find it, {_REFINED_SETTINGS[key]}, run `solve` again and compare the estimates"
+            unknown = f"the error that {words} would remove from the estimates is unknown, and their ± leaves it out"
+            notes.append(f"{unknown}, because {own}. {remedy}")
         else:
             found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
@@ -489,9 +490,10 @@ class AlternatingErrorGrowth:
         step, motion = f"the time step of {self.time_step:g} s is", f"the motion of {self.recording_name}"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along {motion}"
-        grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % per step at {self.max_growth_time:.3g} s"
+        grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % per step at {self.max_growth_time:.3g} s, in total"
+        total = f"to 10^{self.growth_decades:.2g} times its size (10^{_MAX_GROWTH_DECADES:g} is tolerated)"
         remedy = f"set a shorter problem.time_step, such as {self.time_step / 2:g} s"
-        return f"{step} not stable for {motion}: an error that alternates in sign {grows}; {remedy}"
+        return f"{step} not stable for {motion}: an error that alternates in sign {grows} {total}; {remedy}"
 
 
 def _error_growth_along(

@@ -206,14 +206,15 @@ def choose_fit_with_or_without_shape_memory(
     if other.evaluation is None:
         return FitWithOrWithoutShapeMemory(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
-        words = "cable memory is not kept, because testing it needs two recordings that start in motion"
+        words = "the cable's shape memory is not kept, because a test of it needs two recordings that start in motion "
+        words += "and there is only one; add one under recordings.estimate"
         return FitWithOrWithoutShapeMemory(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
-    told = "predicted from the others, recordings that start in motion have an rms error of"
+    told = "recordings that start in motion, each predicted from the others, have an rms error of"
     errors = f"{told} {kept:.3g} with memory and {dropped:.3g} without (in standard deviations of the noise)"
     if kept < dropped:
-        return FitWithOrWithoutShapeMemory(problem, solution, f"cable memory is kept: {errors}")
-    return FitWithOrWithoutShapeMemory(without, other, f"cable memory is not kept: {errors}")
+        return FitWithOrWithoutShapeMemory(problem, solution, f"the cable's shape memory is kept: {errors}")
+    return FitWithOrWithoutShapeMemory(without, other, f"the cable's shape memory is not kept: {errors}")
 
 
 def problem_without_shape_memory(problem: EstimationProblem) -> EstimationProblem:

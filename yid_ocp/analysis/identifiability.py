@@ -382,7 +382,8 @@ def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
-        return f"the effect of {_change_words(parts)} is almost the same as that of {_hiding_nuisances(view, vector)}"
+        change = f"{'a change of ' if len(parts) == 1 else ''}{_change_words(parts)}"
+        return f"the recordings cannot distinguish {change} from {_hiding_nuisances(view, vector)}"
     form = _combination(view, *parts) if len(parts) == 2 else None
     if form is None:
         return _combination_words(parts)
@@ -393,12 +394,14 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
-    for words, prefix in (("another initial state", "start."), ("another position of the grasp", _GRASP_OFFSET_PREFIX)):
+    rest, grasp = "begin them at rest, with problem.initial_state: equilibrium", "measure the position of the grasp"
+    start = f"another initial state; {rest}", "start."
+    for words, prefix in (start, (f"another position of the grasp; {grasp}", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
         remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
         if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
             return words
-    return "another initial state and position of the grasp"
+    return f"another initial state and position of the grasp; {rest}, or {grasp}"
 
 
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:

@@ -53,7 +53,8 @@ class _PinocchioComparison:
             said = f"{self.of}: mass matrix, weight and inverse dynamics agree with Pinocchio's"
             return f"{said} within {max(parts.values()):.1g} of the largest entry"
         wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts.items() if not size <= _RELATIVE_TOLERANCE]
-        return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} of the largest entry"
+        tolerated = f"of the largest entry ({100 * _RELATIVE_TOLERANCE:g} % is tolerated)"
+        return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} {tolerated}; find the cause before you use it"
 
 
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:

@@ -77,7 +77,8 @@ def compute_profile_likelihood_interval(
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
     if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
-        walk.notes.append(f"a better fit exists (chi2 lower by {-walk.base:.2g}): `solve` from other initial values")
+        said = f"a better fit exists (chi2 lower by {-walk.base:.2g}), so the values are not the best ones"
+        walk.notes.append(f"{said}; repeat `yid-ocp solve` with other initial values (parameters.NAME.initial)")
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
 
@@ -233,7 +234,8 @@ class _Walk:
         if barrier is None:
             self.notes.append(f"the interval is open {side}: {_MAX_PROFILE_POINTS} refits did not reach its end")
         else:
-            self.notes.append(f"the model cannot be simulated {side} {self._value(barrier):.4g}")
+            why = f"the model cannot be simulated {side} {self._value(barrier):.4g}"
+            self.notes.append(f"the interval is open {side}, because {why}")
         return None
 
     def rise(self, value: float) -> float:

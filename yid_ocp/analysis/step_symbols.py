@@ -259,7 +259,8 @@ class NamedStepEquations(ReprMixin):
         if len(said) > 2 or not all(said):
             allowed = "ROW (an equation), or ROW, COLUMN (its derivative by a variable)"
             hint = "write for example --entry 'del[T1_0_x], q1[T1_0_x]'"
-            raise ConfigError(f"'{text}' is not an entry of the equations", where="--entry", allowed=allowed, hint=hint)
+            what = f"'{text}' is neither one name nor two names with a comma"
+            raise ConfigError(what, where="--entry", allowed=allowed, hint=hint)
         row, column = _place(said[0], self.row_names, "row", self.row_blocks), ""
         expression = self._row_expressions[row]
         if len(said) == 2:

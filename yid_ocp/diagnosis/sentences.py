@@ -115,7 +115,8 @@ def _gap(result: DiagnosisResult) -> str:
     p_text, detectable = p_value_relation_text(p_value), f"would show {sum(seen)} of {len(seen)} effects"
     said = f"{tests[0].degrees_of_freedom:.0f} independent samples for {unknowns} unknowns, and {detectable}"
     if result.verdict == "insufficient_data":
-        needed = "It needs more samples than unknowns, and at least one effect that they would show."
+        needed = "It needs more samples than unknowns, and at least one effect that they would show: record longer or "
+        needed += "other motions (`yid-ocp plan`), or fix known parameters (parameters.NAME.free: false)."
         return f"The recordings are insufficient for a diagnosis: they have {said}. {needed}"
     if result.verdict == "no_gap":
         return "\n".join([f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)])
