@@ -334,9 +334,7 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
-        leaves = (
-            f"after the fit, the rms error of {group} (noise and slow errors together) is {seen * usual:.2g} {unit}"
-        )
+        leaves = f"the rms error of {group} (noise and slow errors together) is {seen * usual:.2g} {unit} after the fit"
         severity = 1 / (least * max(seen, 1e-9))
         times = f"{least * severity:.2g} times below the stated {usual:.2g} {unit} ({least:g} times is tolerated)"
         advice = "the large std makes every ± too wide and hides small gaps: state the std of the actual noise"

@@ -32,10 +32,7 @@ from yid_ocp.solvers import GaussNewton
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
 EXTRAPOLATION_FACTOR = 2.0
-"""Ratio of the distance to the limit of many links, short steps or no encoder noise to the shift of one refinement.
-
-It is exact for an error proportional to their size: m + m/2 + m/4 + ...
-"""
+"""Distance to many links, short steps or no encoder noise, over the shift of one refinement: m + m/2 + m/4 + ..."""
 _N_NOISE_DRAWS = 6  # of encoder noise
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MAX_FINER_FIT_ITERATIONS = 3
@@ -48,15 +45,11 @@ _REFINED_SETTINGS = {"links": "double `links` of the segments in model.object", 
 
 @dataclass(frozen=True)
 class _FinerModel:
-    """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns.
-
-    A coarse parameter times its entry in `parameter_factors` (default 1) describes the same object in the finer model.
-    `subdivided_joints` maps each joint of a divided link to the fine joints that share its angle.
-    """
+    """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns."""
 
     problem: EstimationProblem
-    parameter_factors: Mapping[str, float] = field(default_factory=dict)
-    subdivided_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    parameter_factors: Mapping[str, float] = field(default_factory=dict)  # fine over coarse value; default 1
+    subdivided_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # fine joints that share its angle
 
     def _factor(self, name: str) -> float:
         return float(self.parameter_factors.get(name.split("[")[0], 1.0))

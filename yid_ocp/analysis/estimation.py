@@ -147,10 +147,7 @@ def _checked_solution_and_issues(
 def _checked_solution_and_step_stability(
     start: EstimationProblem, problem: EstimationProblem, solution: Solution
 ) -> tuple[Solution, dict[str, Any]]:
-    """Return the solution, marked as stalled if the time step is unstable, and stability data for result.json.
-
-    The stability at the initial values is examined only if the search failed.
-    """
+    """Return the solution, marked as stalled if the time step is unstable, and stability data for result.json."""
     growth = discretisation.alternating_error_growth_of_worst_recording
     begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
     end = growth(problem, solution.x)

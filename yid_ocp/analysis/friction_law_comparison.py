@@ -62,10 +62,7 @@ def cross_validate_law_by_motion_kind(
     kinds: Mapping[str, Sequence[str]],
     parts: PartsDoneCounter | None = None,
 ) -> CrossValidatedFrictionLawFit:
-    """Fit a friction law without each of the `kinds` of motion in turn, and compute its errors on the omitted kind.
-
-    `parts` counts the fits.
-    """
+    """Fit a friction law without each of the `kinds` of motion in turn, and compute its errors on the omitted kind."""
     errors: dict[str, float] = {}
     used = (e.measurements for e in problem.episodes)
     is_whitened = {own[i].sensor.unit for own in used for i in _indices_of_sensors_of_friction(own)} != {"rad"}
@@ -96,10 +93,7 @@ def cross_validate_law_by_motion_kind(
 
 
 def _indices_of_sensors_of_friction(samples: Sequence[SensorMeasurements]) -> Sequence[int]:
-    """Return the indices of the joint sensors, whose predictions depend on friction; without any, of all sensors.
-
-    Points on an object that a prescribed arm moves have the same error for all laws, which would hide differences.
-    """
+    """Return the indices of joint sensors, or of all without any: held points have the same error for all laws."""
     return [i for i, own in enumerate(samples) if not own.sensor.frame_names] or range(len(samples))
 
 

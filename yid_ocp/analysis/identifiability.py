@@ -66,12 +66,9 @@ class StdsAndVerdictOfParameter:
 
 @dataclass(frozen=True)
 class _ParameterDirection:
-    """A direction in the space of relative parameter changes, with its uncertainty and verdict.
+    """A direction in the space of relative parameter changes, with its uncertainty and verdict."""
 
-    The singular value is that of the whitened sensitivity [stds per unit change] after elimination of nuisances.
-    """
-
-    singular_value: float
+    singular_value: float  # of the whitened sensitivity, with nuisances eliminated [stds per unit change]
     std_relative: float  # reciprocal of the singular value
     components: Mapping[str, float]  # relative change by parameter, together of unit length
     verdict: str

@@ -258,10 +258,7 @@ def slow_motion_excitation_issues(
 def joint_excitation_issues(
     recordings: Sequence[Recording], free_parameters: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
-    """Yield an issue for each joint that hardly moves in all recordings, although some of its parameters are free.
-
-    `free_parameters` lists these parameters by joint. `position` holds the options of the position sensor.
-    """
+    """Yield an issue for each joint with `free_parameters` that hardly moves; `position`: options of its sensor."""
     for joint, parameters in free_parameters.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:
@@ -367,9 +364,9 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
         wanted = np.sqrt(np.mean(needed**2, axis=0))
         dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
         if dead.any():
-            which = "all joints" if dead.all() else ", ".join(np.array(arm.joint_names)[dead])
-            words = f"the effort of {which} is zero throughout, although gravity and motion require more (up to "
-            words += f"{np.max(wanted[dead]):.2g} N m, rms)"
+            which, asked = ", ".join(np.array(arm.joint_names)[dead]), float(np.max(wanted[dead]))
+            which = "all joints" if dead.all() else which
+            words = f"the effort of {which} is zero throughout, but gravity and motion require {asked:.2g} N m (rms)"
             advice = "record efforts, or move the arms as measured and use no efforts"
             setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
             found.append(_issue("effort_zero", words, 1e3, advice, setting=setting))
@@ -399,8 +396,9 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
         if not 1 / factor < scale < factor:
-            words = f"efforts are about {scale:.2g} times what gravity and motion require (1/{factor:g} to {factor:g} "
-            words += "times is tolerated)"
+            words = (
+                f"efforts are about {scale:.2g} times the required ones (1/{factor:g} to {factor:g} times is tolerated)"
+            )
             advice = f"divide efforts by {1 / common:g}, if they are in another unit than N m"
             yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
             common = 1.0  # said; each joint is compared with the others
@@ -427,8 +425,7 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
 
 
 def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:
-    least = _MIN_Z / 2
-    depth = -fit.inverse / fit.std / least
+    least, depth = _MIN_Z / 2, -fit.inverse / fit.std / (_MIN_Z / 2)
     wrong = ((arm.joint_names[j], float(depth[j])) for j in np.flatnonzero(turned))
     cases = [(f"the effort of {name} has", by, name) for name, by in wrong]
     if turned.sum() >= 2 and not upright.any():

@@ -58,10 +58,7 @@ class _PinocchioComparison:
 
 
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
-    """Compare a system with parameters `theta` (ntheta,) with Pinocchio's model of the same joints and bodies.
-
-    The models are compared at `posture` (n,) [rad or m] and at `_N_RANDOM_CONFIGURATIONS` random configurations.
-    """
+    """Compare a system with parameters `theta` with Pinocchio's model, at `posture` (n,) and random configurations."""
     internal = ca.vertcat(ca.SX(0, 1), *system.effect_internal_coordinate_symbols.values())
     symbols = ca.vertcat(system.parameters.symbols, internal)
     values = np.concatenate([theta, np.zeros(internal.numel())])

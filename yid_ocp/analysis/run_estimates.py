@@ -22,17 +22,14 @@ _MIN_CORRELATION_EIGENVALUE = 1e-12  # smaller eigenvalues result from rounding
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunEstimates(ReprMixin):
-    """The estimates (n,) of n parameters from one run, with covariance (n, n). `units` holds the units by parameter.
-
-    `is_fit_adequate` is False if the model does not explain the recordings; the covariance then includes the misfit.
-    """
+    """The estimates (n,) of n parameters from one run, with covariance (n, n). `units` holds the units by parameter."""
 
     run_name: str
     parameter_names: tuple[str, ...]
     values: Array  # shape (n,)
     covariance: Array  # shape (n, n)
     units: Mapping[str, str] = field(default_factory=dict)
-    is_fit_adequate: bool = True
+    is_fit_adequate: bool = True  # False: the model does not explain the recordings, the covariance has its misfit
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # values by `kind@location` and name
 
     def _summary(self) -> ReprTexts:

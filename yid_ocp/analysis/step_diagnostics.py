@@ -302,13 +302,10 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 @dataclass(frozen=True)
 class UndampedStepMapFrequencies:
-    """The natural frequencies of a system near an equilibrium, as the integrator reproduces them with a fixed robot.
-
-    `n_unstable_modes` counts the modes that grow from step to step although damping is included: the equilibrium is
-    unstable, or the time step is too long for the tension of the object.
-    """
+    """The natural frequencies of a system near an equilibrium, as the integrator reproduces them with a fixed robot."""
 
     frequencies_hz: Array  # without damping, ascending, shape (k,)
+    # modes that grow although damped: an unstable equilibrium, or a time step too long for the object's tension
     n_unstable_modes: int = 0
     message: str = ""  # reason if there are no frequencies
 

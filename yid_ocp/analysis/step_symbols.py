@@ -123,13 +123,10 @@ _MAX_LISTED_SYMBOLS = 6  # names of one block up to which each is listed
 
 @dataclass(frozen=True)
 class _SymbolBlock:
-    """A named block of equations or variables of one kind, as a symbolic column (k, 1).
-
-    `labels` has one entry per row: the name of a joint, grasp equation, internal coordinate or parameter.
-    """
+    """A named block of equations or variables of one kind, as a symbolic column (k, 1)."""
 
     name: str
-    labels: tuple[str, ...]
+    labels: tuple[str, ...]  # by row: name of a joint, grasp equation, internal coordinate or parameter
     expressions: ca.SX
     meaning: str
 

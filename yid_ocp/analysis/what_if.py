@@ -38,12 +38,9 @@ _MAX_CHANGE_SET_SIZE = 3
 
 @dataclass(frozen=True)
 class ExperimentChange:
-    """A single change of an experiment, such as another setup, another measured point or another camera rate.
+    """A single change of an experiment, such as another setup, another measured point or another camera rate."""
 
-    Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
-    """
-
-    name: str
+    name: str  # weld, second_arm, motion, travel, torque, camera:FRAME, arm:FRAME or rate:HERTZ
     description: str
     setup_change: str = ""  # key of `SETUP_CHANGE_DESCRIPTIONS`, empty if the simulated experiment stays the same
     camera_frame: str = ""  # additional frame that the camera sees; empty for none

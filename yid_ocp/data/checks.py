@@ -111,10 +111,7 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
 
 
 def recording_quality_issues(recording: Recording, options: SensorOptionsFunction) -> list[Issue]:
-    """Return the issues of one recording that all checks without a model find.
-
-    `options` returns the sensor options for a settings key, such as `joints.effort`.
-    """
+    """Return the issues of one recording that need no model. `options`(key): those of a sensor (`joints.effort`)."""
     recording = recording.with_effort_sampling_kind(options("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(

@@ -223,8 +223,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from hidden[:_MAX_DIRECTIONS]
-    remedy = "to find each, record other motions (`yid-ocp plan`) or fix a known one (parameters.NAME.free: false)"
-    yield remedy if hidden else ""
+    yield "to find each, record other motions (`yid-ocp plan`) or fix one (parameters.X.free: false)" if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)"
     if not result["profiles"]:
