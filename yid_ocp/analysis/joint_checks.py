@@ -410,7 +410,7 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
             words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion require, which is "
-            words += f"{off:.2g} standard deviations from 1 ({_MIN_Z:g} are tolerated)"
+            words += f"{off:.3g} standard deviations from 1 ({_MIN_Z:g} are tolerated)"
             advice = "find out the unit and scale of the recorded effort, and on which side of the gear it is measured"
             yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)
@@ -431,7 +431,7 @@ def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright
     if turned.sum() >= 2 and not upright.any():
         cases = [("all efforts have", float(np.max(depth[turned])), "")]
     for who, by, joint in cases:
-        words = f"{who} the opposite sign of what gravity and motion require: the fitted gain is {by * least:.2g} std"
+        words = f"{who} the opposite sign of what gravity and motion require: the fitted gain is {by * least:.3g} std"
         words += f" below zero ({least:g} std are tolerated)"
         yield _issue("effort_sign", words, by, "reverse the sign: effort is the motor's torque on the joint", joint)
 
@@ -469,8 +469,8 @@ def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     # by a factor of two, because friction and grasp explain part of a lag
     if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
         when, arms = "earlier" if lag > 0 else "later", joint_names_by_arm(data.arm.system)
-        words = f"efforts fit the motion best if their times are {abs(lag):.2g} s {when}"
-        words += f" (shifts are tried in steps of {_LAG_SEARCH_STEP:g} s; none should be needed)"
+        words = f"efforts fit the motion best if their times are {abs(lag):.2g} s {when} "
+        words += f"(less than {_LAG_SEARCH_STEP:g} s is tolerated)"
         lines = [known_effect_config_line("effort_delay", name, "delay", lag) for name in arms]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
         advice = "correct the times of efforts" + ", or model the delay" * bool(setting)

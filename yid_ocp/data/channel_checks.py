@@ -153,7 +153,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
         if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
             what = f"{channel} has steps of {step:.3g} {unit}, so rounding alone has a std of {size:.2g} {unit}"
             levels = f". Only {wide / step:.3g} steps span its range (at least 16 are needed), and no std is stated"
-            what += f", {size / stated:.2g} {tolerated}" if stated else levels
+            what += f", {size / stated:.3g} {tolerated}" if stated else levels
             ratio = size / (QUALITY_LIMITS.max_noise_ratio * stated) if stated else 16 * step / wide
             advice, line = f"record with more digits, or state the std of rounding{every}", f"{setting}: {size:.2g}"
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
@@ -163,7 +163,7 @@ def excess_noise_issues(recording: Recording, options: SensorOptionsFunction) ->
             # sampling times are known to half a period, which looks like noise during motion
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
-            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, {seen / stated:.2g} {tolerated}"
+            what = f"the noise of {channel} has a std of {seen:.2g} {unit}, {seen / stated:.3g} {tolerated}"
             ratio, line = seen / (QUALITY_LIMITS.max_noise_ratio * stated), f"{setting}: {seen:.2g}"
             advice = f"find the cause of the noise, or state its actual std{every}"
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
@@ -208,7 +208,7 @@ def overstated_noise_std_issues(recording: Recording, options: SensorOptionsFunc
         ratio, unit = stated / most[channel], JOINT_CHANNEL_UNITS.get(channel.partition(".")[0], "m")
         what = f"the noise of {channel} has a std of at most {seen_of[channel]:.2g}, not {stated:.2g} {unit} as stated"
         what += f" (too large for {len(low)} of {len(entries)} such channels)" if len(low) > 1 else ""
-        factor = f"{stated / seen_of[channel]:.2g} times as much ({QUALITY_LIMITS.max_overstatement_ratio:g} times is "
+        factor = f"{stated / seen_of[channel]:.3g} times as much ({QUALITY_LIMITS.max_overstatement_ratio:g} times is "
         what += f". Stated is {factor}tolerated)"
         advice = "the large std makes every ± too wide and hides small gaps: state the std of the actual noise"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""

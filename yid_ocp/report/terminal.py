@@ -117,7 +117,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
             rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}" if has_limit else "–"))
             do = entry["advice"][:1].upper() + entry["advice"][1:]
             do += " by this line of the configuration:" if entry["setting"] else "."
-            place = f" ({where})" if len(alike) > 1 else ""
+            place = f" ({where.partition('/')[0]})" if len(alike) > 1 else ""
             advice += [f"{words}{place}: {entry['what']}. {do}", CodeBlock(entry["setting"])]
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
