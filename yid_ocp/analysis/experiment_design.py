@@ -18,7 +18,7 @@ from yid_ocp.analysis.torque_error_propagation import point_jacobians_and_joint_
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError, YidError, failed_rollout_error
+from yid_ocp.errors import DataError, SolverError, YidError, failed_rollout_error
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.kinematics import forward_kinematics
@@ -270,7 +270,7 @@ class ExperimentVariantSensitivityBuilder:
         x = map_unknowns_to_problem(setting.x, base.unknown_names, problem)
         evaluation = problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
-            raise failed_rollout_error(evaluation.message)
+            raise failed_rollout_error(evaluation.message, f"the experiment with {[*setup_changes] or 'no change'}")
         slopes: dict[tuple[int, str, str], Array] = {}
         by_joints: dict[int, Array] = {}
         encoders = self._with_encoders(problem)
@@ -368,13 +368,14 @@ class ExperimentVariantSensitivityBuilder:
     def _welded(self, system: System, others: frozenset[str]) -> System:
         layout = self.position_sensitivities_of_variant(others)
         if isinstance(layout, str):
-            raise failed_rollout_error(layout)
+            allowed, hint = "changes that work without welded grasps", "leave `weld` out of considered_changes"
+            raise SolverError(layout, where=f"changes {', '.join(sorted(others))}", allowed=allowed, hint=hint)
         problem, n = layout.problem, system.n_coordinates
         theta, offset = problem.unpack_episode_unknowns(layout.x, 0)
         theta = problem.predictor.theta_with_episode_values(problem.episodes[0], theta)
         start = problem.predictor.initial_state_and_derivative(problem.episodes[0], theta, offset)
         if start.failure_message:
-            raise failed_rollout_error(start.failure_message)
+            raise failed_rollout_error(start.failure_message, f"recording '{problem.episodes[0].name}'")
         (q, kinematics), parameters = problem.system.symbols_and_kinematics, problem.system.parameters
         turned = []
         for grasp in system.grasps:

@@ -98,7 +98,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
     """Return derivatives (r, nx + q) of encoder readings, in units of their noise, by the unknowns and the errors."""
     evaluation = encoders.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
-        raise failed_rollout_error(evaluation.message)
+        raise failed_rollout_error(evaluation.message, "the experiment with measured angles of driven joints")
     for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
         if samples.sensor.position_joints:
             read = samples.interpolate_to_samples(blur[samples.evaluation_node_indices])

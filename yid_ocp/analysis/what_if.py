@@ -24,7 +24,7 @@ from yid_ocp.analysis.experiment_design import (
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknown_vector_from_solution
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress, ReprMixin, ReprTexts, count_with_noun
-from yid_ocp.errors import failed_rollout_error
+from yid_ocp.errors import SolverError
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -132,7 +132,8 @@ def what_if(
     outcomes = _Outcomes(setting, inflation, progress, evaluate_changes)
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
-        raise failed_rollout_error(base.message)
+        where, allowed = "the experiment without changes", "an experiment that the model can simulate"
+        raise SolverError(base.message, where=where, allowed=allowed, hint="find the cause with `yid-ocp check FILE`")
     changes = [c for c in outcomes.possible if considered_changes is None or c.name in considered_changes]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
     smallest = _rank_results(_smallest(outcomes, changes, base))
