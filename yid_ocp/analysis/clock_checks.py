@@ -36,12 +36,10 @@ from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.solvers import base as solvers
 
-# Function from N times on the joints' clock (N,) to the positions of np points (N, np, 3) [m].
-PositionsAtTimesFunction = Callable[[Array], Array]
+PositionsAtTimesFunction = Callable[[Array], Array]  # N times on the joints' clock (N,) to points (N, np, 3) [m]
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
-# Longest exposure of one sample: a slow camera knows the time of a frame better than its period [s].
-_MAX_EXPOSURE_TIME = 0.04
+_MAX_EXPOSURE_TIME = 0.04  # of a sample: a slow camera knows the time of a frame better than its period [s]
 _N_TIME_BLOCKS = 10  # blocks of time whose errors count as independent of each other
 _MAX_DRIFT = 0.05  # largest relative drift of clocks that should agree
 _DRIFT_SEARCH_STEP = 0.2  # difference of the total drift between two trials [s]

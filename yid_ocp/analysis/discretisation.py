@@ -451,10 +451,8 @@ def min_gap_by_grasp_at_robot_posture(
     return {g.name: float(np.linalg.norm(gap)) for g, gap in zip(system.grasps, best.reshape(-1, 3), strict=True)}
 
 
-# Number of nodes at which the step is linearised: in total, and at least per motion.
-_N_CHECKED_NODES, _MIN_CHECKED_NODES = 24, 4
-# Allowed growth of an alternating error in powers of ten: from rounding in a step (1e-12) to below sensor resolution.
-_MAX_GROWTH_DECADES = 6.0
+_N_CHECKED_NODES, _MIN_CHECKED_NODES = 24, 4  # nodes at which a step is linearised: in total, at least per motion
+_MAX_GROWTH_DECADES = 6.0  # growth of an alternating error: from rounding (1e-12) to below the sensors' resolution
 
 
 @dataclass(frozen=True)

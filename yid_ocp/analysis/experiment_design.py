@@ -403,8 +403,7 @@ class ExperimentVariantSensitivityBuilder:
         joints = replace(joints, position_std=noise[0], effort_std=noise[1], effort_bias_std=noise[2])
         limits = [system.mechanism.joints[i] for i in driven]
         low, high, most = np.array([(joint.lower_limit, joint.upper_limit, joint.effort_limit) for joint in limits]).T
-        over_range, over_torque = (q.min(0) < low) | (q.max(0) > high), np.abs(run.effort).max(0) > most
-        beyond = {"range": over_range, "torque limit": over_torque}
+        beyond = {"range": (q.min(0) < low) | (q.max(0) > high), "torque limit": np.abs(run.effort).max(0) > most}
         names = {what: ", ".join(np.array(system.driven)[over]) for what, over in beyond.items() if over.any()}
         notes = [f"it exceeds the {what} of {joints_beyond}" for what, joints_beyond in names.items()]
         return Recording(joints, source="what if", name=episode.name), notes

@@ -37,8 +37,7 @@ InitialStateKnowledge = Literal["assumed", "unknown"]
 _GRASP_OFFSET_KIND = "grasp_offset"
 _GRASP_OFFSET_PREFIX = f"{_GRASP_OFFSET_KIND}@"
 GRASP_OFFSET_PRIOR_STD = 0.01  # prior standard deviation of the position of a grasp [m]
-# A column this much smaller than the largest counts as zero when nuisances are eliminated.
-_RANK_RTOL = 1e-10
+_RANK_RTOL = 1e-10  # a column this much smaller than the largest counts as zero when nuisances are eliminated
 _MAX_DIRECTION_MISMATCH = 0.05  # between the unit vectors of a direction and of a simple combination
 _FINITE_CHANGE_FACTOR = 1.3  # factor on the first parameter in the test of a combination at a finite change
 _MAX_LISTED_NAMES = 4  # in a sentence
@@ -379,7 +378,7 @@ def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
-        change = f"{'a change of ' if len(parts) == 1 else ''}{_change_words(parts)}"
+        change = ("a change of " if len(parts) == 1 else "") + _change_words(parts)
         return f"the recordings cannot distinguish {change} from {_hiding_nuisances(view, vector)}"
     form = _combination(view, *parts) if len(parts) == 2 else None
     if form is None:

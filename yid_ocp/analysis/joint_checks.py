@@ -305,8 +305,7 @@ _MIN_Z = 5.0  # standard deviations from which on an error is significant
 _INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples count as independent if they are half of its inverse apart [Hz]
 _MIN_EFFORT = 1e-3  # smaller efforts give no information [N m]
 _LAG_SEARCH_STEP = 0.1  # step of the search for a lag of efforts; a shorter lag is no gross error [s]
-# Fraction of the effort limit that a joint with zero command may seem to require, because it swings with friction.
-_IDLE_COMMAND_FRACTION = 0.2
+_IDLE_COMMAND_FRACTION = 0.2  # of the effort limit, which a joint with zero command may seem to require by friction
 _MAX_EFFORT_RATIO = 1.3  # allowed ratio to the URDF's effort limit, which may hold for continuous use only
 
 
@@ -360,7 +359,6 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
     if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
         commanded = joints.effort_sampling_kind_or_default == "command"
         least = (_IDLE_COMMAND_FRACTION if commanded else 2 * _EFFORT_LIMIT_ERROR_FRACTION) * size
-        # zero throughout although gravity and motion require more than the smallest effort that counts
         wanted = np.sqrt(np.mean(needed**2, axis=0))
         dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
         if dead.any():

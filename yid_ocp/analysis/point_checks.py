@@ -25,8 +25,7 @@ from yid_ocp.sensors import SensorOptions
 _Choices = Callable[[str], SensorOptions]
 
 _HELD_POINT_TOLERANCE = 0.01  # allowed distance from the position by forward kinematics (calibration, tool) [m]
-# Fraction of the object's length by which points may differ from a model with unknown stiffness.
-_MAX_OBJECT_ERROR_FRACTION = 0.25
+_MAX_OBJECT_ERROR_FRACTION = 0.25  # of the object's length, to a model with unknown stiffness
 _MAX_REMAINING_FRACTION = 0.5  # a correction explains an error if less than this fraction of it remains
 # Factors of lengths in a wrong unit, and powers of ten for typing errors.
 _UNIT_SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 100.0, 1e3)

@@ -49,8 +49,7 @@ def step_equation_jacobians_at_state(
 # A row is observed if a reading changes by more than this fraction of the largest change over all rows: smaller changes
 # are rounding errors of the equilibrium (1e-12 rad) and of a hundred steps.
 _MIN_RELATIVE_RESPONSE = 1e-7
-# Number of steps in which readings are examined; slower responses take longer than most motions.
-_RESPONSE_STEPS = 100
+_RESPONSE_STEPS = 100  # steps in which readings are examined; slower responses take longer than most motions
 
 
 @dataclass(frozen=True)
@@ -305,8 +304,7 @@ class UndampedStepMapFrequencies:
     """The natural frequencies of a system near an equilibrium, as the integrator reproduces them with a fixed robot."""
 
     frequencies_hz: Array  # without damping, ascending, shape (k,)
-    # modes that grow although damped: an unstable equilibrium, or a time step too long for the object's tension
-    n_unstable_modes: int = 0
+    n_unstable_modes: int = 0  # modes that grow although damped: unstable equilibrium, or too long a time step
     message: str = ""  # reason if there are no frequencies
 
 

@@ -92,8 +92,7 @@ def _function(expressions: Sequence[ca.SX], variables: ca.SX) -> ca.Function:
     return ca.Function("formula", [variables], [ca.cse(ca.densify(ca.vertcat(*expressions)))])
 
 
-# Operation, nodes that it takes, and the index of a variable or the value of a constant.
-_Node = tuple[int, tuple[int, ...], float]
+_Node = tuple[int, tuple[int, ...], float]  # operation, nodes that it takes, index of a variable or a constant
 
 
 def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:

@@ -24,8 +24,7 @@ from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
 from yid_ocp.problem.evaluation import Evaluation
 
 _NEGLIGIBLE_STD = 0.1  # standard deviation of a reading that may be neglected, in units of its noise
-# Initial number of random samples of all errors, doubled while too small, and its maximum.
-_INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
+_INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512  # random samples of all errors, doubled while too few
 
 
 def point_jacobians_and_joint_information(

@@ -308,17 +308,13 @@ class Issue:
 
     cause: str  # key of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # sentence on the cause, with numbers
-    # effect on a run: it continues with a warning, continues with the verdict `not_trusted`, or stops
-    severity: IssueSeverity
-    # observed value over the detection limit (inverse for a lower limit), 1 to `LIMIT_VIOLATION_RATIO_CAP`
-    limit_violation_ratio: float
+    severity: IssueSeverity  # a run continues with a warning, continues with the verdict `not_trusted`, or stops
+    limit_violation_ratio: float  # value over limit (inverse for a lower limit), 1 to `LIMIT_VIOLATION_RATIO_CAP`
     advice: str  # recommended action
-    # location; empty means all
-    recording: str
+    recording: str  # location; empty means all
     group: str = ""
     channel: str = ""
-    # time interval on the group's clock [s]; None means the whole recording
-    begin: float | None = None
+    begin: float | None = None  # time interval on the group's clock [s]; None means the whole recording
     end: float | None = None
     setting: str = ""  # line of configuration that repairs or describes it, if any
 
