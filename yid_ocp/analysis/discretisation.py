@@ -331,8 +331,8 @@ def parameter_shifts_at_finer_discretisation(
             own = error.what
         if isinstance(own, str):
             remedy = f"To find it, {_REFINED_SETTINGS[key]}, run `solve` again and compare the estimates"
-            unknown = f"the error that {words} would remove from the estimates is unknown, and their ± leaves it out"
-            notes.append(f"{unknown}, because {own}. {remedy}")
+            usable = "Estimates stay usable, but their ± leaves this error out"
+            notes.append(f"whether {words} would change the estimates is unknown, because {own}. {usable}. {remedy}")
         else:
             found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))

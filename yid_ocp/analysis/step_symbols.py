@@ -287,7 +287,7 @@ class NamedStepEquations(ReprMixin):
             else:
                 used = self._summarize_columns(place[symbol.element_hash()] for symbol in ca.symvar(row))
                 said.append(_headline(name, count, used))
-        whole = "`inspect --entry 'ROW'` prints an equation in full, `--entry 'ROW, COLUMN'` its derivative"
+        whole = "`yid-ocp inspect FILE --entry 'ROW'` prints one in full, `--entry 'ROW, COLUMN'` its derivative"
         blocks = [block for block in self.column_blocks if block.labels]
         names = (f"{b.name} ({b.meaning}): {', '.join(b.full_names)}" for b in blocks)
         return [f"equations of one step; {whole}", "", *said, "", *names]
